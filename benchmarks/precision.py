@@ -243,7 +243,9 @@ def measured(config: PrecisionConfig, found: Recommended) -> tuple[float, bool]:
         for number in range(REPEATS)
     ]
     point = summarize_samples(
-        setting, samples, reference_error=bench.floor(setting, found.quantity)
+        setting,
+        samples,
+        reference_error=bench.get_reference_error(setting, found.quantity),
     )
     return point.rms, point.is_known
 

@@ -443,7 +443,7 @@ MADE_BY_HAND = [
     ("questions.md", {8: "in one to eight parameters"}[growing.MAX_PARAMETERS]),
     ("questions.md", {8: "as long as eight random pictures"}[boxes.PROBES]),
     ("questions.md", {4: "with other seeds, up to four times"}[boxes.ATTEMPTS]),
-    ("questions.md", f"First come {growing.CENTRE_TRIALS} trials of the centre"),
+    ("questions.md", f"First come {growing.CENTER_TRIALS} trials of the centre"),
     (
         "questions.md",
         f"Then come {RegionConfig.model_fields['samples'].default} fresh samples",

@@ -21,18 +21,7 @@ def make_view(result: RenderResult) -> ShownResult:
     if result.answered:
         headline += f"\n{result.answered}: with the predictions drawn in"
     if len(result.views) > 1:
-        rows = [
-            [
-                f"{view.azimuth:g}",
-                "; ".join(
-                    format_image_prediction(result.task, answer)
-                    for answer in view.answers
-                ),
-            ]
-            for view in result.views
-        ]
-        heads = ("azimuth", f"model {result.model} sees")
-        return ShownResult(headline, [ResultPart(heads=heads, rows=rows)])
+        return ShownResult(headline, [_make_table_of_views(result)])
     (view,) = result.views
     predictions = [
         format_image_prediction_cells(result.task, answer) for answer in view.answers
@@ -46,6 +35,17 @@ def make_view(result: RenderResult) -> ShownResult:
             ResultPart("In the picture", heads=("", *VISIBLE_HEADS), rows=things)
         )
     return ShownResult(headline, sections)
+
+
+def _make_table_of_views(result: RenderResult) -> ResultPart:
+    """Return a table of what the model predicts in each view, by its azimuth."""
+    rows = []
+    for view in result.views:
+        predictions = [
+            format_image_prediction(result.task, answer) for answer in view.answers
+        ]
+        rows.append([f"{view.azimuth:g}", "; ".join(predictions)])
+    return ResultPart(heads=("azimuth", f"model {result.model} sees"), rows=rows)
 
 
 @experiment(

@@ -94,16 +94,21 @@ class MovingMesh:
         of all their faces; those with different normals do not, so that creases stay
         creases. `vertices` are (V, 3) positions of the mesh's vertices.
         """
+        # (F, 3) vertices of the faces, and (V,) the group of vertices that share a mean
         faces, groups = (indices.to(vertices.device) for indices in self._shared_groups)
         first, second, third = (
             vertices.index_select(0, faces[:, corner]) for corner in range(3)
         )
         # as long as twice the face's area: the sum weights faces by area
-        normals = torch.linalg.cross(second - first, third - first)
-        sums = vertices.new_zeros(int(groups.max()) + 1, 3)
-        # all first corners, then all second and third ones, as `repeat` has the normals
+        face_normals = torch.linalg.cross(second - first, third - first)
+        # each face counts for the groups of its three corners: first all the first
+        # corners, then all the second and all the third ones
         group_of_corner = groups[faces].T.reshape(-1)
-        sums = sums.index_add(0, group_of_corner, normals.repeat(3, 1))[groups]
+        group_sums = vertices.new_zeros(int(groups.max()) + 1, 3).index_add(
+            0, group_of_corner, face_normals.repeat(3, 1)
+        )
+        sums = group_sums[groups]
+        # 1e-24 keeps the derivative finite where a sum is 0
         return sums / (sums.square().sum(dim=1, keepdim=True) + 1e-24).sqrt()
 
     @cached_property
@@ -112,10 +117,11 @@ class MovingMesh:
 
     @cached_property
     def _shared_groups(self) -> tuple[Tensor, Tensor]:
-        """The faces (F, 3), and for each vertex (V,) its group that shares a normal.
+        """The faces (F, 3), and the group (V,) of vertices that each vertex is in.
 
-        Vertices are in one group if their positions and their normals are the same, the
-        positions to 1e-5 of the mesh's unit and the normals to 1e-3.
+        The vertices of a group have their normal in common. They are in one group if
+        their positions and their normals are the same, the positions to 1e-5 of the
+        mesh's unit and the normals to 1e-3.
         """
         rounded = np.round(
             np.concatenate(
@@ -222,11 +228,10 @@ class Assembly:
         All are differentiable torch operations.
         """
         if self.is_object_hidden:
-            name = f"{OBJECT}.to_world"
-            pose = inputs.get(name, self.meshes[OBJECT].to_world).clone()
-            pose[1, 3] += HIDDEN_OFFSET
-            inputs = {**inputs, name: pose}
+            inputs = self._hide_object(inputs)
         parameters = dict(inputs)
+        # which of several photographs is chosen, by its index; without a choice the
+        # first
         photograph = int(parameters.pop(PHOTOGRAPH_INPUT, torch.zeros(())))
         parameters |= self._get_image_inputs(photograph)
         for part in self._carried:  # what carries it may be moved or deformed
@@ -248,11 +253,19 @@ class Assembly:
                 parameters["ground.reflectance"] = self._photograph.compute_reflectance(
                     data
                 )
-            # a column of the other side at each, so that interpolation has no seam
+            # the last column before the first, and the first behind the last, so that
+            # interpolation has no seam
             parameters["environment.padded"] = torch.cat(
                 [data[:, -1:], data, data[:, :1]], dim=1
             )
         return parameters
+
+    def _hide_object(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return inputs in which the object is far away to the side."""
+        name = f"{OBJECT}.to_world"
+        pose = inputs.get(name, self.meshes[OBJECT].to_world).clone()
+        pose[1, 3] += HIDDEN_OFFSET
+        return {**inputs, name: pose}
 
     def _get_image_inputs(self, photograph: int) -> dict[str, Tensor]:
         """Return what a photograph adds to the image; it is read once.
@@ -265,6 +278,7 @@ class Assembly:
         if photograph not in self._image_inputs_of:
             view = self._views[photograph]
             image_inputs = make_image_inputs(view, self._resolution)
+            # the plane has the light of the scene itself, whatever the photograph
             image_inputs.pop(PLANE_INPUT, None)
             self._image_inputs_of[photograph] = image_inputs | self._plane
         return self._image_inputs_of[photograph]
@@ -391,7 +405,8 @@ class Motion:
         aspect = resolution[1] / resolution[0]
         pose = camera_to_world(description, aspect)
         self._camera = torch.from_numpy(pose).double()
-        # `_ground` is half the side of the ground square, `_edge` (n, 3) points on it.
+        # Half the side of the square that the ground is, and points (n, 3) on its edge;
+        # of a photographed ground all of its vertices.
         if description.photograph is None:
             self._ground = description.get_number("ground.size") / 2.0
             self._edge = _sample_square_edge(self._ground)
@@ -402,6 +417,7 @@ class Motion:
         # Points of the environment; none if nothing shows them.
         hidden = description.backdrop or description.environment is None
         self._far = _sample_sphere(0 if hidden else N_DIRECTIONS) * ENVIRONMENT_DISTANCE
+        # which vertices of each mesh are followed
         self._picks = {
             name: torch.from_numpy(_spread_indices(len(mesh.vertices), N_VERTICES))
             for name, mesh in assembly.meshes.items()
@@ -437,13 +453,18 @@ class Motion:
         return positions, is_visible & near_frame
 
     def _hidden_by_ground(self, eye: Tensor) -> Tensor:
-        """Return which of the far points the ground plane hides from the eye."""
+        """Return which points of the environment, (n,), the ground hides from the eye.
+
+        The ground is a square at z = 0, and hides nothing from an eye below it.
+        """
         directions = self._far - eye
-        # where the line of sight meets z = 0; only downward ones count below
+        # where the line of sight meets z = 0; it means nothing for lines that go up,
+        # which do not count below
         distance = -eye[2] / directions[:, 2].clamp_max(-1e-9)
         hit = eye + distance[:, None] * directions
         on_ground = (hit[:, :2].abs() <= self._ground).all(dim=1)
-        return (directions[:, 2] < 0.0) & bool(eye[2] > 0.0) & on_ground
+        is_eye_above = bool(eye[2] > 0.0)
+        return (directions[:, 2] < 0.0) & is_eye_above & on_ground
 
     def measure_speeds(
         self,
@@ -464,17 +485,18 @@ class Motion:
         with torch.no_grad():
             positions, is_visible = self.project_points(inputs(u))
             for coordinate in coordinates:
-                for size in NUDGES:
+                for nudge in NUDGES:
                     nudged = u.clone()
                     # backwards at the upper border of the box
-                    sign = 1.0 if float(u[coordinate]) + size <= 1.0 else -1.0
-                    nudged[coordinate] += sign * size
+                    sign = 1.0 if float(u[coordinate]) + nudge <= 1.0 else -1.0
+                    nudged[coordinate] += sign * nudge
                     new_positions, still_visible = self.project_points(inputs(nudged))
                     shifts = (new_positions - positions)[is_visible & still_visible]
                     distances = shifts.norm(dim=1)
-                    # If nothing moves, all that does may have left the frame.
+                    # If nothing moves, what moved may have left the frame: then a
+                    # smaller nudge is tried.
                     if bool((distances > 0.0).any()):
-                        speeds[coordinate] = float(distances.max()) / size
+                        speeds[coordinate] = float(distances.max()) / nudge
                         break
         return speeds
 

@@ -250,13 +250,12 @@ class EnvironmentAsset:
             row, column = np.unravel_index(int(is_bad.argmax()), is_bad.shape)
             bad_texels = (
                 f"{int(is_bad.sum())} of {is_bad.size} texels that are negative, NaN "
-                "or "
-                "infinite"
+                "or infinite"
             )
             raise InputError(
                 f"environment {self.name!r}: expected finite radiance of at least 0, "
-                f"got {bad_texels} (the first in row "
-                f"{row}, column {column}); clamp them"
+                f"got {bad_texels} (the first in row {row}, column {column}); clamp "
+                "them"
             )
 
 
@@ -349,6 +348,32 @@ SIMPLIFICATION_GRIDS = (384, 256, 192, 128, 96, 64, 48, 32, 24, 16, 12, 8)
 TEXTURE_CELLS = 32
 
 
+def _merge_clusters(mesh: Mesh, cluster_of: IntArray) -> tuple[IntArray, IntArray]:
+    """Merge the vertices of each cluster that lie in one cell of the texture.
+
+    Args:
+        mesh: the full mesh.
+        cluster_of: (V,) cluster of each vertex.
+
+    Returns:
+        For each new vertex (N,) one of the vertices that it stands for; and the faces
+        (F, 3) of new vertices whose corners are in three clusters.
+    """
+    texture_cell = np.floor(mesh.uvs.astype(np.float64) * TEXTURE_CELLS).astype(
+        np.int64
+    )
+    cluster_and_cell = _encode_rows(np.column_stack([cluster_of, texture_cell]))
+    _, representative, new_vertex = np.unique(
+        cluster_and_cell, return_index=True, return_inverse=True
+    )
+    faces = new_vertex.reshape(-1)[mesh.faces]
+    cluster_a, cluster_b, cluster_c = cluster_of[representative][faces].T
+    is_face = (
+        (cluster_a != cluster_b) & (cluster_b != cluster_c) & (cluster_c != cluster_a)
+    )
+    return representative, faces[is_face]
+
+
 def make_simplifier(mesh: Mesh, max_faces: int) -> Callable[[Mesh], Mesh] | None:
     """Return a function that simplifies a mesh, also once its vertices are elsewhere.
 
@@ -367,23 +392,9 @@ def make_simplifier(mesh: Mesh, max_faces: int) -> Callable[[Mesh], Mesh] | None
     """
     if len(mesh.faces) <= max_faces:
         return None
-    texture_cell = np.floor(mesh.uvs.astype(np.float64) * TEXTURE_CELLS).astype(
-        np.int64
-    )
     for grid in SIMPLIFICATION_GRIDS:
         cluster_of = _cluster_vertices(mesh, grid)
-        # A new vertex for each cluster, and for each part of the texture in it.
-        cluster_and_chart = _encode_rows(np.column_stack([cluster_of, texture_cell]))
-        _, representative, new_vertex = np.unique(
-            cluster_and_chart, return_index=True, return_inverse=True
-        )
-        faces = new_vertex.reshape(-1)[mesh.faces]
-        cluster_a, cluster_b, cluster_c = cluster_of[representative][faces].T
-        faces = faces[
-            (cluster_a != cluster_b)
-            & (cluster_b != cluster_c)
-            & (cluster_c != cluster_a)
-        ]
+        representative, faces = _merge_clusters(mesh, cluster_of)
         if len(faces) <= max_faces:
             break
     distinct_faces = np.unique(faces, axis=0).astype(np.uint32)
@@ -439,9 +450,9 @@ def _encode_rows(rows: IntArray) -> IntArray:
 # How large things really are: an object's longest side in metres, from what is said of
 # it or from its file.
 #
-# A scene is as large as its object is 1. `ObjectAsset.size_in_metres` is the one number that
-# makes metres of it: whatever speaks of metres (distances of the camera, the road, what
-# stands beside the object) divides by `SceneDescription.size_in_metres`.
+# A scene is as large as its object is 1. `ObjectAsset.size_in_metres` is the one number
+# that makes metres of it: whatever speaks of metres (distances of the camera, the road,
+# what stands beside the object) divides by `SceneDescription.size_in_metres`.
 
 # metres of the units that a mesh may be in
 METRES_PER_UNIT = {"mm": 0.001, "cm": 0.01, "m": 1.0, "in": 0.0254}
@@ -450,6 +461,8 @@ METRES_PER_UNIT = {"mm": 0.001, "cm": 0.01, "m": 1.0, "in": 0.0254}
 TRIPOD_HEIGHT = 1.6
 MIN_METRES = 1e-4  # metres of an object's longest side
 MAX_METRES = 1e4
+# metres that the longest side of an object of any name usually has
+PLAUSIBLE_SIZES = (0.005, 100.0)
 USUAL_SIZES = {
     "airplane": (6.0, 75.0),
     "apple": (0.05, 0.12),
@@ -518,47 +531,52 @@ def is_road_vehicle(asset: ObjectAsset) -> bool:
 
 
 def with_size(asset: ObjectAsset, size: float | None, unit: str | None) -> ObjectAsset:
-    """Return an object with its size in metres, if it is known.
+    """Return an object with the size in metres that its user states, if any.
 
     Args:
         asset: the object.
-        size: its longest side in metres.
-        unit: unit of its file, one of `METRES_PER_UNIT`.
+        size: its longest side in metres; or None.
+        unit: unit of its file, one of `METRES_PER_UNIT`; or None.
 
     Raises:
         InputError: both are given, the size is out of range, or the object comes
             from no file that could have a unit.
     """
-    if size is None and unit is None:
-        return asset
     if size is not None and unit is not None:
         raise InputError(
             "size and unit: both say how large the object is; leave one of them out"
         )
-    if unit is not None and unit not in METRES_PER_UNIT:
+    if size is not None:
+        longest_side = float(size)
+        statement = f"size={size:g}"
+    elif unit is not None:
+        longest_side = _convert_extent(asset, unit)
+        statement = f"unit={unit} for a mesh of {asset.extent:.4g}"
+    else:
+        return asset
+    if not MIN_METRES <= longest_side <= MAX_METRES:
+        raise InputError(
+            f"{statement}: expected a longest side of {MIN_METRES:g} to {MAX_METRES:g} "
+            f"metres, got {longest_side:.4g}; give it in metres, such as size=4.9"
+        )
+    return replace(asset, size_in_metres=longest_side)
+
+
+def _convert_extent(asset: ObjectAsset, unit: str) -> float:
+    """Return the longest side of an object, metres, by the unit of its file.
+
+    Raises InputError: there is no such unit, or the object comes from no mesh file.
+    """
+    if unit not in METRES_PER_UNIT:
         raise InputError(
             f"unit: expected one of {', '.join(METRES_PER_UNIT)}, got {unit!r}"
         )
-    if unit is not None and asset.extent is None:
+    if asset.extent is None:
         raise InputError(
             f"unit: {asset.name} is no mesh file; give its longest side "
             "in metres, such as size=0.1"
         )
-    if size is not None:
-        longest_side = float(size)
-    else:
-        longest_side = (asset.extent or 0.0) * METRES_PER_UNIT[unit or "m"]
-    if not MIN_METRES <= longest_side <= MAX_METRES:
-        statement = f"unit={unit} for a mesh of {asset.extent:.4g}"
-        if size is not None:
-            statement = f"size={size:g}"
-        raise InputError(
-            f"{statement}: expected a longest side of {MIN_METRES:g} to {MAX_METRES:g} "
-            "metres, "
-            f"got {longest_side:.4g}; give it in "
-            "metres, such as size=4.9"
-        )
-    return replace(asset, size_in_metres=longest_side)
+    return asset.extent * METRES_PER_UNIT[unit]
 
 
 def describe_size_doubts(
@@ -566,59 +584,65 @@ def describe_size_doubts(
 ) -> tuple[str, ...]:
     """Return a remark where an object's size is unusual for its name, or unknown.
 
-    The last word of the object's name that `USUAL_SIZES` has says what is usual;
-    without one a size is unusual only below 5 mm and above 100 m. A size that is
-    unknown matters if something is in metres, or if the name and the file's extent tell
-    which unit would fit. The user's own size is never doubted. Empty, or one remark.
+    A size that is unknown matters if something is in metres, or if the name and the
+    file's extent tell which unit would fit. The user's own size is never doubted.
+    Empty, or one remark.
 
     Args:
         asset: the object.
         has_user_size: whether its user gave its size.
         needs_metres: whether something in the scene is in metres, such as the road.
     """
-    kind = next(
-        (
-            word
-            for word in reversed(re.split(r"[^a-z]+", asset.name.lower()))
-            if word in USUAL_SIZES
-        ),
-        None,
-    )
-    min_size, max_size = (0.005, 100.0) if kind is None else USUAL_SIZES[kind]
-    is_unusual = (
-        asset.size_in_metres is not None
-        and not min_size <= asset.size_in_metres <= max_size
-    )
-    is_unknown = asset.size_in_metres is None and (
-        needs_metres or (kind is not None and asset.extent is not None)
-    )
-    if has_user_size or not (is_unusual or is_unknown):
+    kind = _find_usual_kind(asset.name)
+    usual_sizes = PLAUSIBLE_SIZES if kind is None else USUAL_SIZES[kind]
+    min_size, max_size = usual_sizes
+    size = asset.size_in_metres
+    # without a kind, what the file states tells nothing
+    extent = None if kind is None else asset.extent
+    is_unusual = size is not None and not min_size <= size <= max_size
+    is_missing = size is None and (needs_metres or extent is not None)
+    if has_user_size or not (is_unusual or is_missing):
         return ()
-    extent = 0.0 if asset.extent is None or kind is None else asset.extent
-    fitting_units = [
-        unit
-        for unit, metres in METRES_PER_UNIT.items()
-        if min_size <= extent * metres <= max_size
-    ]
-    clauses = [
-        f"its longest side is {format_rounded(asset.size_in_metres or 0.0)} m"
-        if is_unusual
-        else "its size in metres is not known",
-        f"it is {format_rounded(extent)} in its file" if is_unknown and extent else "",
-        f"a {kind}'s is {min_size:g} to {max_size:g} m" if kind else "",
-        "it is taken for 1 m, as the road is in metres"
-        if is_unknown and needs_metres
-        else "",
-    ]
-    # the example is the geometric mean of what is usual
-    remedy = f"give its longest side in metres, such as `size={(min_size * max_size) ** 0.5:.2g}`"
-    if fitting_units:
-        remedy += (
-            f", or `unit={fitting_units[0]}`, which makes it "
-            f"{format_rounded(extent * METRES_PER_UNIT[fitting_units[0]])} m"
-        )
-    # the remedy's first letter is replaced by what begins the sentence
-    return (
-        f"{asset.name}: {'; '.join(filter(None, clauses))}. "
-        f"{'If that is wrong, g' if is_unusual else 'G'}{remedy[1:]}",
-    )
+    clauses = []
+    if size is not None:
+        clauses.append(f"its longest side is {format_rounded(size)} m")
+    else:
+        clauses.append("its size in metres is not known")
+        if extent:
+            clauses.append(f"it is {format_rounded(extent)} in its file")
+    if kind is not None:
+        clauses.append(f"a {kind}'s is {min_size:g} to {max_size:g} m")
+    if is_missing and needs_metres:
+        clauses.append("it is taken for 1 m, as the road is in metres")
+    remedy = _describe_size_remedy(extent, usual_sizes)
+    beginning = "If that is wrong, give" if is_unusual else "Give"
+    return (f"{asset.name}: {'; '.join(clauses)}. {beginning} {remedy}",)
+
+
+def _find_usual_kind(name: str) -> str | None:
+    """Return the last word of an object's name that `USUAL_SIZES` has, or None."""
+    for word in reversed(re.split(r"[^a-z]+", name.lower())):
+        if word in USUAL_SIZES:
+            return word
+    return None
+
+
+def _describe_size_remedy(
+    extent: float | None, usual_sizes: tuple[float, float]
+) -> str:
+    """Return what to give so that an object's size is known, to follow "give".
+
+    Args:
+        extent: longest side of the object in the unit of its file, if that is known.
+        usual_sizes: smallest and largest size that is usual, metres.
+    """
+    min_size, max_size = usual_sizes
+    example = (min_size * max_size) ** 0.5  # the geometric mean
+    remedy = f"its longest side in metres, such as `size={example:.2g}`"
+    for unit, metres in METRES_PER_UNIT.items():
+        if extent is not None and min_size <= extent * metres <= max_size:
+            return (
+                f"{remedy}, or `unit={unit}`, which makes it "
+                f"{format_rounded(extent * metres)} m"
+            )
+    return remedy

@@ -350,7 +350,7 @@ def make_backdrop(
 def compute_photograph_gain(
     description: SceneData, photograph: BackdropPhotograph
 ) -> float:
-    """Return the factor from radiance to display-linear values of a photograph.
+    """Return the factor from a scene's radiance to a photograph's display-linear values.
 
     By it a level surface of reflectance `GREY_CARD`, lit by the environment, gets the
     mean luminance of the photograph. 1 where no environment lights the scene.
@@ -358,15 +358,18 @@ def compute_photograph_gain(
     irradiance = float(compute_level_irradiance(description) @ LUMINANCE)
     if not irradiance > 0.0:
         return 1.0
-    counts = [
+    # how many pixels have each of the 256 levels
+    histograms = [
         np.bincount(photograph.levels[..., channel].reshape(-1), minlength=256)
         for channel in range(len(CHANNELS))
     ]
     decoded = decode_all_levels()
-    means = np.array([np.average(decoded, weights=count) for count in counts])
-    mean = max(float(means @ LUMINANCE), 1e-3)
+    channel_means = np.array(
+        [np.average(decoded, weights=histogram) for histogram in histograms]
+    )
+    mean_luminance = max(float(channel_means @ LUMINANCE), 1e-3)
     # a matt surface has the radiance reflectance * irradiance / pi
-    return mean * math.pi / (GREY_CARD * irradiance)
+    return mean_luminance * math.pi / (GREY_CARD * irradiance)
 
 
 def compute_level_irradiance(description: SceneData) -> Float64Array:
@@ -378,14 +381,14 @@ def compute_level_irradiance(description: SceneData) -> Float64Array:
     if environment is None:
         return np.zeros(len(CHANNELS))
     rows = environment.radiance.shape[0]
+    # of the angle from straight up at the edges of rows, 0 below the horizon
     edge_cosines = np.cos(np.arange(rows + 1) * math.pi / rows)
-    # Of the angle from straight up at each row's two edges; 0 below the horizon. The
-    # integral of cosine times solid angle over a row is pi (upper^2 - lower^2).
     upper_cosines = np.maximum(edge_cosines[:-1], 0.0)
     lower_cosines = np.maximum(edge_cosines[1:], 0.0)
     row_means = environment.radiance.mean(axis=1, dtype=np.float64)
+    # the integral of cosine times solid angle over each row
     weights = math.pi * (upper_cosines**2 - lower_cosines**2)
-    # no BLAS, whose last bits depend on its threads
+    # by a sum, not by BLAS, whose last bits depend on the number of threads
     return np.asarray((weights[:, None] * row_means).sum(axis=0))
 
 
@@ -501,21 +504,23 @@ def make_matrix_camera(
         InputError: it is no such matrix.
     """
     matrix = np.asarray(camera_matrix, np.float64)
-    has_form = (
+    is_camera_matrix = (
         matrix.shape == (3, 3)
         and bool(np.isfinite(matrix).all())
         and matrix[1, 0] == 0.0
         and matrix[2].tolist() == [0.0, 0.0, 1.0]
         and min(matrix[0, 0], matrix[1, 1]) > 0.0
     )
-    if not has_form:
+    if not is_camera_matrix:
         raise InputError(
             "camera_matrix: expected [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] in "
             f"pixels, got {matrix.tolist()}"
         )
     height, width = size
-    # The order of `LINEAR_PARAMETERS`, as fractions of the image. Half a pixel is added
-    # since our (0, 0) is the corner of the first pixel, not its center.
+    # In the order of `LINEAR_PARAMETERS`: fx, fy, cx, cy and skew, lengths along x as
+    # fractions of the width, those along y of the height. Half a pixel is added to the
+    # principal point, since our (0, 0) is the corner of the first pixel, not its
+    # center.
     linear = (
         matrix[0, 0] / width,
         matrix[1, 1] / height,
@@ -604,7 +609,7 @@ def _check_film(photograph: BackdropPhotograph, resolution: tuple[int, int]) -> 
     """
     height, width = photograph.size
     film_height, film_width = resolution
-    # photograph pixels in one pixel of the film
+    # pixels of the photograph in one of the film: what rounding to whole pixels explains
     rounding = max(width / film_width, height / film_height)
     if abs(film_width / film_height * height - width) <= rounding:
         return
@@ -682,6 +687,7 @@ def compute_view_settings(
     )
     rotation = world_axes @ mesh_to_camera[:3, :3]
     offset = world_axes @ (center - np.array([0.0, 0.0, distance]))
+    # height of the lowest vertex, from the middle of the object
     lowest = float(((vertices - middle) @ rotation.T)[:, 2].min())
     return {
         **_compute_orbit(world_axes),
@@ -734,7 +740,9 @@ def _compute_orbit(world_axes: Float64Array) -> dict[str, float]:
     y down, z ahead). Angles in degrees. Raises InputError: it looks straight up or
     down.
     """
-    outwards = -world_axes[:, 2]  # from the object to the camera
+    # from the object to the camera, in the axes of the world: the camera looks along
+    # its own z
+    outwards = -world_axes[:, 2]
     elevation = math.degrees(math.asin(min(max(float(outwards[2]), -1.0), 1.0)))
     if abs(elevation) > MAX_ELEVATION:
         raise InputError(
@@ -742,10 +750,11 @@ def _compute_orbit(world_axes: Float64Array) -> dict[str, float]:
             f"{MAX_ELEVATION:g} degrees from level, which no camera does that orbits "
             "the object; give another `up`"
         )
+    # to the left and up of a camera without roll
     level_left = np.array([outwards[1], -outwards[0], 0.0])
     level_left /= np.linalg.norm(level_left)
-    # Roll is the angle of the camera's left against that of a camera without roll.
     upright = np.cross(-outwards, level_left)
+    # roll is the angle of the camera's own left against that
     left = -world_axes[:, 0]
     return {
         "camera.azimuth": math.degrees(math.atan2(outwards[1], outwards[0])),
@@ -776,7 +785,8 @@ def _check_rigid(pose: npt.ArrayLike) -> Float64Array:
 def _make_world_axes(up: Float64Array) -> Float64Array:
     """Return world axes (3, 3), rows in camera coordinates, with z along `up`.
 
-    +x points from the object to the camera as far as that is level.
+    +x points from the object to the camera as far as that is level. `up` is a direction
+    (3,) in camera coordinates: x to the right, y down, z ahead.
     """
     if up.shape != (3,) or not np.isfinite(up).all() or not up.any():
         raise InputError(f"up: expected a direction of three numbers, got {up!r}")
@@ -784,6 +794,7 @@ def _make_world_axes(up: Float64Array) -> Float64Array:
     towards_camera = np.array([0.0, 0.0, -1.0])
     x_axis = towards_camera - (towards_camera @ z_axis) * z_axis
     if np.linalg.norm(x_axis) < 1e-6:  # the camera looks straight up or down
+        # towards the lower border of the image instead
         x_axis = np.array([0.0, 1.0, 0.0]) - z_axis[1] * z_axis
     x_axis /= np.linalg.norm(x_axis)
     return np.stack([x_axis, np.cross(z_axis, x_axis), z_axis])

@@ -71,8 +71,9 @@ class BackdropPhotograph:
     def resample_depth(self, resolution: tuple[int, int]) -> Tensor | None:
         """Return the depth (H S, W S) float32 in metres at S x S points of each pixel.
 
-        They are so many that the edges in the depth are followed, at most
-        `MAX_DEPTH_POINTS` along each side. None if there is no depth.
+        S is how many pixels of the depth a pixel has along a side, so that edges are
+        followed, within `MIN_DEPTH_POINTS` and `MAX_DEPTH_POINTS`. None if there is no
+        depth.
         """
         if self.depth is None:
             return None
@@ -80,11 +81,12 @@ class BackdropPhotograph:
         part = self.depth[top : top + height, left : left + width]
         needed = math.ceil(max(height / resolution[0], width / resolution[1]))
         n_points = min(max(needed, MIN_DEPTH_POINTS), MAX_DEPTH_POINTS)
-        picks = [
+        # the row, or column, of the depth in which each point lies
+        positions = [
             ((np.arange(n_points * n_pixels) + 0.5) * side / (n_points * n_pixels))
             for n_pixels, side in zip(resolution, part.shape, strict=True)
         ]
-        rows, columns = (pick.astype(np.intp) for pick in picks)
+        rows, columns = (position.astype(np.intp) for position in positions)
         return torch.from_numpy(part[np.ix_(rows, columns)])
 
     def make_noise(self, resolution: tuple[int, int], sigma: float | None) -> Tensor:
@@ -98,11 +100,9 @@ class BackdropPhotograph:
             sigma: standard deviation in levels at that resolution; None: that of the
                 photograph.
         """
-        part = self.levels[
-            self.crop[1] : self.crop[1] + self.crop[3],
-            self.crop[0] : self.crop[0] + self.crop[2],
-        ]
-        seed = int(self.digest[:8], 16)
+        left, top, width, height = self.crop
+        part = self.levels[top : top + height, left : left + width]
+        seed = int(self.digest[:8], 16)  # of the photograph's content
         if sigma is not None:
             return make_noise(np.full(3, sigma / 255.0), resolution, seed)
         noise = make_noise(measure_noise(part) / 255.0, self.size, seed)

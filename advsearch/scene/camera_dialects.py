@@ -52,8 +52,7 @@ OTHER_FORMATS: tuple[tuple[str, str, str], ...] = (
         r"# ?Bundle file",
         "a Bundler reconstruction, which has no size of its pictures",
         "write the f, k1 and k2 of one of its cameras as COLMAP's cameras.txt: 1 "
-        "RADIAL WIDTH HEIGHT f WIDTH/2 "
-        "HEIGHT/2 k1 k2",
+        "RADIAL WIDTH HEIGHT f WIDTH/2 HEIGHT/2 k1 k2",
     ),
     (
         r"NVM_V3",
@@ -124,6 +123,17 @@ METASHAPE_KINDS = {
     "fisheye": "fisheye",
     "spherical": "equirectangular",
 }
+# Entries of a camera of OpenSfM that are translated; any other is passed on as it is.
+OPENSFM_TRANSLATED_KEYS = (
+    "projection_type",
+    "width",
+    "height",
+    "focal",
+    "focal_x",
+    "focal_y",
+    "c_x",
+    "c_y",
+)
 
 
 def describe_projection(name: str) -> str:
@@ -151,9 +161,8 @@ def check_xml_root(path: str, tag: str) -> None:
     if tag in METASHAPE_PROJECT:
         raise FileFormatError(
             f"{path}: expected one camera, got Metashape's <{tag}>, with sensors and "
-            "poses; save the lens alone: "
-            "Tools > Camera Calibration > Adjusted > Save, as Agisoft XML "
-            "(<calibration>)"
+            "poses; save the lens alone: Tools > Camera Calibration > Adjusted > Save, "
+            "as Agisoft XML (<calibration>)"
         )
 
 
@@ -225,6 +234,12 @@ def _translate_orbslam(
     """Translate a camera of ORB-SLAM, whose entries are `Camera.fx` or `Camera1.fx`.
 
     Entries of other cameras, and those that are not about the lens, are left out.
+
+    Args:
+        path: the file, for messages.
+        camera_name: "" if none is named.
+        data: all entries of the file.
+        cameras: names of its cameras: what stands before the dot.
     """
     camera_group = select_camera(
         path, camera_name, dict(zip(cameras, cameras, strict=True))
@@ -234,16 +249,15 @@ def _translate_orbslam(
         "distortion_model": ORBSLAM_KINDS.get(stated_type.lower(), stated_type)
     }
     other_cameras = {name for name in cameras if name != camera_group}
+    size_names = {"width": "image_width", "height": "image_height"}
     for name, value in data.items():
         group, _, entry_name = name.partition(".")
-        if (
-            ORBSLAM_NON_LENS_KEYS.fullmatch(name)
-            or group in other_cameras
-            or name == "Camera.type"
-        ):
+        is_about_lens = not ORBSLAM_NON_LENS_KEYS.fullmatch(name)
+        is_translated = name == "Camera.type"
+        if not is_about_lens or is_translated or group in other_cameras:
             continue
+        # `Camera` has what all cameras of the file share
         if group in (camera_group, "Camera"):
-            size_names = {"width": "image_width", "height": "image_height"}
             entries[size_names.get(entry_name, entry_name)] = value
         else:
             entries[name] = value
@@ -325,8 +339,8 @@ def _translate_kitti(
     elif "image_width" not in data or "image_height" not in data:
         raise FileFormatError(
             f"{path}: KITTI's calibration has no size of the pictures; add it in two "
-            "lines, as in image_width: 1242 "
-            "and image_height: 375 (also 1241 x 376, 1226 x 370, 1224 x 370)"
+            "lines, as in image_width: 1242 and image_height: 375 (also 1241 x 376, "
+            "1226 x 370, 1224 x 370)"
         )
     return entries
 
@@ -348,11 +362,10 @@ def _translate_realsense(data: Mapping[str, Any]) -> dict[str, Any]:
     if kind in ("kannala_brandt4", "kannala_brandt"):
         kind = "kannala_brandt"
         # the model has four; the list may be longer
-        entries["coeffs"] = (
-            coefficients[:4] if isinstance(coefficients, list) else coefficients
-        )
+        if isinstance(coefficients, list):
+            coefficients = coefficients[:4]
+        entries["coeffs"] = coefficients
     elif is_zero and kind in ("inverse_brown_conrady", "modified_brown_conrady"):
-        # all of Brown's polynomials are the same where their coefficients are 0
         kind = "none"
     entries["distortion_model"] = kind
     return entries
@@ -361,57 +374,62 @@ def _translate_realsense(data: Mapping[str, Any]) -> dict[str, Any]:
 def _translate_opensfm(path: str, camera: Mapping[str, Any]) -> dict[str, Any]:
     """Translate a camera of OpenSfM, whose lengths are fractions of the larger side.
 
-    The principal point counts from the middle of the image there, and here from the
-    center of the first pixel, which is (side - 1) / 2 before the middle. `focal` is
-    that of both axes unless they have their own. For a camera of an unknown kind, or a
-    panorama, no lengths are translated.
+    For a camera of an unknown kind, or a panorama, no lengths are translated. `path` is
+    the file, for messages.
     """
     stated_type = str(camera["projection_type"])
+    kind = OPENSFM_KINDS.get(stated_type)  # None if it is unknown
     entries = {
         name: value
         for name, value in camera.items()
-        if name
-        not in (
-            "projection_type",
-            "width",
-            "height",
-            "focal",
-            "focal_x",
-            "focal_y",
-            "c_x",
-            "c_y",
-        )
+        if name not in OPENSFM_TRANSLATED_KEYS
     }
     width, height = (
         parse_number(path, side, camera.get(side)) for side in ("width", "height")
     )
     entries |= {
-        "distortion_model": OPENSFM_KINDS.get(stated_type, stated_type),
+        "distortion_model": stated_type if kind is None else kind,
         "image_width": width,
         "image_height": height,
     }
-    if OPENSFM_KINDS.get(stated_type) in (None, "equirectangular"):
-        return entries
-    side = max(width, height)  # lengths are in this
-    focal_x = parse_number(path, "focal_x", camera.get("focal_x", camera.get("focal")))
-    entries["fx"] = side * focal_x
-    entries["fy"] = side * parse_number(path, "focal_y", camera.get("focal_y", focal_x))
-    entries["cx"] = (width - 1.0) / 2.0 + side * parse_number(
-        path, "c_x", camera.get("c_x", 0.0)
-    )
-    entries["cy"] = (height - 1.0) / 2.0 + side * parse_number(
-        path, "c_y", camera.get("c_y", 0.0)
-    )
+    if kind not in (None, "equirectangular"):
+        entries |= _scale_opensfm_lengths(path, camera, width, height)
     return entries
+
+
+def _scale_opensfm_lengths(
+    path: str, camera: Mapping[str, Any], width: float, height: float
+) -> dict[str, float]:
+    """Return the focal lengths and the principal point of OpenSfM's camera in pixels.
+
+    OpenSfM's principal point counts from the middle of the image, OpenCV's from the
+    center of the first pixel, which is (side - 1) / 2 before the middle. `focal` is the
+    length along both axes, unless they have their own.
+
+    Args:
+        path: the file, for messages.
+        camera: the camera's entries, in which lengths are fractions of the larger side.
+        width: width of the image in pixels.
+        height: likewise.
+    """
+    focal_x = parse_number(path, "focal_x", camera.get("focal_x", camera.get("focal")))
+    focal_y = parse_number(path, "focal_y", camera.get("focal_y", focal_x))
+    shift_x = parse_number(path, "c_x", camera.get("c_x", 0.0))
+    shift_y = parse_number(path, "c_y", camera.get("c_y", 0.0))
+    larger_side = max(width, height)
+    return {
+        "fx": larger_side * focal_x,
+        "fy": larger_side * focal_y,
+        "cx": (width - 1.0) / 2.0 + larger_side * shift_x,
+        "cy": (height - 1.0) / 2.0 + larger_side * shift_y,
+    }
 
 
 def _translate_metashape(path: str, data: Mapping[str, Any]) -> dict[str, Any]:
     """Translate a camera of Agisoft Metashape (manual, appendix "Camera models").
 
-    The focal lengths are f + b1 along x and f along y, and b2 is the skew, in pixels.
-    cx and cy count from the center of the image, which is (side - 1) / 2 from the
-    center of the first pixel. p1 and p2 are swapped against OpenCV. k4 is the fourth
-    coefficient of the radial polynomial, which only a fisheye of OpenCV has.
+    p1 and p2 are swapped against OpenCV. k4 is the fourth coefficient of the radial
+    polynomial, which only a fisheye of OpenCV has.
 
     Args:
         path: the file, for messages.
@@ -437,26 +455,30 @@ def _translate_metashape(path: str, data: Mapping[str, Any]) -> dict[str, Any]:
     entries |= {"distortion_model": kind, "image_width": width, "image_height": height}
     if kind == "equirectangular":
         return entries
-    center_x = (width - 1.0) / 2.0 + value_by_name["cx"]
-    center_y = (height - 1.0) / 2.0 + value_by_name["cy"]
-    entries["camera_matrix"] = [
-        value_by_name["f"] + value_by_name["b1"],
-        value_by_name["b2"],
-        center_x,
-        0.0,
-        value_by_name["f"],
-        center_y,
-        0.0,
-        0.0,
-        1.0,
-    ]
+    entries["camera_matrix"] = _make_metashape_matrix(value_by_name, width, height)
     entries |= {"p1": value_by_name["p2"], "p2": value_by_name["p1"]}
     if kind == "fisheye":
         entries["k4"] = value_by_name["k4"]
     elif value_by_name["k4"]:
         raise FileFormatError(
-            f"{path}: k4: expected 0, got {value_by_name['k4']:g}: the fourth radial term of "
-            "Metashape is not OpenCV's; leave "
-            "k4 out of the fit and optimize the cameras again"
+            f"{path}: k4: expected 0, got {value_by_name['k4']:g}: the fourth radial "
+            "term of Metashape is not OpenCV's; leave k4 out of the fit and optimize "
+            "the cameras again"
         )
     return entries
+
+
+def _make_metashape_matrix(
+    value_by_name: Mapping[str, float], width: float, height: float
+) -> list[float]:
+    """Return the camera matrix of Metashape's numbers, nine numbers row by row.
+
+    The focal lengths are f + b1 along x and f along y, and b2 is the skew. Metashape's
+    cx and cy count from the center of the image; the matrix's count from the center of
+    the first pixel, (side - 1) / 2 before it. All are in pixels.
+    """
+    center_x = (width - 1.0) / 2.0 + value_by_name["cx"]
+    center_y = (height - 1.0) / 2.0 + value_by_name["cy"]
+    focal = value_by_name["f"]
+    first_row = [focal + value_by_name["b1"], value_by_name["b2"], center_x]
+    return [*first_row, 0.0, focal, center_y, 0.0, 0.0, 1.0]

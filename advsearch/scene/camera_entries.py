@@ -72,8 +72,8 @@ class Entries:
         for key in self._keys.repeated:
             later_key = self._keys.get_spelling(normalize_key(key))
             raise FileFormatError(
-                f"{path}: has {format_name(key)} and {format_name(later_key)}; leave one "
-                "of them out"
+                f"{path}: has {format_name(key)} and {format_name(later_key)}; leave "
+                "one of them out"
             )
         # Keys of matrices that are not read.
         self._unread_matrix_keys: list[str] = []
@@ -103,15 +103,14 @@ class Entries:
         Args:
             name: the entry.
             default: the default; None if the entry is required.
-            aliases: plain names for the entry, if there are several.
+            aliases: plain names for the entry, see `normalize_key`, if there are
+                several; otherwise that of `name`.
 
         Raises:
             FileFormatError: it is no number, or is required and missing.
         """
-        if (
-            default is not None
-            and self.get(*(aliases or (normalize_key(name),))) is None
-        ):
+        is_missing = self.get(*(aliases or (normalize_key(name),))) is None
+        if is_missing and default is not None:
             return default
         return parse_number(self.path, name, self.require(name, aliases))
 
@@ -137,8 +136,8 @@ class Entries:
         if len(values) not in counts:
             expected = " or ".join(map(str, counts))
             raise FileFormatError(
-                f"{self.path}: {name}: expected a list of "
-                f"{expected} numbers, got {len(values)}"
+                f"{self.path}: {name}: expected a list of {expected} numbers, got "
+                f"{len(values)}"
             )
         return [parse_number(self.path, name, value) for value in values]
 
@@ -147,7 +146,7 @@ class Entries:
         them.
 
         Args:
-            prefix: prefix for the entry that they are within, with a dot.
+            prefix: name, with a dot, of the entry that all of these stand in.
 
         Raises:
             FileFormatError: one of them changes the image.
@@ -158,29 +157,32 @@ class Entries:
         ):
             name = normalize_key(spelling)
             value = self._keys.peek(name)
-            is_matrix = isinstance(value, (list, Mapping))
-            is_coefficient = name in COEFFICIENTS and not is_matrix
-            # an entry such as M2 beside M1, of a stereo pair; k2 is no such entry
-            is_of_second_camera = (
-                name.endswith("2")
-                and f"{name[:-1]}1" in self._keys
-                and not is_coefficient
-            )
-            changes_image = (
-                IMAGE_CHANGING_KEYS.fullmatch(name)
-                and not RECTIFICATION_KEYS.fullmatch(name)
-                and not is_of_second_camera
-            )
-            if not changes_image:
+            if not self._may_change_image(name, value):
                 unread.append(prefix + spelling)
             elif not is_neutral(value):
                 raise FileFormatError(
                     f"{self.path}: expected no {format_name(prefix + spelling)}, got "
-                    f"{format_name(str(value))}: it makes another"
-                    " picture and is not read; calibrate with one of the models in "
-                    "docs/cameras.md"
+                    f"{format_name(str(value))}: it makes another picture and is not "
+                    "read; calibrate with one of the models in docs/cameras.md"
                 )
         return unread
+
+    def _may_change_image(self, name: str, value: object) -> bool:
+        """Return whether an entry of a plain name would change the image if it were
+        read.
+
+        Entries about rectified images would not; nor would those of the second camera
+        of a stereo pair, which have a 2 at the end, as M2 beside M1.
+        """
+        if not IMAGE_CHANGING_KEYS.fullmatch(name):
+            return False
+        if RECTIFICATION_KEYS.fullmatch(name):
+            return False
+        is_matrix = isinstance(value, (list, Mapping))
+        # k2 beside k1 is of the same camera
+        is_coefficient = name in COEFFICIENTS and not is_matrix
+        has_first_camera = name.endswith("2") and f"{name[:-1]}1" in self._keys
+        return is_coefficient or not has_first_camera
 
 
 def select_camera(path: str, camera_name: str, cameras: Mapping[str, Any]) -> Any:
@@ -214,11 +216,12 @@ def select_camera(path: str, camera_name: str, cameras: Mapping[str, Any]) -> An
 
 
 def is_neutral(value: object) -> bool:
-    """Return whether a value changes nothing: it is zero, empty or none.
+    """Return whether an entry changes nothing: it is zero, empty or none.
 
     Of a matrix, a list or a mapping all values have to be.
     """
     if isinstance(value, Mapping):
+        # a matrix has its numbers as `data`
         value = value.get("data", list(value.values()))
     return all(
         cell in (None, False, "", "none") or _to_float(str(cell)) == 0.0
@@ -253,8 +256,8 @@ def parse_number(path: str, name: str, entry: object) -> float:
     value = _to_float(entry)
     if not math.isfinite(value):
         raise FileFormatError(
-            f"{path}: {name}: expected a finite number, got "
-            f"{str(entry)[:40]!r}; correct it"
+            f"{path}: {name}: expected a finite number, got {str(entry)[:40]!r}; "
+            "correct it"
         )
     return value
 
@@ -343,7 +346,8 @@ def _check_numbers(
         """Raise the error of a number that is not valid."""
         if not is_valid:
             raise FileFormatError(
-                f"{path}: {name}: expected {expected}, got {value_by_name[name]:g}{hint}"
+                f"{path}: {name}: expected {expected}, got "
+                f"{value_by_name[name]:g}{hint}"
             )
 
     for name, side in (("fx", width), ("fy", height)):
@@ -352,7 +356,8 @@ def _check_numbers(
         check(
             name,
             min_focal <= value_by_name[name] <= max_focal,
-            f"a focal length from {min_focal:g} to {max_focal:g} pixels for a side of {side:g}",
+            f"a focal length from {min_focal:g} to {max_focal:g} pixels for a side of "
+            f"{side:g}",
         )
     for name, side in (("cx", width), ("cy", height)):
         check(
@@ -389,9 +394,8 @@ class CameraPreset:
     distance: float
     # Whether azimuth 0 is in the object's lane, behind what drives there.
     in_lane: bool
-    search_azimuth: (
-        float  # how far to either side a search goes, degrees; 180 for all around
-    )
+    # how far to either side a search goes, degrees; 180 for all around
+    search_azimuth: float
     # Other ranges that are searched by default; what has none stays.
     search_ranges: Mapping[str, tuple[float, float]]
 
@@ -401,7 +405,11 @@ PRESETS: Mapping[str, CameraPreset] = MappingProxyType(
         # Behind the windscreen of a car, in the lane of the object. What glass and
         # dashboard do to a picture is not in it.
         "dashcam": CameraPreset(
-            height=1.3, fov=75.0, distance=10.0, in_lane=True, search_azimuth=10.0,
+            height=1.3,
+            fov=75.0,
+            distance=10.0,
+            in_lane=True,
+            search_azimuth=10.0,
             search_ranges={"distance": (6.0, 60.0), "fov": (60.0, 90.0)},
         ),
         # The head of a humanoid: the Unitree G1 is 1.32 m tall (its product page), with
@@ -409,11 +417,15 @@ PRESETS: Mapping[str, CameraPreset] = MappingProxyType(
         # colour picture of that has 69 x 42 degrees, and its depth reaches to 3 m
         # (Clearpath Robotics, documentation of the RealSense D435).
         "robot": CameraPreset(
-            height=1.2, fov=69.0, distance=1.0, in_lane=False, search_azimuth=180.0,
+            height=1.2,
+            fov=69.0,
+            distance=1.0,
+            in_lane=False,
+            search_azimuth=180.0,
             search_ranges={"distance": (0.5, 3.0)},
         ),
     }
-)  # fmt: skip
+)
 """The mounted cameras by name."""
 TABLE_HEIGHT = 0.75
 TABLE_SIDE = 1.2

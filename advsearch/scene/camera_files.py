@@ -49,6 +49,9 @@ from advsearch.trust.yaml_text import MAX_YAML_BYTES, parse_yaml
 
 # Limit of the bytes of a JSON file, which may have the pose of every image.
 MAX_JSON_SIZE = 1 << 25
+# The coordinates of the center of the first pixel, where 0 is its corner; added to a
+# principal point of a tool that counts from that center.
+FIRST_PIXEL_CENTER = 0.5
 MAX_BINNING = 64  # limit of the pixels along a side that a sensor bins into one
 # Coefficients in the order of OpenCV and ROS.
 OPENCV_COEFFICIENTS = (
@@ -141,10 +144,9 @@ LENS_KEYS = frozenset(
 """Entries of nerfstudio about a camera, of all frames or of one."""
 SCENE_KEYS = frozenset(
     "frames aabb_scale scale offset applied_transform applied_scale ply_file_path "
-    "orientation_override "
-    "auto_scale_poses_override train_filenames val_filenames test_filenames "
-    "camera_angle_x camera_angle_y "
-    "file_path transform_matrix sharpness colmap_im_id mask_path depth_file_path "
+    "orientation_override auto_scale_poses_override train_filenames val_filenames "
+    "test_filenames camera_angle_x camera_angle_y file_path transform_matrix sharpness "
+    "colmap_im_id mask_path depth_file_path "
     "semantic_path time rotation".split()
 )
 """Entries of a transforms.json, and of its frames, that are not about the lens; angles
@@ -177,8 +179,8 @@ def read_camera(spec: str) -> CameraModel:
 
     Raises:
         FileFormatError: the file is missing, is of no known kind, has a model that is
-            not one of ours, numbers that no camera has, or an entry that changes the image
-            and is not read.
+            not one of ours, numbers that no camera has, or an entry that changes the
+            image and is not read.
     """
     path, _, camera_name = spec.partition("#")
     text = _read_camera_text(path)
@@ -206,8 +208,8 @@ def read_camera(spec: str) -> CameraModel:
         return _read_kalibr(spec, camera, Entries(path, other_entries).find_unread())
     if camera_name:
         raise FileFormatError(
-            f"{path}: expected several cameras, as {camera_name!r} is asked for, got one; "
-            f"leave #{camera_name} out"
+            f"{path}: expected several cameras, as {camera_name!r} is asked for, got "
+            f"one; leave #{camera_name} out"
         )
     if "intrinsics" in data and "camera_model" in data:
         return _read_kalibr(spec, Entries(path, data))
@@ -236,8 +238,8 @@ def _read_camera_text(path: str) -> str:
         )
     if suffix in MESHES:
         raise FileFormatError(
-            f"{path}: expected a camera file, got a mesh; it is an "
-            "object's, not a camera's"
+            f"{path}: expected a camera file, got a mesh; it is an object's, not a "
+            "camera's"
         )
     limit = MAX_JSON_SIZE if suffix == ".json" else MAX_YAML_BYTES
     return read_existing_text(path, "a camera file", limit)
@@ -273,17 +275,17 @@ def _parse_file(path: str, text: str) -> dict[str, Any]:
     if path.lower().endswith(".json"):
         data = parse_text(path, text, "JSON", parse_json)
     else:
-        # OpenCV's YAML has a directive and tags that are not standard.
+        # OpenCV's YAML begins with a directive, and has tags, that are not standard.
         text = re.sub(r"\A%YAML[^\n]*\n", "", text)
         text = re.sub(r"!!opencv-(nd-)?matrix", "", text)
+        # only the first document
         text = re.sub(r"\A\s*---[^\n]*\n", "", text).split("\n---")[0]
         data = parse_text(path, text, "YAML, or COLMAP's cameras.txt", parse_yaml)
     if not isinstance(data, dict) or not all(isinstance(name, str) for name in data):
         got = "an empty file" if data is None else f"a {type(data).__name__}"
         raise FileFormatError(
             f"{path}: expected a camera of OpenCV, Kalibr, ROS, COLMAP or nerfstudio, "
-            f"got {got}; docs/cameras.md shows "
-            "one of each"
+            f"got {got}; docs/cameras.md shows one of each"
         )
     return data
 
@@ -296,16 +298,15 @@ def _parse_xml(path: str, text: str) -> dict[str, Any]:
     """
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise FileFormatError(
-            f"{path}: declares a document type or entities, "
-            "which no camera needs; remove it"
+            f"{path}: declares a document type or entities, which no camera needs; "
+            "remove it"
         )
     root = parse_text(path, text, "XML", ElementTree.fromstring)
     check_xml_root(path, root.tag)
     if root.tag not in ("opencv_storage", METASHAPE_FILE):
         raise FileFormatError(
             f"{path}: expected a camera of OpenCV in <opencv_storage>, got "
-            f"<{root.tag[:40]}>; docs/cameras.md has "
-            "the formats that are read"
+            f"<{root.tag[:40]}>; docs/cameras.md has the formats that are read"
         )
     entries = dict[str, Any]()
     for element in root:
@@ -339,16 +340,15 @@ def _read_colmap(
     if name not in COLMAP_MODELS:
         raise FileFormatError(
             f"{path}: expected one of COLMAP's models {', '.join(COLMAP_MODELS)}, got "
-            f"{name[:40]}, which is another projection"
-            "; fit one of these to it (colmap model_converter does not), or undistort "
-            "the pictures"
+            f"{name[:40]}, which is another projection; fit one of these to it (colmap "
+            "model_converter does not), or undistort the pictures"
         )
     kind, parameters = COLMAP_MODELS[name]
     keys = ["width", "height", *parameters.split()]
     if len(values) != len(keys):
         raise FileFormatError(
-            f"{path}: {name}: expected {' '.join(keys)}, got "
-            f"{len(values)} numbers; correct the line"
+            f"{path}: {name}: expected {' '.join(keys)}, got {len(values)} numbers; "
+            "correct the line"
         )
     numbers = {
         key: parse_number(path, key, value)
@@ -382,9 +382,9 @@ def _read_nerfstudio(
     numbers["cx"] = entries.get_number("cx", width / 2.0)
     numbers["cy"] = entries.get_number("cy", height / 2.0)
     if kind == FISHEYE:
-        numbers |= _read_coefficients(entries, COEFFICIENTS[:4])
+        numbers |= _read_optional_numbers(entries, COEFFICIENTS[:4])
     else:
-        numbers |= _read_coefficients(entries, ("k1", "k2", "k3", "p1", "p2"))
+        numbers |= _read_optional_numbers(entries, ("k1", "k2", "k3", "p1", "p2"))
     model = make_camera_model(spec, kind, (height, width), numbers)
     unread = entries.find_unread()
     frame_entries = Entries(path, _select_other_entries(frames))
@@ -422,9 +422,8 @@ def _read_projection(path: str, entries: Entries) -> str:
     if name not in (*COLMAP_MODELS, "PERSPECTIVE"):
         raise FileFormatError(
             f"{path}: expected one of the camera models {', '.join(COLMAP_MODELS)}, "
-            "got "
-            f"{format_name(name)}, which is another "
-            "projection; fit one of these to it"
+            f"got {format_name(name)}, which is another projection; fit one of these "
+            "to it"
         )
     if entries.get("isfisheye"):
         return FISHEYE
@@ -436,27 +435,29 @@ def _read_focal_lengths(
 ) -> dict[str, float]:
     """Return fx and fy in pixels, from lengths or from angles of view.
 
-    A length wins. fy is fx where the file has neither its length nor its angle.
+    A length wins over an angle. fy is fx where the file has neither for y.
 
     Args:
         path: the file, for messages.
-        data: all entries of the file, which have the angles, radians.
-        entries: those of the camera, which have the lengths.
+        data: all entries of the file, which may have the angles, radians.
+        entries: those of the camera, which may have the lengths.
         width: width of the image in pixels.
         height: likewise.
 
     Raises:
-        FileFormatError: the two contradict each other.
+        FileFormatError: length and angle along x contradict each other, or both are
+            missing.
     """
-    x_focal = _compute_focal_length(path, data.get("camera_angle_x"), width)
-    y_focal = _compute_focal_length(path, data.get("camera_angle_y"), height)
-    fx = entries.get_number("fl_x", x_focal or None)
-    if x_focal and abs(fx - x_focal) > MAX_FOCAL_MISMATCH * fx:
+    fx_by_angle = _compute_focal_length(path, data.get("camera_angle_x"), width)
+    fy_by_angle = _compute_focal_length(path, data.get("camera_angle_y"), height)
+    fx = entries.get_number("fl_x", fx_by_angle)
+    if fx_by_angle is not None and abs(fx - fx_by_angle) > MAX_FOCAL_MISMATCH * fx:
         raise FileFormatError(
-            f"{path}: fl_x: expected {x_focal:g}, as camera_angle_x says, got {fx:g}; "
-            "leave one out"
+            f"{path}: fl_x: expected {fx_by_angle:g}, as camera_angle_x says, got "
+            f"{fx:g}; leave one out"
         )
-    return {"fx": fx, "fy": entries.get_number("fl_y", y_focal or fx)}
+    default_fy = fx if fy_by_angle is None else fy_by_angle
+    return {"fx": fx, "fy": entries.get_number("fl_y", default_fy)}
 
 
 def _select_lens(
@@ -474,7 +475,9 @@ def _select_lens(
     """
     lenses = [
         {key: frame[key] for key in frame if key in LENS_KEYS} for frame in frames
-    ] or [{}]  # without frames, all is said once for the file
+    ]
+    if not lenses:
+        lenses = [{}]  # a file without frames has all of its lens outside of them
     first_lens: dict[str, Any] = lenses[0]
     if not camera_name and all(lens == first_lens for lens in lenses):
         return first_lens
@@ -483,11 +486,18 @@ def _select_lens(
     return selected
 
 
-def _compute_focal_length(path: str, angle: object, side: float) -> float:
-    """Return the focal length in pixels of a field of view in radians; 0 for None."""
+def _compute_focal_length(path: str, angle: object, side: float) -> float | None:
+    """Return the focal length, in pixels, of a field of view; None without an angle.
+
+    Args:
+        path: the file, for messages.
+        angle: an entry of the file, radians; None if it is missing.
+        side: side of the image, in pixels, that the angle spans.
+    """
     if angle is None:
-        return 0.0
+        return None
     half_angle = parse_number(path, "camera_angle", angle) / 2.0
+    # 1e-9: an angle of 0 or less becomes a very long focal length
     return side / 2.0 / max(math.tan(half_angle), 1e-9)
 
 
@@ -495,8 +505,6 @@ def _read_kalibr(
     spec: str, entries: Entries, unread: Sequence[str] = ()
 ) -> CameraModel:
     """Return the model of a camera of Kalibr.
-
-    Principal points count from the center of the first pixel there, hence the half.
 
     Args:
         spec: the file, and perhaps the camera in it.
@@ -525,50 +533,33 @@ def _read_kalibr(
     )
     numbers = _read_distortion(entries, names, (0, 4))
     numbers |= zip(("fx", "fy", "cx", "cy"), intrinsics, strict=True)
-    camera = make_camera_model(spec, kind, (height, width), numbers, 0.5)
+    camera = make_camera_model(spec, kind, (height, width), numbers, FIRST_PIXEL_CENTER)
     return add_notes(camera, [*unread, *entries.find_unread()])
 
 
 def _read_opencv(spec: str, entries: Entries) -> CameraModel:
     """Return the model of a camera of OpenCV or ROS.
 
-    Principal points count from the center of the first pixel. The calibration is of the
-    sensor's pixels, before ROS bins them: the model has the size after that. A tilted
-    sensor is rejected, a region of interest too.
+    The calibration is of the sensor's pixels; ROS may bin several of them into one
+    pixel of the image, and the model has the size of that image. A tilted sensor is
+    rejected, a region of interest too. `spec` is the file, and perhaps the camera in
+    it.
     """
     path = entries.path
     kind = _find_opencv_kind(path, entries)
     if kind == EQUIRECTANGULAR:
-        return add_notes(
-            make_camera_model(spec, kind, _read_size(entries), {}),
-            entries.find_unread(),
-        )
+        panorama = make_camera_model(spec, kind, _read_size(entries), {})
+        return add_notes(panorama, entries.find_unread())
     matrix = _read_camera_matrix(path, entries)
     height, width = _read_size(entries)
     unread = _check_roi(entries, (height, width))
-    if kind == FISHEYE:
-        numbers = _read_distortion(entries, COEFFICIENTS[:4], (0, 4))
-    else:
-        numbers = _read_distortion(
-            entries, OPENCV_COEFFICIENTS, OPENCV_COEFFICIENT_COUNTS
-        )
-    if numbers.pop("tauX", 0.0) or numbers.pop("tauY", 0.0):
-        raise FileFormatError(
-            f"{path}: expected no tilt of the sensor (tauX, tauY), got one; calibrate "
-            "without CALIB_TILTED_MODEL"
-        )
-    numbers |= {
-        "fx": matrix[0],
-        "skew": matrix[1],
-        "cx": matrix[2],
-        "fy": matrix[4],
-        "cy": matrix[5],
-    }
+    numbers = _read_opencv_distortion(entries, kind) | _name_matrix_entries(matrix)
     y_binning, x_binning = _read_binning(entries)
     # Pixels that fill no bin are cut off; the model is in fractions of what is left.
-    binned_size = (height - height % y_binning, width - width % x_binning)
-    model = make_camera_model(spec, kind, binned_size, numbers, 0.5)
-    model = replace(model, size=(int(height // y_binning), int(width // x_binning)))
+    used_size = (height - height % y_binning, width - width % x_binning)
+    model = make_camera_model(spec, kind, used_size, numbers, FIRST_PIXEL_CENTER)
+    binned_size = (int(height // y_binning), int(width // x_binning))
+    model = replace(model, size=binned_size)
     rectified = _find_rectified(entries, matrix)
     return add_notes(model, unread + entries.find_unread(), rectified)
 
@@ -585,8 +576,8 @@ def _find_opencv_kind(path: str, entries: Entries) -> str:
     is_fisheye = not is_neutral(entries.get("fisheyemodel"))
     if len(kinds) > 1:
         raise FileFormatError(
-            f"{path}: expected one model, got a camera_model beside "
-            "another distortion_model"
+            f"{path}: expected one model, got a camera_model beside another "
+            "distortion_model"
         )
     return FISHEYE if is_fisheye else next(iter(kinds), BROWN_CONRADY)
 
@@ -610,8 +601,8 @@ def _read_camera_matrix(path: str, entries: Entries) -> list[float]:
     if not any(matrix):
         raise FileFormatError(
             f"{path}: expected a calibrated camera, got a camera_matrix (K) of zeros, "
-            "as ROS says of one that is not "
-            "calibrated; calibrate it, and give the file that this writes"
+            "as ROS says of one that is not calibrated; calibrate it, and give the "
+            "file that this writes"
         )
     # skew, cx and cy are 0, and the last row is not
     is_by_columns = not any(matrix[index] for index in (1, 2, 5)) and any(matrix[6:8])
@@ -619,10 +610,16 @@ def _read_camera_matrix(path: str, entries: Entries) -> list[float]:
         matrix = [matrix[3 * column + row] for row in range(3) for column in range(3)]
     if matrix[3] or matrix[6] or matrix[7] or matrix[8] != 1.0:
         raise FileFormatError(
-            f"{path}: camera_matrix: expected fx, skew, cx, 0, fy, "
-            "cy, 0, 0, 1, got other numbers"
+            f"{path}: camera_matrix: expected fx, skew, cx, 0, fy, cy, 0, 0, 1, got "
+            "other numbers"
         )
     return matrix
+
+
+def _name_matrix_entries(matrix: Sequence[float]) -> dict[str, float]:
+    """Return the numbers of a camera matrix, nine row by row, that are not fixed."""
+    fx, skew, cx, _, fy, cy = matrix[:6]
+    return {"fx": fx, "skew": skew, "cx": cx, "fy": fy, "cy": cy}
 
 
 def _read_distortion(
@@ -636,8 +633,10 @@ def _read_distortion(
         counts: the lengths that the list may have.
     """
     distortion = entries.get(*DISTORTION_KEYS)
-    if is_neutral(distortion) and not isinstance(distortion, Mapping):
-        coefficients = _read_coefficients(entries, names)
+    # a matrix (a mapping) is a list even if it is all zeros
+    has_list = isinstance(distortion, Mapping) or not is_neutral(distortion)
+    if not has_list:
+        coefficients = _read_optional_numbers(entries, names)
     else:
         values = entries.parse_numbers("distortion_coefficients", distortion, counts)
         coefficients = dict(zip(names, values, strict=False))
@@ -651,8 +650,28 @@ def _read_distortion(
     return coefficients
 
 
-def _read_coefficients(entries: Entries, names: Sequence[str]) -> dict[str, float]:
-    """Return entries of single coefficients; 0 for those that are missing."""
+def _read_opencv_distortion(entries: Entries, kind: str) -> dict[str, float]:
+    """Return the distortion coefficients of a camera of OpenCV or ROS, by name.
+
+    Raises FileFormatError: the sensor is tilted, for which our models have no numbers.
+    """
+    if kind == FISHEYE:
+        return _read_distortion(entries, COEFFICIENTS[:4], (0, 4))
+    coefficients = _read_distortion(
+        entries, OPENCV_COEFFICIENTS, OPENCV_COEFFICIENT_COUNTS
+    )
+    x_tilt = coefficients.pop("tauX", 0.0)
+    y_tilt = coefficients.pop("tauY", 0.0)
+    if x_tilt or y_tilt:
+        raise FileFormatError(
+            f"{entries.path}: expected no tilt of the sensor (tauX, tauY), got one; "
+            "calibrate without CALIB_TILTED_MODEL"
+        )
+    return coefficients
+
+
+def _read_optional_numbers(entries: Entries, names: Sequence[str]) -> dict[str, float]:
+    """Return entries that are numbers, by name; 0 for those that are missing."""
     return {name: entries.get_number(name, 0.0) for name in names}
 
 
@@ -695,10 +714,11 @@ def _check_roi(entries: Entries, size: tuple[float, float]) -> list[str]:
     if not isinstance(value, Mapping):
         value = {}
     roi = Entries(entries.path, {str(key): value[key] for key in value})
-    numbers = _read_coefficients(roi, ("x_offset", "y_offset", "height", "width"))
-    x, y, height, width = numbers.values()
+    numbers = _read_optional_numbers(roi, ("x_offset", "y_offset", "height", "width"))
     roi.get("dorectify")  # counts as read: it changes nothing in a full image
-    if (x, y) != (0.0, 0.0) or (height, width) not in ((0.0, 0.0), size):
+    offset = (numbers["x_offset"], numbers["y_offset"])
+    roi_size = (numbers["height"], numbers["width"])
+    if offset != (0.0, 0.0) or roi_size not in ((0.0, 0.0), size):
         raise FileFormatError(
             f"{entries.path}: expected a camera_info of whole pictures, got one of a "
             "part (roi); set it to 0"
@@ -709,7 +729,7 @@ def _check_roi(entries: Entries, size: tuple[float, float]) -> list[str]:
 def _find_kind(path: str, model: object) -> str:
     """Return the kind of a distortion model by the name that a tool gives it."""
     name = re.sub(r"[-\s]", "_", str(model or "").strip().lower())
-    if name == "pinhole":
+    if name == "pinhole":  # without distortion, or with this one
         return BROWN_CONRADY
     if name not in KIND_OF_DISTORTION:
         advice = describe_projection(name) or "; calibrate with one of these"

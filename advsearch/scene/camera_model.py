@@ -49,13 +49,16 @@ COEFFICIENTS_OF_KIND: Mapping[str, tuple[str, ...]] = {
     EQUIRECTANGULAR: (),
 }
 """The coefficients that each kind of model has."""
-# Limit of the steps of an inversion; nearly all converge in five.
+# Limit of the steps of an inversion of radii; nearly all converge in five.
 MAX_STEPS = 60
+# The same in two dimensions, where no bisection can follow when Newton's method fails.
+MAX_STEPS_2D = 20
 TOLERANCE = 1e-10  # distance, in focal lengths, under which an inversion has converged
 MAX_TANGENT = math.tan(
     math.radians(80.0)
 )  # tangent of the widest half angle that is framed
 MAX_RAY_TANGENT = 1e6  # limit of the tangents of rays
+BORDER_POINTS = 512  # points on a line from the axis to a border of the image
 VectorFunction = Callable[[Tensor], Tensor]
 
 
@@ -92,8 +95,7 @@ class CameraModel:
         if "camera.fov" in setting_names:
             raise InputError(
                 f"`camera={self.name}` and `set` camera.fov contradict each other: the "
-                "camera has focal lengths of its "
-                "own; leave one of the two out"
+                "camera has focal lengths of its own; leave one of the two out"
             )
 
     # ---- Projection and rays ----
@@ -108,8 +110,7 @@ class CameraModel:
         """
         x, y, z = points.double().unbind(dim=-1)
         if self.kind == EQUIRECTANGULAR:
-            # All but NaN are visible.
-            return _project_to_panorama(x, y, z), x == x
+            return _project_to_panorama(x, y, z), ~torch.isnan(x)
         if self.kind == FISHEYE:
             distorted, is_visible = self._project_fisheye(x, y, z)
         else:
@@ -126,7 +127,7 @@ class CameraModel:
         """Return distorted points (N, 2) in focal lengths, and which are visible."""
         distance = torch.hypot(x, y)
         angle = torch.atan2(distance, z)
-        # 1e-300: on the axis x and y are 0 whatever the scale
+        # 1e-300: on the axis the distance is 0, and so are x and y whatever the scale
         scale = self._distort_radius(angle) / distance.clamp_min(1e-300)
         distorted = torch.stack([x * scale, y * scale], dim=-1)
         return distorted, angle <= self._max_visible
@@ -145,10 +146,8 @@ class CameraModel:
     def compute_rays(self, image_points: Tensor) -> tuple[Tensor, Tensor]:
         """Return the rays of image coordinates (N, 2).
 
-        They are found by Newton's method, kept within bounds by bisection, and checked:
-        coordinates whose inversion has not converged to the branch that the axis is on
-        are outside of the view. The radial distortion is inverted first; if there is
-        decentering too, that is where an inversion in two dimensions starts.
+        The distortion is inverted step by step. Coordinates whose inversion has not
+        converged, before the angle at which the lens folds, are outside of the view.
 
         Returns:
             Directions (N, 3) float64, unit vectors for a fisheye and a panorama, else
@@ -159,24 +158,38 @@ class CameraModel:
         if self.kind == EQUIRECTANGULAR:
             return _compute_panorama_directions(u, v), torch.ones_like(u)
         distorted = self._to_distorted(u, v)
+        if self.kind == FISHEYE:
+            return self._compute_fisheye_rays(distorted)
+        return self._compute_perspective_rays(distorted)
+
+    def _compute_fisheye_rays(self, distorted: Tensor) -> tuple[Tensor, Tensor]:
+        """Return unit directions and margins of distorted points, see `compute_rays`.
+
+        The points (N, 2) are in focal lengths.
+        """
+        radius = distorted.norm(dim=-1)
+        radial_direction = distorted / radius.clamp_min(1e-300)[..., None]
+        # beyond the circle of the image too, so that the margin changes sign there
+        angle, converged = self._invert_radial(radius, min(self.fold_angle, math.pi))
+        directions = torch.cat(
+            [radial_direction * angle.sin()[..., None], angle.cos()[..., None]], dim=-1
+        )
+        max_radius = self._compute_edge_radius()
+        return directions, _clip_margin(max_radius - radius, converged)
+
+    def _compute_perspective_rays(self, distorted: Tensor) -> tuple[Tensor, Tensor]:
+        """Return directions with z = 1 and margins of distorted points.
+
+        The points (N, 2) are in focal lengths; for the result see `compute_rays`. The
+        radial distortion is inverted first; with decentering, an inversion in two
+        dimensions starts from there.
+        """
         radius = distorted.norm(dim=-1)
         radial_direction = distorted / radius.clamp_min(1e-300)[..., None]
         max_visible = min(self._max_visible, MAX_RAY_TANGENT)
-        max_radius = float(
-            self._distort_radius(torch.tensor([max_visible], dtype=torch.float64))
-        )
-        if self.kind == FISHEYE:
-            # Beyond its circle too, for the edge of the view.
-            angle, converged = self._invert_radial(
-                radius, min(self.fold_angle, math.pi)
-            )
-            directions = torch.cat(
-                [radial_direction * angle.sin()[..., None], angle.cos()[..., None]],
-                dim=-1,
-            )
-            return directions, _clip_margin(max_radius - radius, converged)
         undistorted_radius, converged = self._invert_radial(radius, max_visible)
         undistorted = radial_direction * undistorted_radius[..., None]
+        # p1 and the numbers after it do not depend on the radius alone
         has_decentering = any(self.numbers[NUMBER_NAMES.index("p1") :])
         if has_decentering:
             undistorted, converged = self._invert_distortion(
@@ -186,7 +199,15 @@ class CameraModel:
         directions = torch.cat(
             [undistorted, torch.ones_like(undistorted[..., :1])], dim=-1
         )
+        max_radius = self._compute_edge_radius()
         return directions, _clip_margin(max_radius - radius, converged)
+
+    def _compute_edge_radius(self) -> float:
+        """Return the distorted radius, in focal lengths, of the edge of the view."""
+        max_visible = min(self._max_visible, MAX_RAY_TANGENT)
+        return float(
+            self._distort_radius(torch.tensor([max_visible], dtype=torch.float64))
+        )
 
     def _to_distorted(self, u: Tensor, v: Tensor) -> Tensor:
         """Return distorted points (N, 2) at image coordinates (N,): invert
@@ -210,8 +231,9 @@ class CameraModel:
     def _invert_radial(self, target: Tensor, max_value: float) -> tuple[Tensor, Tensor]:
         """Solve radial(x) = target for x within [0, max_value], where radial grows.
 
-        By Newton's method. Each solution has a bracket, which every step narrows; a
-        step that would leave it is replaced by the bracket's middle.
+        By Newton's method. Each solution has a bracket, two bounds between which it
+        lies, and which every step narrows; a step that would leave the bracket is
+        replaced by its middle.
 
         Args:
             target: (N,) distorted radii.
@@ -220,14 +242,8 @@ class CameraModel:
         Returns:
             The solutions (N,), and which of them have converged.
         """
-        # A bracket as small as it can be, for few bisections.
-        bound = min(1.0, max_value)
-        while bound < max_value and float(
-            self._distort_radius(torch.tensor(bound, dtype=torch.float64))
-        ) < float(target.max()):
-            bound = min(2.0 * bound, max_value)
         lower = torch.zeros_like(target)
-        upper = torch.full_like(target, bound)
+        upper = torch.full_like(target, self._find_upper_bound(target, max_value))
         radius = torch.minimum(target, upper)
         for _ in range(MAX_STEPS):
             # `radial` as a function with one component for each point
@@ -244,13 +260,29 @@ class CameraModel:
             is_within = (newton_radius > lower) & (newton_radius < upper)
             radius = torch.where(is_within, newton_radius, (lower + upper) / 2.0)
         residual = (self._distort_radius(radius) - target).abs()
-        # wider than in the loop, where a narrow bracket counts as solved too
+        # 1e3: a solution whose bracket was narrow has a larger residual
         return radius, residual <= 1e3 * TOLERANCE * (1.0 + target)
+
+    def _find_upper_bound(self, target: Tensor, max_value: float) -> float:
+        """Return a bound of all solutions of `_invert_radial`, doubled up from 1.
+
+        A small bound takes fewer bisections than `max_value`, which it does not exceed.
+        """
+        bound = min(1.0, max_value)
+        while bound < max_value:
+            # the largest radius with a solution up to the bound
+            reached_radius = self._distort_radius(
+                torch.tensor(bound, dtype=torch.float64)
+            )
+            if not float(reached_radius) < float(target.max()):
+                break
+            bound = min(2.0 * bound, max_value)
+        return bound
 
     def _invert_distortion(
         self, undistorted: Tensor, distorted: Tensor, max_radius: float
     ) -> tuple[Tensor, Tensor]:
-        """Solve distort(x) = distorted by Newton's method in two dimensions.
+        """Solve distort(x) = distorted for points x by Newton's method.
 
         A step that leaves the circle of `max_radius` ends at its border, and one that
         is not finite is not taken.
@@ -264,7 +296,7 @@ class CameraModel:
             The solutions (N, 2); and which have converged before the lens folds.
         """
         converged = torch.zeros_like(undistorted[..., 0], dtype=torch.bool)
-        for _ in range(MAX_STEPS // 3):
+        for _ in range(MAX_STEPS_2D):
             values, jacobian_rows = _evaluate_with_jacobian(self._distort, undistorted)
             residual = values - distorted
             step, determinant = _solve_two_by_two(jacobian_rows, residual)
@@ -276,7 +308,7 @@ class CameraModel:
             if bool(converged.all()):
                 break
             updated = undistorted - step
-            # scaled back to the circle if it is outside
+            # the factor below is 1 inside the circle, and leads back to it from outside
             radius = updated.norm(dim=-1, keepdim=True)
             updated = torch.where(
                 torch.isfinite(radius),
@@ -352,8 +384,8 @@ class CameraModel:
         They are the tangential distortion (p1 and p2: the lens stands off the axis) and
         that of a thin prism (s1 to s4), in focal lengths; see the formulas above.
         """
-        (p1, p2, s1, s2, s3, s4) = self.numbers[NUMBER_NAMES.index("p1") :]
-        (x, y) = undistorted.unbind(dim=-1)
+        p1, p2, s1, s2, s3, s4 = self.numbers[NUMBER_NAMES.index("p1") :]
+        x, y = undistorted.unbind(dim=-1)
         square = x * x + y * y
         x_shift = (
             2.0 * p1 * x * y + p2 * (square + 2.0 * x * x) + square * (s1 + s2 * square)
@@ -377,58 +409,57 @@ class CameraModel:
         # 17 points on each side of the rectangle
         grid = torch.linspace(-1.0, 1.0, 17, dtype=torch.float64)
         ones = torch.ones_like(grid)
-        border = torch.stack(
-            [
-                torch.cat([grid, grid, ones, -ones]),
-                torch.cat([ones, -ones, grid, grid]),
-            ],
-            dim=-1,
-        )
-        border = border * torch.tensor(edges, dtype=torch.float64)
+        x = torch.cat([grid, grid, ones, -ones])
+        y = torch.cat([ones, -ones, grid, grid])
+        border = torch.stack([x, y], dim=-1) * torch.tensor(edges, dtype=torch.float64)
         for fraction in torch.linspace(1.0, 0.02, 50).tolist():
             points = torch.cat(
                 [fraction * border, torch.ones_like(border[:, :1])], dim=-1
             )
             coordinates, is_visible = self.project(points)
-            is_in_image = (coordinates >= -1e-6).all(dim=-1) & (
-                coordinates <= 1.0 + 1e-6
-            ).all(dim=-1)
-            if bool((is_visible & is_in_image).all()):
+            is_in_image = (coordinates >= -1e-6) & (coordinates <= 1.0 + 1e-6)
+            if bool((is_visible & is_in_image.all(dim=-1)).all()):
                 break
+        # of the last step if no step has all of the border in the image
         return fraction * edges[0], fraction * edges[1]
 
     def _compute_edge_tangents(self) -> list[float]:
         """Return the tangents at which the image ends along x and along y.
 
-        A tangent is that of the angle to the axis. It is found on the row and the
-        column of pixels through the axis: of both edges the nearer one counts, at most
-        `MAX_TANGENT`. Where the view ends before the edge, that is the edge.
+        A tangent is that of the angle to the axis. Of both edges along an axis the
+        nearer one counts, at most `MAX_TANGENT`.
         """
         center, _ = self.project(torch.tensor([[0.0, 0.0, 1.0]]))
         edge_tangents = []
         for axis in (0, 1):
-            # 512 points from the axis to one edge, then to the other
-            line_points = center.repeat(512, 1)
-            border_tangents = []
-            for border in (0.0, 1.0):
-                line_points[:, axis] = torch.linspace(
-                    float(center[0, axis]), border, 512, dtype=torch.float64
-                )
-                directions, margin = self.compute_rays(line_points)
-                # 0.1: rays almost aside, at more than about 84 degrees, do not count
-                is_visible = (margin > 0.0) & (directions[:, 2] > 0.1)
-                line_tangents = directions[:, axis].abs() / directions[:, 2].clamp_min(
-                    0.1
-                )
-                border_tangents.append(
-                    float(
-                        torch.where(
-                            is_visible, line_tangents, torch.zeros_like(line_tangents)
-                        ).max()
-                    )
-                )
+            border_tangents = [
+                self._compute_border_tangent(center, axis, border)
+                for border in (0.0, 1.0)
+            ]
             edge_tangents.append(max(1e-3, min(MAX_TANGENT, *border_tangents)))
         return edge_tangents
+
+    def _compute_border_tangent(
+        self, center: Tensor, axis: int, border: float
+    ) -> float:
+        """Return the largest tangent on the line from the axis to an image border.
+
+        Args:
+            center: (1, 2) image coordinates of the axis.
+            axis: 0 for a line along x, 1 along y.
+            border: image coordinate of the border, 0 or 1.
+        """
+        line_points = center.repeat(BORDER_POINTS, 1)
+        line_points[:, axis] = torch.linspace(
+            float(center[0, axis]), border, BORDER_POINTS, dtype=torch.float64
+        )
+        directions, margin = self.compute_rays(line_points)
+        # 0.1: rays almost aside, at more than about 84 degrees, do not count
+        is_visible = (margin > 0.0) & (directions[:, 2] > 0.1)
+        tangents = directions[:, axis].abs() / directions[:, 2].clamp_min(0.1)
+        return float(
+            torch.where(is_visible, tangents, torch.zeros_like(tangents)).max()
+        )
 
     @cached_property
     def black_fraction(self) -> float:
@@ -449,9 +480,8 @@ class CameraModel:
         if self.fold_angle < math.radians(self.max_angle):
             sentence = (
                 f"{name}: the lens folds at {math.degrees(self.fold_angle):.1f} "
-                "degrees "
-                f"from its axis, and {black_part}, which only directions beyond that "
-                "would fill, is black."
+                f"degrees from its axis, and {black_part}, which only directions "
+                "beyond that would fill, is black."
             )
         return (*self.reading_notes, sentence)
 
@@ -472,8 +502,8 @@ class CameraModel:
             )
         return (
             f"{self.name} is for {model_width} x {model_height} pixels (width x "
-            "height): its focal lengths and its principal point "
-            f"are scaled to {width} x {height}{stretch_text}.",
+            f"height): its focal lengths and its principal point are scaled to {width} "
+            f"x {height}{stretch_text}.",
         )
 
 
@@ -484,6 +514,7 @@ def make_pinhole(fov: float, aspect: float) -> CameraModel:
         fov: field of view of the larger side, degrees.
         aspect: width divided by height.
     """
+    # in larger sides: half a side is seen at half the angle
     focal = 0.5 / math.tan(math.radians(fov) / 2.0)
     # Lengths along x are in image widths, those along y in image heights.
     fx = focal * max(1.0, 1.0 / aspect)
@@ -501,15 +532,12 @@ def make_bundled_models(aspect: float = 1.0) -> Mapping[str, CameraModel]:
     has all directions.
     """
     focal = 1.0 / math.pi  # an angle of pi / 2 reaches half of the side
+    # focal lengths as fractions of width and height
+    focal_x = focal * min(1.0, 1.0 / aspect)
+    focal_y = focal * min(1.0, aspect)
     no_distortion = [0.0] * len(COEFFICIENTS)
-    fisheye = (
-        focal * min(1.0, 1.0 / aspect),
-        focal * min(1.0, aspect),
-        0.5,
-        0.5,
-        0.0,
-        *no_distortion,
-    )
+    # in the order of `NUMBER_NAMES`: fx, fy, cx, cy, skew and the coefficients
+    fisheye = (focal_x, focal_y, 0.5, 0.5, 0.0, *no_distortion)
     panorama = (1.0, 1.0, 0.5, 0.5, 0.0, *no_distortion)
     return {
         FISHEYE: CameraModel(FISHEYE, fisheye, FISHEYE, max_angle=90.0),

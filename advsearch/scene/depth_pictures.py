@@ -1,7 +1,7 @@
 """Pictures of depth: how far what a photograph shows is from its camera.
 
-Depth counts along the camera's axis, as depth cameras and BOP have it. 0, and what is no
-finite number, is unknown.
+Depth counts along the camera's axis, as depth cameras and BOP have it. 0, and what is
+no finite number, is unknown.
 """
 
 from __future__ import annotations
@@ -38,8 +38,9 @@ def check_no_depth(mode: str, path: Path) -> None:
     """Raise FileFormatError if a mask has the mode of a picture of depth."""
     if mode in LEVEL_BITS:
         raise FileFormatError(
-            f"{path}: expected a mask of 8 bits, got a picture of 16 bits; if it is one "
-            f"of depth, give the metres of a level behind its name, as in {path}#0.001"
+            f"{path}: expected a mask of 8 bits, got a picture of 16 bits; if it is "
+            "one of depth, give the metres of a level behind its name, as in "
+            f"{path}#0.001"
         )
 
 
@@ -60,24 +61,16 @@ def read_depth(spec: str | Path) -> Float32Array:
     scaled = SCALED.fullmatch(str(spec))
     path = Path(scaled["path"] if scaled else spec)
     metres = float(scaled["metres"]) if scaled else 1.0
-    suffix = path.suffix.lower()
-    if suffix == EXR_SUFFIX:
-        planes, _ = read_exr(path, _read_file(path))
-        channels = np.stack(planes, axis=2)
-    elif suffix == ARRAY_SUFFIX:
-        channels = _read_array(path)[..., None]
-    else:
-        with open_image(path, LARGEST_FILE) as image:
-            check_decodable(image, path)
-            levels = np.asarray(image)
-        channels = levels if levels.ndim == 3 else levels[..., None]
-    # a grey picture may be stored as three equal channels
-    if (channels != channels[..., :1])[np.isfinite(channels)].any():
+    channels = _read_channels(path)
+    # A grey picture may be stored as three equal channels. NaN differs from itself.
+    differs_from_first = channels != channels[..., :1]
+    if differs_from_first[np.isfinite(channels)].any():
         raise FileFormatError(
             f"{path}: expected one depth for each pixel, got channels that differ; "
             "save depth as grey"
         )
     depth = channels[..., 0].astype(np.float64) * metres
+    # 0 is how cameras of depth write that they do not know it
     depth[~np.isfinite(depth) | (depth == 0.0)] = np.inf
     known = depth[np.isfinite(depth)]
     if known.size and not 0.0 < known.min() <= known.max() <= MAX_DEPTH:
@@ -97,6 +90,20 @@ def _read_file(path: Path) -> bytes:
             f"{path}: expected a picture of depth, got one that cannot be read "
             f"({reason}); check the path"
         ) from error
+
+
+def _read_channels(path: Path) -> np.ndarray:
+    """Return what a picture of depth has in its channels (H, W, c), as it is stored."""
+    suffix = path.suffix.lower()
+    if suffix == EXR_SUFFIX:
+        planes, _ = read_exr(path, _read_file(path))
+        return np.stack(planes, axis=2)
+    if suffix == ARRAY_SUFFIX:
+        return _read_array(path)[..., None]
+    with open_image(path, LARGEST_FILE) as image:
+        check_decodable(image, path)
+        levels = np.asarray(image)
+    return levels if levels.ndim == 3 else levels[..., None]
 
 
 def _read_array(path: Path) -> np.ndarray:

@@ -1,5 +1,6 @@
-"""A scene as its users have it: `SceneData` with its light, its exposure, its cameras and
-what there is to say of it. And `load_description`, which reads one.
+"""A scene as its users have it: `SceneData` with its light, exposure and cameras.
+
+It also has what there is to say of the scene. `load_description` reads one.
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy.typing as npt
 import torch
@@ -37,6 +38,7 @@ from advsearch.scene.camera_entries import (
     PRESETS,
     TABLE_HEIGHT,
     TABLE_SIDE,
+    CameraPreset,
 )
 from advsearch.scene.camera_files import read_camera
 from advsearch.scene.camera_model import make_bundled_models
@@ -128,8 +130,7 @@ class SceneDescription(SceneData):
             )
             raise InputError(
                 f"`controls` {part.name}: the scene has something of that name "
-                "already; choose another name, as in "
-                f"light:{part.name}-2{alternative}"
+                f"already; choose another name, as in light:{part.name}-2{alternative}"
             )
         return replace(self, parts=(*self.parts, part))
 
@@ -175,16 +176,31 @@ class SceneDescription(SceneData):
             photograph = read_backdrop(photograph)
         if occluder is not None:
             photograph = with_front(photograph, occluder)
-        others = sorted(
+        self._check_backdrop(photograph)
+        values = dict(self.values)
+        if "ground.size" not in self.requested:
+            values["ground.size"] = PLANE_SIZE
+        scene = replace(
+            self, backdrop=True, backdrop_photograph=photograph, values=values
+        )
+        return with_requested_ground(scene)
+
+    def _check_backdrop(self, photograph: BackdropPhotograph) -> None:
+        """Check that nothing that was requested contradicts a photograph as backdrop.
+
+        Raises InputError: a ground other than the plane, a rig, or drops on the lens.
+        """
+        other_grounds = sorted(
             name
             for name in self.requested - PLANE_SETTINGS
             if name.startswith("ground.")
         )
-        if others:
+        if other_grounds:
             raise InputError(
-                f"`backdrop={photograph.spec}` and `set` {others[0]} contradict each "
-                "other: the ground of a photograph is a plane that takes the shadow, "
-                f"with {', '.join(sorted(PLANE_SETTINGS))}; leave one of the two out"
+                f"`backdrop={photograph.spec}` and `set` {other_grounds[0]} contradict "
+                "each other: the ground of a photograph is a plane that takes the "
+                f"shadow, with {', '.join(sorted(PLANE_SETTINGS))}; leave one of the "
+                "two out"
             )
         if self.rig:
             raise InputError(
@@ -197,13 +213,6 @@ class SceneDescription(SceneData):
                 f"`backdrop={photograph.spec}` and `set` camera.drops contradict each "
                 "other: drops would show the photograph; leave one of the two out"
             )
-        values = dict(self.values)
-        if "ground.size" not in self.requested:
-            values["ground.size"] = PLANE_SIZE
-        scene = replace(
-            self, backdrop=True, backdrop_photograph=photograph, values=values
-        )
-        return with_requested_ground(scene)
 
     def with_measured_view(
         self,
@@ -266,6 +275,8 @@ class SceneDescription(SceneData):
         to_world = pose @ AXES
         to_world[:3, 3] /= self.object.size_in_metres
         model.check_no_fov(self.requested)
+        # of half the width and half the height; the larger one is that of the larger
+        # side
         tangents = (0.5 / model.values["fx"], 0.5 / model.values["fy"])
         fov = 2.0 * math.degrees(math.atan(max(tangents)))
         cameras = {**self.cameras, spec: PosedCamera(to_world, fov)}
@@ -306,9 +317,8 @@ class SceneDescription(SceneData):
         if camera != ORBIT_CAMERA and camera_settings:
             raise InputError(
                 f"`camera={camera}` and `set` {camera_settings[0]} contradict each "
-                "other: "
-                "the camera of the file has a place and "
-                "a field of view of its own; leave one of the two out"
+                "other: the camera of the file has a place and a field of view of its "
+                "own; leave one of the two out"
             )
         return replace(scene, camera=camera)
 
@@ -334,17 +344,19 @@ class SceneDescription(SceneData):
                 "Or give the path of a camera file, such as calib.yaml.",
             )
         scene = self
-        model = make_bundled_models().get(camera)
-        if is_path(camera):
-            rig = read_rig(camera)
-            if rig:
-                model = rig[0].model
-                scene = replace(scene, rig=rig, rig_spec=camera)
-                if rig[0].fov is not None:
-                    scene = scene.with_values(camera__fov=rig[0].fov)
-            else:
-                with track_opened_files(camera.partition("#")[0]):
-                    model = read_camera(camera)
+        # empty for a bundled model, and for a file with one camera
+        rig = read_rig(camera) if is_path(camera) else ()
+        if rig:
+            first_camera = rig[0]
+            model = first_camera.model
+            scene = replace(scene, rig=rig, rig_spec=camera)
+            if first_camera.fov is not None:
+                scene = scene.with_values(camera__fov=first_camera.fov)
+        elif is_path(camera):
+            with track_opened_files(camera.partition("#")[0]):
+                model = read_camera(camera)
+        else:
+            model = make_bundled_models()[camera]
         if model is not None:
             model.check_no_fov(self.requested)
         return replace(scene, camera_model=model)
@@ -362,15 +374,36 @@ class SceneDescription(SceneData):
         if self.object.size_in_metres is None:
             raise InputError(
                 f"`camera={name}` is {preset.height:g} m high, and how large "
-                f"{self.object.name} is is not known; give "
-                "its longest side in metres, such as `size=0.1`"
+                f"{self.object.name} is is not known; give its longest side in metres, "
+                "such as `size=0.1`"
             )
-        is_on_plane = (
+        preset_values = {
+            setting: value
+            for setting, value in self._make_preset_values(preset).items()
+            if setting not in self.requested
+        }
+        values = {**self.values, **preset_values}
+        scene = replace(
+            self, camera=ORBIT_CAMERA, camera_model=None, preset=name, values=values
+        )
+        if "camera.distance" in self.requested:
+            return scene
+        fov = torch.tensor(scene.get_number("camera.fov"), dtype=torch.float64)
+        framing = float(geometry.compute_framing_distance(scene, fov, scene.aspect))
+        distance = max(preset.distance, framing * scene.size_in_metres)
+        return scene.with_values(camera__distance=distance)
+
+    def _make_preset_values(self, preset: CameraPreset) -> dict[str, float]:
+        """Return the settings of a mounted camera, but its distance, by name.
+
+        A small object on a plain ground stands on a table, whose side is set too.
+        """
+        is_on_plain_ground = (
             self.get_number("ground.size") > 0.0
             and self.photograph is None
             and not is_paved(self)
         )
-        is_on_table = is_on_plane and self.object.size_in_metres <= MAX_TABLETOP_SIZE
+        is_on_table = is_on_plain_ground and self.size_in_metres <= MAX_TABLETOP_SIZE
         preset_values = {"camera.fov": preset.fov}
         if "camera.elevation" not in self.requested:
             place = find_place(self)
@@ -382,19 +415,7 @@ class SceneDescription(SceneData):
             preset_values["camera.azimuth"] = 0.0
         if is_on_table:
             preset_values["ground.size"] = TABLE_SIDE / self.size_in_metres
-        values = dict(self.values)
-        for setting, value in preset_values.items():
-            if setting not in self.requested:
-                values[setting] = value
-        scene = replace(
-            self, camera=ORBIT_CAMERA, camera_model=None, preset=name, values=values
-        )
-        if "camera.distance" in self.requested:
-            return scene
-        fov = torch.tensor(scene.get_number("camera.fov"), dtype=torch.float64)
-        framing = float(geometry.compute_framing_distance(scene, fov, scene.aspect))
-        distance = max(preset.distance, framing * scene.size_in_metres)
-        return scene.with_values(camera__distance=distance)
+        return preset_values
 
     @property
     def things(self) -> Mapping[str, ThingPart]:
@@ -541,13 +562,12 @@ class SceneDescription(SceneData):
         requested: dict[str, float | str] = {}
         for name in self.requested & self.values.keys():
             value = self.values[name]
+            if value is None:
+                continue
+            requested[name] = value
             setting = settings.find_parameter(name)
-            if value is not None:
-                requested[name] = (
-                    setting.options[int(value)]
-                    if setting is not None and setting.options
-                    else value
-                )
+            if setting is not None and setting.options:
+                requested[name] = setting.options[int(value)]
         return requested
 
     @property
@@ -558,21 +578,33 @@ class SceneDescription(SceneData):
         it is set; else that of the photograph that the scene is rendered into; else the
         metered one, or 1 where exposure is not metered.
         """
-        stops = self.values.get("camera.ev")
-        unit = None if self.environment is None else self.environment.candelas
-        if stops is None and self.backdrop_photograph is not None:
+        exposure_value = self.values.get("camera.ev")
+        exposure = 1.0
+        if exposure_value is not None:
+            exposure = self._compute_exposure(exposure_value)
+        elif self.backdrop_photograph is not None:
             exposure = compute_photograph_gain(self, self.backdrop_photograph)
-        elif stops is None:
-            exposure = compute_metered_gain(self) if self.metered else 1.0
-        elif unit is None:
+        elif self.metered:
+            exposure = compute_metered_gain(self)
+        return exposure * math.pow(2.0, self.get_number("camera.exposure"))
+
+    def _compute_exposure(self, exposure_value: float) -> float:
+        """Return the factor from scene radiance to display-linear values of an EV.
+
+        A display value of 1 is where a sensor saturates: at a luminance of 1.2 times 2
+        to the power of the exposure value, in cd/m2 (Lagarde and de Rousiers 2014,
+        Moving Frostbite to PBR, section 5.1).
+
+        Raises InputError: the radiance of the environment has no unit.
+        """
+        # luminance of a radiance of 1, cd/m2
+        unit = None if self.environment is None else self.environment.candelas
+        if unit is None:
             raise InputError(
                 "`set` camera.ev: the brightness of this environment has no unit; take "
-                "one of the avenue, or leave "
-                "camera.ev out, and exposure is metered"
+                "one of the avenue, or leave camera.ev out, and exposure is metered"
             )
-        else:  # saturation (Lagarde and de Rousiers 2014, Moving Frostbite to PBR, section 5.1)
-            exposure = unit / (1.2 * math.pow(2.0, stops))
-        return exposure * math.pow(2.0, self.get_number("camera.exposure"))
+        return unit / (1.2 * math.pow(2.0, exposure_value))
 
 
 def load_description(
@@ -594,7 +626,7 @@ def load_description(
     and errors that are not listed are as of `advsearch.load_scene`.
 
     Args:
-        object_spec: object spec with `plugins` the id of a shape.
+        object_spec: name or file of the object; with `plugins` the id of a shape.
         environment_spec: `NO_ENVIRONMENT` is no map at all.
         setting_values: settings of the scene by name.
         up: the up axis of a mesh file.
@@ -606,52 +638,39 @@ def load_description(
     """
     setting_values = setting_values or {}
     values = settings.resolve_settings(setting_values)
-    file: str | Path | ObjectAsset = object_spec
-    node = None
-    if isinstance(object_spec, str):
-        file, node = split_node(object_spec)
-    is_mitsuba_file = node is not None and str(file).lower().endswith(MITSUBA_SUFFIX)
-    is_mitsuba = plugins is not None or is_mitsuba_file
-    is_scene_file = node is not None or is_mitsuba
-    _check_axes(up, facing, is_scene_file=is_scene_file, is_mitsuba=is_mitsuba)
-    if plugins is not None:
-        # Mitsuba is imported only for what it reads
-        from advsearch.scene.mitsuba_backend.scene_files import import_mitsuba_scene
-
-        imported = import_mitsuba_scene(plugins, node or str(object_spec))
-    elif node is None:
-        imported = ImportedScene(_load_object(object_spec, up, facing))
-    else:
-        imported = _import_scene_file(Path(str(file)), node, is_mitsuba=is_mitsuba)
+    source = _find_source(object_spec, plugins)
+    is_mitsuba = source.is_mitsuba
+    if source.is_scene:
+        _check_not_turned(up, facing, is_mitsuba=is_mitsuba)
+    imported = _import_source(source, object_spec, plugins, up, facing)
     imported = replace(imported, object=with_size(imported.object, size, unit))
 
-    is_lit = _has_lights(imported.surroundings)
-    if is_mitsuba and imported.object.emission is not None:
-        is_lit = True
-    lit_by = environment_spec or (NO_ENVIRONMENT if is_lit else DEFAULT_ENVIRONMENT)
+    lit_by = environment_spec or _choose_environment(imported, is_mitsuba=is_mitsuba)
     check_ground(setting_values, lit_by)
     if lit_by != NO_ENVIRONMENT:
         check_single_environment(
             imported.surroundings, f"`environment={_spec_text(lit_by)}`"
         )
-    if is_scene_file and not {"ground.size", "ground.kind"} & set(setting_values):
+    # what stands around the object has a ground of its own
+    if source.is_scene and not {"ground.size", "ground.kind"} & set(setting_values):
         values["ground.size"] = 0.0
     requested = set(setting_values)
     if environment_spec is not None:
         requested.add(ENVIRONMENT)
+    # a Mitsuba scene is seen by its first camera, unless settings describe another
     camera = ORBIT_CAMERA
     if is_mitsuba and not _describes_orbit(setting_values):
         camera = next(iter(imported.cameras), ORBIT_CAMERA)
     described = SceneDescription(
-        imported.object,
-        _load_environment(lit_by),
-        values,
-        _spec_text(object_spec),
-        _spec_text(lit_by),
-        up,
-        facing,
-        size,
-        unit,
+        object=imported.object,
+        environment=_load_environment(lit_by),
+        values=values,
+        object_spec=_spec_text(object_spec),
+        environment_spec=_spec_text(lit_by),
+        up=up,
+        facing=facing,
+        size=size,
+        unit=unit,
         requested=frozenset(requested),
         parts=imported.surroundings,
         cameras=imported.cameras,
@@ -665,12 +684,67 @@ def load_description(
     return described
 
 
-def _check_axes(
-    up: str | None, facing: str | None, *, is_scene_file: bool, is_mitsuba: bool
-) -> None:
-    """Check that a scene file is not turned. Raises InputError: it is."""
-    if not is_scene_file:
-        return
+class _Source(NamedTuple):
+    """What an object is read from."""
+
+    file: str | Path | ObjectAsset  # a file, the name of a bundled object, or itself
+    node: str | None  # node or shape of a scene file that is the object
+    is_mitsuba: bool  # whether it is a Mitsuba scene, a file or a dictionary
+
+    @property
+    def is_scene(self) -> bool:
+        """Whether there are other things around the object."""
+        return self.node is not None or self.is_mitsuba
+
+
+def _find_source(
+    object_spec: str | Path | ObjectAsset, plugins: Mapping[str, object] | None
+) -> _Source:
+    """Return what an object spec names; with `plugins` it is the id of a shape."""
+    file: str | Path | ObjectAsset = object_spec
+    node = None
+    if isinstance(object_spec, str):
+        file, node = split_node(object_spec)
+    is_mitsuba_file = node is not None and str(file).lower().endswith(MITSUBA_SUFFIX)
+    return _Source(file, node, is_mitsuba=plugins is not None or is_mitsuba_file)
+
+
+def _import_source(
+    source: _Source,
+    object_spec: str | Path | ObjectAsset,
+    plugins: Mapping[str, object] | None,
+    up: str | None,
+    facing: str | None,
+) -> ImportedScene:
+    """Read an object, and what stands around it; arguments as of `load_description`."""
+    if plugins is not None:
+        # Mitsuba is imported only for what it reads
+        from advsearch.scene.mitsuba_backend.scene_files import import_mitsuba_scene
+
+        return import_mitsuba_scene(plugins, source.node or str(object_spec))
+    if source.node is None:
+        return ImportedScene(_load_object(object_spec, up, facing))
+    return _import_scene_file(
+        Path(str(source.file)), source.node, is_mitsuba=source.is_mitsuba
+    )
+
+
+def _choose_environment(imported: ImportedScene, *, is_mitsuba: bool) -> str:
+    """Return the environment where none is requested: none where lights shine already.
+
+    What shines may be a light around the object; of a Mitsuba scene also the object.
+    """
+    object_shines = is_mitsuba and imported.object.emission is not None
+    if object_shines or _has_lights(imported.surroundings):
+        return NO_ENVIRONMENT
+    return DEFAULT_ENVIRONMENT
+
+
+def _check_not_turned(up: str | None, facing: str | None, *, is_mitsuba: bool) -> None:
+    """Check that a scene file is not to be turned.
+
+    Raises InputError: an axis is given that is to point up, or to be the front.
+    """
     if up is not None:
         reason = "glTF files have y up"
         if is_mitsuba:
@@ -769,11 +843,8 @@ def check_single_environment(parts: Iterable[ScenePart], requester: str) -> None
         if isinstance(part, PluginPart) and part.plugin.get("type") in ENVIRONMENTS:
             raise InputError(
                 f"{requester}: the Mitsuba scene has an environment of its own, "
-                f"{part.name} "
-                f"(a {part.plugin['type']}), and "
-                f"there can be one only; leave {requester} out, or take {part.name} "
-                "out of "
-                "the scene"
+                f"{part.name} (a {part.plugin['type']}), and there can be one only; "
+                f"leave {requester} out, or take {part.name} out of the scene"
             )
 
 
@@ -792,12 +863,11 @@ def check_ground(
             "`set` ground.kind=photograph: the scene has no environment map to show; "
             "give it one, or leave it out"
         )
-    described = [name for name in settings.TABLE_SETTINGS if name in requested]
-    if described:
+    table_settings = [name for name in settings.TABLE_SETTINGS if name in requested]
+    if table_settings:
         raise InputError(
-            f"`set` ground.kind={kind} and `set` {described[0]} contradict each other: "
-            "only a table has that; "
-            f"leave one of the two out"
+            f"`set` ground.kind={kind} and `set` {table_settings[0]} contradict each "
+            "other: only a table has that; leave one of the two out"
         )
 
 
@@ -816,6 +886,7 @@ def _load_object(
     if isinstance(spec, ObjectAsset):
         return spec
     if is_path(spec):
+        # any other `up` was refused with the settings
         known_up: Literal["y", "z"] | None = None
         if up == "y":
             known_up = "y"

@@ -1,6 +1,6 @@
 """Image formation: from linear radiance to the display-referred image of the model.
 
-    display = sRGB(clip(gain * denoised(radiance), 0, 1))          (IEC 61966-2-1 transfer)
+    display = sRGB(clip(gain * denoised(radiance), 0, 1))       (IEC 61966-2-1 transfer)
 
 It is part of a run, named and stored, and the same in search and verification
 (docs/design.md, "Image formation"). Verification then rounds to 8 bits, as a file
@@ -125,6 +125,10 @@ class _SrgbDisplay(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, radiance: Tensor, gain: float) -> Tensor:
+        """Return the sRGB image of radiance times a gain.
+
+        As `linear_to_srgb`, but in place where that saves memory.
+        """
         ctx.save_for_backward(radiance)
         ctx.gain = gain
         clipped = (radiance * gain).clamp_(0.0, 1.0)
@@ -162,9 +166,10 @@ def round_sample_count(sampler: str, samples: float) -> int:
     ones in products of two near numbers, orthogonal arrays in squares of primes, the
     low-discrepancy sequence in powers of four.
     """
-    # 1e-9: rounding must not add a sample
+    # less 1e-9, here and below: a number just above an integer by rounding is that
+    # integer, and needs no further sample
     count = max(1, math.ceil(samples - 1e-9))
-    root = math.isqrt(count - 1) + 1  # rounded up
+    root = math.isqrt(count - 1) + 1  # the square root of the count, rounded up
     if sampler == "stratified":
         return root**2
     if sampler == "multijitter":
@@ -173,7 +178,8 @@ def round_sample_count(sampler: str, samples: float) -> int:
     if sampler == "orthogonal":
         return next((prime for prime in PRIMES if prime >= root), PRIMES[-1]) ** 2
     if sampler == "ldsampler":
-        return int(4 ** math.ceil(math.log(max(4, count), 4) - 1e-9))
+        exponent = math.ceil(math.log(max(4, count), 4) - 1e-9)
+        return int(4**exponent)
     return count
 
 
@@ -272,22 +278,24 @@ def compute_metered_gain(scene: SceneData) -> float:
 def compute_irradiance(scene: SceneData, normals: Float64Array) -> Float64Array:
     """Return the irradiance (N, 3) on unshadowed surfaces at the object's center.
 
-    The surfaces have unit normals (N, 3).
+    It is the light of environment and ground, of lamps, and of meshes around the object
+    that emit some. The surfaces have unit normals (N, 3).
     """
     vertices = scene.base_vertices
     center = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
-    # of each direction: radiance times solid angle, which the cosine makes irradiance
+    # unit directions (W, 3) to the light, and radiance times solid angle (W, 3), which
+    # times the cosine is irradiance
     directions, power = _compute_distant_light(scene, center)
     cosines = np.maximum(np.einsum("nk,wk->nw", normals, directions), 0.0)
-    # no BLAS, whose last bits depend on its threads
+    # by `einsum`, not by BLAS, whose last bits depend on the number of threads
     irradiances = np.asarray(np.einsum("nw,wc->nc", cosines, power))
     for lamp in list_lamps(scene).values():
-        direction, lamp_irradiance = lamp.compute_lighting(center)
-        if lamp_irradiance.any():  # the lamps of controls are dark by default
-            distance = max(float(np.linalg.norm(direction)), 1e-12)
-            cosine = np.maximum(normals @ (direction / distance), 0.0)
+        to_lamp, lamp_irradiance = lamp.compute_lighting(center)
+        if lamp_irradiance.any():  # lamps that a search sets are dark by default
+            distance = max(float(np.linalg.norm(to_lamp)), 1e-12)
+            cosine = np.maximum(normals @ (to_lamp / distance), 0.0)
             irradiances = irradiances + cosine[:, None] * lamp_irradiance
-    # what the object emits belongs to what it is made of
+    # what the object itself emits does not light it from outside
     for name in scene.surrounding_meshes:
         part = scene.meshes[name]
         if part.emission is not None:
@@ -361,18 +369,19 @@ def _compute_emitted_light(
         faces each.
     """
     corners = compute_base_vertices(part)[part.mesh.faces]
-    area = compute_area_vectors(corners) / 2.0
+    area = compute_area_vectors(corners) / 2.0  # (F, 3) along the normals
     offset = corners.mean(axis=1) - point
     squared_distance = (offset * offset).sum(axis=1)
     direction = offset / np.maximum(np.sqrt(squared_distance), 1e-12)[:, None]
+    # (F, P, 2) of P points on each face
     uv = np.einsum("pk,fkc->fpc", FACE_SAMPLE_WEIGHTS, part.mesh.uvs[part.mesh.faces])
+    # centers of texels have whole coordinates here; v points up, rows go down
     height, width = emission.shape[:2]
     column = uv[..., 0] * width - 0.5
     row = (1.0 - uv[..., 1]) * height - 0.5
-    # (F, 3) mean radiance at ten points of each face
     mean_radiance = look_up_texture(emission, column, row).mean(axis=1)
     projected_area = np.maximum(-(area * direction).sum(axis=1), 0.0)
-    # irradiance = radiance * area / (distance^2 + area / pi)
+    # the form factor of a disk: area / (distance^2 + area / pi)
     disk_divisor = squared_distance + np.linalg.norm(area, axis=1) / math.pi
     return direction, mean_radiance * (projected_area / disk_divisor)[:, None]
 
@@ -410,14 +419,16 @@ def compute_visible_normals(scene: SceneData) -> Float64Array:
     camera. The image has `METERING_SIZE` pixels along its longer side.
     """
     camera = camera_to_world(scene)
+    # in the camera's coordinates: left, up and ahead
     points = (scene.base_vertices - camera[:3, 3]) @ camera[:3, :3]
     faces = scene.object.mesh.faces.astype(np.int64)
     faces = faces[(points[faces][..., 2] > MIN_DEPTH).all(axis=1)]
     frame = Frame.of(scene.get_number("camera.fov"), scene.aspect)
-    pixel, shape = _choose_metering_shape(frame)
+    pixel_width, shape = _choose_metering_shape(frame)
     tangents = points[faces][..., :2] / points[faces][..., 2:]
+    # the raster has the center of its first pixel at 0
     face, row, column, weights = rasterize_triangles(
-        (tangents - (frame.left, frame.low)) / pixel - 0.5, shape
+        (tangents - (frame.left, frame.low)) / pixel_width - 0.5, shape
     )
     # 1 / depth, unlike depth, may be interpolated linearly over the image
     nearness = (weights / points[faces[face]][..., 2]).sum(axis=1)
@@ -460,8 +471,10 @@ def _compute_unrotated_light(
     height, width = environment.radiance.shape[:2]
     rows = _find_block_starts(height, METERING_ROWS)
     columns = _find_block_starts(width, 2 * METERING_ROWS)
-    # rows 0 and -1 are the poles
+    # Angle from straight up at the border above each row, and below the last. The
+    # first and the last row have their centers at the poles: half of each is missing.
     polar = np.clip((np.arange(height + 1) - 0.5) / (height - 1), 0.0, 1.0) * math.pi
+    # of a texel in each row
     solid_angle = -np.diff(np.cos(polar)) * (2.0 * math.pi / width)
     # a fourth channel of ones sums up the solid angles
     ones = np.ones((height, width, 1))
@@ -554,29 +567,35 @@ def divide_exposure(
             moment of its own.
 
     Returns:
-        (M,) seconds from the middle of the exposure; (M, H) fractions of the rows,
-        whose columns add up to 1; and the fraction of a pixel's samples that each
-        moment takes.
+        (M,) seconds from the middle of the exposure; (M, H) the fraction of each row
+        that each moment has, whose columns add up to 1; and the fraction of a pixel's
+        samples that each moment takes.
     """
     is_from_bottom = rolling < 0.0
     rolling = abs(rolling)
     duration = (shutter + rolling) / count
     starts = torch.arange(count, dtype=torch.float64) * duration
-    # (H,) when each row opens
+    # (H,) when each row opens, seconds after the first
     opens = rolling * (torch.arange(height, dtype=torch.float64) + 0.5) / height
-    if shutter < duration:  # a row lies within one moment
-        nearest = ((opens + shutter / 2.0) / duration).long().clamp_max(count - 1)
-        fractions = torch.nn.functional.one_hot(nearest, count).T.double()
+    if shutter < duration:  # a row has the one moment that the middle of it lies in
+        moment = ((opens + shutter / 2.0) / duration).long().clamp_max(count - 1)
+        fractions = torch.nn.functional.one_hot(moment, count).T.double()
     else:
-        ends = torch.minimum(starts[:, None] + duration, opens + shutter)
-        fractions = (ends - torch.maximum(starts[:, None], opens)).clamp_min(0.0)
+        # (M, H) seconds for which moment and row overlap
+        overlap_start = torch.maximum(starts[:, None], opens)
+        overlap_end = torch.minimum(starts[:, None] + duration, opens + shutter)
+        fractions = (overlap_end - overlap_start).clamp_min(0.0)
     fractions = fractions / fractions.sum(dim=0)
     if is_from_bottom:
         fractions = fractions.flip(1)
     # middle of each moment, from the middle of the exposure
     offsets = starts + duration / 2.0 - (shutter + rolling) / 2.0
-    samples = min(1.0, duration / shutter if shutter else 1.0)
-    return offsets, fractions.float(), samples
+    # A row overlaps with shutter / duration moments, which share its samples; without a
+    # shutter one moment has all of them.
+    sample_fraction = 1.0
+    if shutter:
+        sample_fraction = min(1.0, duration / shutter)
+    return offsets, fractions.float(), sample_fraction
 
 
 # ----------------------------------------------------------------------------------

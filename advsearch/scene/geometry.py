@@ -228,6 +228,9 @@ def _compute_framing_distance_all_around(
     sine = math.sin(math.radians(elevation))
     inverse_width = 1.0 / tangents[0]
     inverse_height = 1.0 / tangents[1]
+    # A vertex at azimuth a of the circle is `outwards` towards the camera, `left` and
+    # `up` in its image. An edge needs outwards + side / tangent, of which the terms
+    # with cos(a) and sin(a) add up to the norm of their factors.
     # outwards = rho cosine cos(a) + z sine, left = rho sin(a)
     for_sides = rho * torch.sqrt(inverse_width**2 + cosine**2) + z * sine
     # up = z cosine - rho sine cos(a), and its negative for the bottom edge
@@ -272,18 +275,13 @@ def camera_to_world(
     if requested_distance is not None:
         distance = requested_distance / description.size_in_metres
     else:
-        distance = float(
-            compute_framing_distance(
-                description,
-                torch.tensor(get_number("camera.fov"), dtype=torch.float64),
-                aspect,
-            )
-        )
+        fov = torch.tensor(get_number("camera.fov"), dtype=torch.float64)
+        distance = float(compute_framing_distance(description, fov, aspect))
     elevation = get_number("camera.elevation")
     height = description.values.get("camera.height")
     if height is not None:
         center_height = float(compute_center(description)[2])
-        # from the middle of the object at this distance to the height
+        # of the elevation at which the camera has the height, at this distance
         sine = (height / description.size_in_metres - center_height) / distance
         sine = min(max(sine, -MAX_ELEVATION_SINE), MAX_ELEVATION_SINE)
         elevation = math.degrees(math.asin(sine))
@@ -365,13 +363,13 @@ def compute_car_pose(camera: Tensor) -> Tensor:
     It is level, with its +x ahead and +z up, at the height 0 below the camera;
     differentiable. A camera looks along its own +z, the third column of its pose.
     """
-    forward = camera[:2, 2] / camera[:2, 2].norm().clamp_min(1e-6)
-    zero = torch.zeros_like(forward[0])
-    unit = torch.ones_like(forward[0])
-    axes = torch.stack(
-        [forward[0], -forward[1], zero, forward[1], forward[0], zero, zero, zero, unit]
-    ).reshape(3, 3)
-    return make_affine(axes, torch.cat([camera[:2, 3], zero[None]]))
+    x, y = camera[:2, 2] / camera[:2, 2].norm().clamp_min(1e-6)
+    zero = torch.zeros_like(x)
+    unit = torch.ones_like(x)
+    # the columns of the rotation: ahead (x, y, 0), to the left (-y, x, 0), and up
+    rotation = torch.stack([x, -y, zero, y, x, zero, zero, zero, unit]).reshape(3, 3)
+    position = torch.cat([camera[:2, 3], zero[None]])
+    return make_affine(rotation, position)
 
 
 def get_positioned_part(scene: SceneData, part: ScenePart) -> Any:
@@ -443,6 +441,7 @@ def make_euler_rotation(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
     (cz, sz), (cy, sy), (cx, sx) = (
         (torch.cos(a), torch.sin(a)) for a in map(torch.deg2rad, (yaw, pitch, roll))
     )
+    # row by row
     about_z = torch.stack([cz, -sz, zero, sz, cz, zero, zero, zero, unit]).reshape(3, 3)
     about_y = torch.stack([cy, zero, sy, zero, unit, zero, -sy, zero, cy]).reshape(3, 3)
     about_x = torch.stack([unit, zero, zero, zero, cx, -sx, zero, sx, cx]).reshape(3, 3)

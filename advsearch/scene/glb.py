@@ -161,8 +161,9 @@ def encode_web_glb(
     # Rows of 3: its axes to the left, up and ahead, then its position.
     camera_rows = camera[:3].T.astype(np.float32)
     camera_matrix = np.eye(4)
-    # glTF's cameras look along their -z, with +x to the right. A row here is a column
-    # of the node's matrix, as the format stores it.
+    # glTF's cameras look along their -z, with +x to the right: the opposite of left and
+    # ahead, while up and the position stay. A row here is a column of the node's
+    # matrix, as the format stores it.
     signs = np.array([[-1.0], [1.0], [-1.0], [1.0]], np.float32)
     camera_matrix[:, :3] = _to_y_up(camera_rows * signs)
     document["cameras"] = [CAMERA_ENTRY]
@@ -295,7 +296,7 @@ def _add_texture(
 ) -> dict[str, int]:
     """Add an image file as a texture, and return the reference to it.
 
-    Each texture has an entry and an image of its own, with the same index.
+    Each texture has an image of its own, which has the same index in its list.
     """
     document["images"].append(
         {
@@ -303,8 +304,9 @@ def _add_texture(
             "bufferView": buffer.add_view(image_file),
         }
     )
-    document["textures"].append({"source": len(document["textures"]), "sampler": 0})
-    return {"index": len(document["textures"]) - 1}
+    index = len(document["textures"])
+    document["textures"].append({"source": index, "sampler": 0})
+    return {"index": index}
 
 
 def _make_material(shape: Shape, texture: dict[str, int]) -> dict[str, Any]:

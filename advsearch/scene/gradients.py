@@ -109,6 +109,7 @@ ESTIMATORS: Mapping[str, str] = {
 }
 """Every estimator by the name that forces it."""
 ADJOINT_ESTIMATORS = frozenset({"adjoint", "material"})
+ALL_GROUPS = "*"  # the name by which an estimator is forced for all groups
 # they need nothing but renders: right for any continuous coordinate
 ALWAYS_VALID_ESTIMATORS = ("differences", "secant", "none")
 # number of coordinates above which differences are not compared with an adjoint: they
@@ -255,13 +256,15 @@ class GradientPlan:
 def select_compared(valid: Sequence[str], size: int) -> tuple[str, ...]:
     """Return which of the valid estimators of a group are worth a measurement.
 
-    `size` is its number of coordinates: above `MAX_COMPARED_SIZE` only adjoints are, if
-    there are any.
+    Differences take two renders for each of the group's `size` coordinates, an adjoint
+    one for all: above `MAX_COMPARED_SIZE` only adjoints are, if there are any.
     """
     adjoints = tuple(
         estimator for estimator in valid if estimator in ADJOINT_ESTIMATORS
     )
-    return adjoints if adjoints and size > MAX_COMPARED_SIZE else tuple(valid)
+    if adjoints and size > MAX_COMPARED_SIZE:
+        return adjoints
+    return tuple(valid)
 
 
 def make_first_plan(
@@ -287,17 +290,14 @@ def make_first_plan(
         InputError: an estimator is unknown, or not valid where it was forced by name.
     """
     forced = dict(forced or {})
-    names = {key for group in groups for key in (group.name, group.control)}
+    known_names = {name for group in groups for name in (group.name, group.control)}
     for name, estimator in forced.items():
         if estimator not in ESTIMATORS:
-            raise UnknownNameError(
-                "estimator" if name == "*" else f"estimator for {name}",
-                estimator,
-                ESTIMATORS,
-            )
+            kind = "estimator" if name == ALL_GROUPS else f"estimator for {name}"
+            raise UnknownNameError(kind, estimator, ESTIMATORS)
     for name in forced:
-        if name != "*" and name not in names:
-            raise UnknownNameError("control in `estimators`", name, sorted(names))
+        if name not in (ALL_GROUPS, *known_names):
+            raise UnknownNameError("control in `estimators`", name, sorted(known_names))
     return GradientPlan(
         tuple(_plan_group(group, steps, forced, image_size) for group in groups), spp
     )
@@ -308,58 +308,67 @@ def _plan_group(
 ) -> Group:
     """Return a group with its preferred or forced estimator; see `make_first_plan`.
 
-    The step is that of a pixel. A single coordinate that moves outlines has a wider
-    one, `SEARCH_STEP`, as long as that moves them by no more than `SEARCH_FRACTION` of
-    the image. An estimator forced for the group wins over one for its control, and that
-    over one for all groups, which holds only where it is valid.
+    An estimator forced for the group wins over one for its control, and that over one
+    for all groups, which holds only where it is valid.
     """
     # the smallest: no coordinate of the group moves an outline by more than a pixel
     pixel_step = float(steps[group.coordinates].min()) if group.size else 0.0
-    step = pixel_step
-    # both estimators are right only for what moves no outline
-    moves_outlines = not {"adjoint", "image"} & {*group.valid}
-    if group.size == 1 and moves_outlines:
-        step = max(
-            pixel_step, min(SEARCH_STEP, SEARCH_FRACTION * image_size * pixel_step)
-        )
     group = replace(group, pixel=pixel_step)
     if not group.valid:
         return replace(
             group, estimator="none", reason="a discrete choice has no derivative"
         )
+    group = replace(group, step=_choose_step(group, image_size))
     forced_by_name = forced.get(group.name) or forced.get(group.control)
     if forced_by_name is not None:
-        allowed = dict.fromkeys((*group.valid, *ALWAYS_VALID_ESTIMATORS))
-        if forced_by_name not in allowed:
-            raise InputError(
-                f"`estimators` {group.name}={forced_by_name}: not valid there; expected one "
-                f"of {', '.join(allowed)}"
-            )
+        _check_is_valid(group, forced_by_name)
         return replace(
-            group,
-            estimator=forced_by_name,
-            step=step,
-            reason="forced by name",
-            is_forced=True,
+            group, estimator=forced_by_name, reason="forced by name", is_forced=True
         )
-    # "*" may also name an estimator that is always valid, but leaves what is
-    # differentiated on the picture, without a render, as it is.
-    forced_for_all = forced.get("*", "")
-    has_alternative = (
+    forced_for_all = forced.get(ALL_GROUPS)
+    # Some estimators are valid for every group, and not listed as such. But what is
+    # differentiated on the picture, without a render, stays as it is.
+    is_always_valid = (
         forced_for_all in ALWAYS_VALID_ESTIMATORS and "image" not in group.valid
     )
-    if forced_for_all in group.valid or has_alternative:
+    if forced_for_all is not None and (
+        forced_for_all in group.valid or is_always_valid
+    ):
         return replace(
-            group,
-            estimator=forced_for_all,
-            step=step,
-            reason="forced for all",
-            is_forced=True,
+            group, estimator=forced_for_all, reason="forced for all", is_forced=True
         )
     reason = "the only valid estimator"
     if len(group.valid) > 1:
         reason = f"preferred among {', '.join(group.valid)}; not measured"
-    return replace(group, estimator=group.valid[0], step=step, reason=reason)
+    return replace(group, estimator=group.valid[0], reason=reason)
+
+
+def _choose_step(group: Group, image_size: float) -> float:
+    """Return the half-width of a group's differences in u.
+
+    It is the step of a pixel, `Group.pixel`. A single coordinate that moves outlines
+    has a wider one, `SEARCH_STEP`, as long as that moves them by no more than
+    `SEARCH_FRACTION` of the image, whose longer side has `image_size` pixels.
+    """
+    # both estimators are right only for what moves no outline
+    moves_outlines = not {"adjoint", "image"} & {*group.valid}
+    if group.size != 1 or not moves_outlines:
+        return group.pixel
+    widest_step = SEARCH_FRACTION * image_size * group.pixel
+    return max(group.pixel, min(SEARCH_STEP, widest_step))
+
+
+def _check_is_valid(group: Group, estimator: str) -> None:
+    """Raise InputError if an estimator that is forced for a group is not valid there.
+
+    Those that need nothing but renders are valid for every group.
+    """
+    allowed = dict.fromkeys((*group.valid, *ALWAYS_VALID_ESTIMATORS))
+    if estimator not in allowed:
+        raise InputError(
+            f"`estimators` {group.name}={estimator}: not valid there; expected one "
+            f"of {', '.join(allowed)}"
+        )
 
 
 # ---- no second derivatives
@@ -368,11 +377,11 @@ Backward = Callable[[Any, Tensor], tuple[Tensor | None, ...]]
 
 
 def forbid_second_derivatives(backward: Backward) -> Backward:
-    """Make what a backward pass returns refuse to be differentiated again.
+    """Make what a backward pass returns raise an error when it is differentiated again.
 
-    Torch's own `once_differentiable` refuses only where the engine runs its node:
-    `torch.autograd.grad` and `functional.hessian` leave that out, and a part of the
-    derivative with it.
+    Torch's own `once_differentiable` does so only if the backward pass reaches its
+    node. `torch.autograd.grad` and `functional.hessian` may leave that node out: they
+    would return a second derivative that lacks a part.
     """
 
     @wraps(backward)
@@ -380,12 +389,14 @@ def forbid_second_derivatives(backward: Backward) -> Backward:
         """Return the derivatives, guarded if another backward pass may follow."""
         with torch.no_grad():
             derivatives = backward(ctx, cotangent)
+        # gradients are enabled here only with `create_graph`, for a second derivative
         if not torch.is_grad_enabled():
             return derivatives
+        # a guarded value depends on all that the derivative depends on
         arguments = (cotangent, *ctx.saved_tensors)
         guarded = []
         for value in derivatives:
-            # The cotangent itself, of an identity, may be differentiated.
+            # the cotangent itself, of an identity, may be differentiated
             if value is not None and value is not cotangent:
                 value = _OnceDifferentiable.apply(value, *arguments)  # type: ignore[no-untyped-call]
             guarded.append(value)
@@ -405,7 +416,6 @@ class _OnceDifferentiable(torch.autograd.Function):
     def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
         raise NotImplementedError(
             "render: it has first derivatives only, since light is differentiated by "
-            "an adjoint or by differences; "
-            "leave out what needs a second one (a Hessian, a gradient penalty), or "
-            "take differences of gradients"
+            "an adjoint or by differences; leave out what needs a second one (a "
+            "Hessian, a gradient penalty), or take differences of gradients"
         )

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from advsearch.scene import settings
-from advsearch.scene.assets import Float64Array
+from advsearch.scene.assets import EnvironmentAsset, Float64Array
 from advsearch.scene.geometry import camera_to_world, compute_center
 from advsearch.scene.parts import MeshPart, Place
 from advsearch.scene.photographed_ground import compute_irradiance
@@ -71,8 +71,7 @@ def make_traffic_remark(scene: SceneData) -> str:
     azimuth_behind = (180.0 - scene.azimuth_zero) % 360.0
     return (
         f"The camera is in the lane of {scene.object.name} and looks at its front, "
-        "against the traffic; behind it is "
-        f"`set` camera.azimuth={azimuth_behind:g}"
+        f"against the traffic; behind it is `set` camera.azimuth={azimuth_behind:g}"
     )
 
 
@@ -142,17 +141,21 @@ def load_requested_place(scene: SceneData) -> Place | None:
         if kind not in PLACE_BY_GROUND_KIND:
             return None
         return load_bundled_place(*PLACE_BY_GROUND_KIND[kind])
+    if scene.environment is None:
+        return None
     has_table_settings = not scene.requested.isdisjoint(settings.TABLE_SETTINGS)
-    is_described = scene.get_number("ground.size") <= 0.0 or has_table_settings
-    environment = scene.environment
-    return None if environment is None or is_described else environment.place
+    has_no_ground = scene.get_number("ground.size") <= 0.0
+    if has_table_settings or has_no_ground:
+        return None
+    place: Place | None = scene.environment.place
+    return place
 
 
 def with_requested_ground(scene: AnyScene) -> AnyScene:
-    """Return the scene with the road or the place that its settings ask for.
+    """Return the scene with the road or the place that its settings request.
 
-    Another one that it had is left out. The place's lamps are on at dusk: where the
-    environment has a unit, and less illuminance than `DUSK_ILLUMINANCE`.
+    Another one that it had is left out. The place's lamps are on where the light is
+    dark, see `_is_dark`.
     """
     other_parts = tuple(
         part
@@ -168,17 +171,23 @@ def with_requested_ground(scene: AnyScene) -> AnyScene:
         return replace(scene, parts=other_parts)
     environment = scene.environment
     radiance_unit = None if environment is None else environment.candelas
-    is_dark = False
-    if environment is not None and radiance_unit is not None and place.file.lamps:
-        irradiance = compute_irradiance(torch.from_numpy(environment.radiance.copy()))
-        is_dark = (
-            radiance_unit * float(irradiance @ torch.tensor(LUMINANCE))
-            < DUSK_ILLUMINANCE
-        )
+    is_dark = bool(place.file.lamps) and _is_dark(environment)
     place_parts = make_place_parts(
         place, scene.size_in_metres, radiance_unit, is_dark=is_dark
     )
     return replace(scene, parts=(*other_parts, *place_parts))
+
+
+def _is_dark(environment: EnvironmentAsset | None) -> bool:
+    """Return whether level ground has less illuminance than `DUSK_ILLUMINANCE`.
+
+    False where that is not known: without an environment, or if it has no unit.
+    """
+    if environment is None or environment.candelas is None:
+        return False
+    irradiance = compute_irradiance(torch.from_numpy(environment.radiance.copy()))
+    luminance = float(irradiance @ torch.tensor(LUMINANCE))
+    return environment.candelas * luminance < DUSK_ILLUMINANCE
 
 
 DUSK_ILLUMINANCE = (
@@ -213,6 +222,8 @@ MAX_SCALE_ERROR = 2.0  # how much too large, or too high, what stands around may
 DEFAULT_EMPTY_RADIUS = 5.0
 # degrees that a street's map may be turned by: its houses then stand beside its road
 MAX_MAP_ROTATION = 2.0
+# the range of distance and height of a picture that fits no camera
+NO_RANGE = (0.0, 0.0)
 Box = tuple[float, float, float, float]
 """From and to in x, from and to in y, metres or object sizes, with the object at (0,
 0).
@@ -255,22 +266,23 @@ def find_valid_range(
 ) -> tuple[float, float]:
     """Return up to which distance and height an environment's picture fits a camera.
 
-    In the lengths of `surroundings`, infinite without a bound; 0 and 0 where the
-    picture is turned against the ground, so that it fits nowhere. The distance has two
-    bounds, as said above: what stands around becomes too large, or the end of the
-    ground comes into sight. The camera's own distance does not count, its height and
-    angles do.
+    In the lengths of `surroundings`, infinite without a bound; `NO_RANGE` where the
+    picture is turned against the ground. The distance has two bounds, as said above:
+    what stands around becomes too large, or the end of the ground comes into sight. The
+    camera's own distance does not count, its height and angles do.
     """
-    if abs((surroundings.rotation + 180.0) % 360.0 - 180.0) > MAX_MAP_ROTATION:
-        return 0.0, 0.0
+    # from -180 to 180 degrees
+    rotation = (surroundings.rotation + 180.0) % 360.0 - 180.0
+    if abs(rotation) > MAX_MAP_ROTATION:
+        return NO_RANGE
     max_scale_distance = (MAX_SCALE_ERROR - 1.0) * _reach_of_area(
         surroundings.nearest_distance, camera.towards
     )
-    hidden_ground_distance = (
-        math.inf
-        if camera.lower_angle <= 0.0
-        else camera.height / math.tan(math.radians(min(camera.lower_angle, 179.0)))
-    )
+    # how much of the ground below the camera its image does not show
+    hidden_ground_distance = math.inf
+    if camera.lower_angle > 0.0:
+        lower_angle = math.radians(min(camera.lower_angle, 179.0))
+        hidden_ground_distance = camera.height / math.tan(lower_angle)
     ground_distance = _reach_of_area(surroundings.ground_extent, camera.azimuth)
     max_distance = min(max_scale_distance, ground_distance + hidden_ground_distance)
     return max(0.0, max_distance), MAX_SCALE_ERROR * surroundings.height
@@ -286,18 +298,16 @@ def _reach_of_area(area: Box | float, azimuth: float) -> float:
         return area
     x = math.cos(math.radians(azimuth))
     y = math.sin(math.radians(azimuth))
-    x_reach = (area[1] if x > 0.0 else -area[0]) / max(abs(x), 1e-12)
-    return min(x_reach, (area[3] if y > 0.0 else -area[2]) / max(abs(y), 1e-12))
+    x_from, x_to, y_from, y_to = area
+    x_side = x_to if x > 0.0 else -x_from
+    y_side = y_to if y > 0.0 else -y_from
+    return min(x_side / max(abs(x), 1e-12), y_side / max(abs(y), 1e-12))
 
 
 def find_surroundings(scene: SceneData) -> Surroundings | None:
-    """Return what is known of the place in a scene's environment.
+    """Return what is known of the place that a scene's environment is a picture of.
 
-    In metres; the first of these that holds. If the scene has a place as geometry and
-    the environment shows the picture of one, the picture's limits hold. A photographed
-    environment over a ground has the limits of its camera's height and of its empty
-    radius. Otherwise only the end of a paved ground counts. None where there is none,
-    or nothing of the environment's picture has to fit it.
+    In metres. None if nothing of the picture has to fit a ground.
     """
     environment = scene.environment
     # what encloses the object is geometry, true from everywhere
@@ -310,25 +320,27 @@ def find_surroundings(scene: SceneData) -> Surroundings | None:
     captured_site = (
         environment.place if bundled is None else load_bundled_place(*bundled)
     )
-    if (
-        place is not None
-        and captured_site is not None
-        and captured_site.file.picture is not None
-    ):
-        picture = captured_site.file.picture
+    picture = None if captured_site is None else captured_site.file.picture
+    # the place stands around as geometry too: the limits of its picture hold
+    if place is not None and picture is not None:
         return Surroundings(
             height=picture.height,
             nearest_distance=(*picture.x, *picture.y),
             ground_extent=extent,
             rotation=scene.get_number("environment.rotation"),
         )
+    # a photograph over a ground, with the limits of its camera's height and of the
+    # empty floor around it
     if environment.photographed and (is_paved(scene) or scene.photograph is not None):
         height = scene.capture_height * scene.size_in_metres
         radius = scene.values.get("ground.radius")
         if radius is None:
             radius = DEFAULT_EMPTY_RADIUS * height
         return Surroundings(height, radius, extent)
-    return Surroundings(math.inf, math.inf, extent) if is_paved(scene) else None
+    if not is_paved(scene):
+        return None
+    # only the end of the ground counts
+    return Surroundings(math.inf, math.inf, extent)
 
 
 def bound_ground(place: Place) -> Box:
@@ -362,23 +374,20 @@ def make_camera_view(
     if fov is None:
         fov = scene.get_number("camera.fov")
     half_fov = math.radians(fov) / 2.0
+    # the height of an image is its larger side, or smaller than that by the aspect
     half_height_angle = math.degrees(
         math.atan(math.tan(half_fov) * min(1.0, 1.0 / scene.aspect))
     )
-    # A lens of the user's may show anything down to straight below.
+    # A lens of the user's, which has a name, may show anything down to straight below.
     if scene.camera_model is not None and scene.camera_model.name:
         half_height_angle = 90.0
     azimuth = math.degrees(math.atan2(y, x))
-    level_length = math.hypot(forward[0], forward[1])
-    view_azimuth = (
-        math.degrees(math.atan2(forward[1], forward[0]))
-        if level_length > 1e-6
-        else azimuth + 180.0
-    )
-    # half the picture's angle, minus how far above the horizon its middle is
-    lower_angle = half_height_angle - math.degrees(
-        math.asin(float(np.clip(forward[2], -1.0, 1.0)))
-    )
+    view_azimuth = azimuth + 180.0  # straight down counts as towards the object
+    if math.hypot(forward[0], forward[1]) > 1e-6:
+        view_azimuth = math.degrees(math.atan2(forward[1], forward[0]))
+    # how far above the horizon the middle of the image is
+    view_elevation = math.degrees(math.asin(float(np.clip(forward[2], -1.0, 1.0))))
+    lower_angle = half_height_angle - view_elevation
     return CameraView(
         azimuth=azimuth,
         towards=view_azimuth,
@@ -427,16 +436,25 @@ def list_view_remarks(
     outside = () if place is None else list_outside_remarks(scene, place, views)
     if outside or surroundings is None:
         return outside
-    name = scene.environment_name
-    is_against_road = find_valid_range(surroundings, views[0]) == (0.0, 0.0)
-    if is_against_road or (
-        rotates_map and isinstance(surroundings.nearest_distance, tuple)
-    ):
+    is_against_road = find_valid_range(surroundings, views[0]) == NO_RANGE
+    # houses are a box beside the road, other surroundings are equally far all around
+    has_houses = isinstance(surroundings.nearest_distance, tuple)
+    if is_against_road or (rotates_map and has_houses):
         return (
-            f"{name}: its houses are a picture, which `environment.rotation` turns "
-            "against the road: they then stand "
+            f"{scene.environment_name}: its houses are a picture, which "
+            "`environment.rotation` turns against the road: they then stand "
             "across it; leave the rotation out",
         )
+    return _list_range_remarks(scene, surroundings, views)
+
+
+def _list_range_remarks(
+    scene: SceneData, surroundings: Surroundings, views: Sequence[CameraView]
+) -> tuple[str, ...]:
+    """Return a remark if views are too far or too high for an environment's picture.
+
+    Arguments are as for `list_view_remarks`; empty if no view is.
+    """
     limits = [find_valid_range(surroundings, view) for view in views]
     views_beyond = [
         view
@@ -450,12 +468,11 @@ def list_view_remarks(
     farthest = max(view.distance for view in views_beyond)
     highest = max(view.height for view in views_beyond)
     return (
-        f"{name}: the place around the object is a picture, which fits a camera up to "
-        f"{_describe_limits(limits, unit)}; {subject} "
+        f"{scene.environment_name}: the place around the object is a picture, which "
+        f"fits a camera up to {_describe_limits(limits, unit)}; {subject} "
         f"{farthest:.3g} {unit} away and {highest:.3g} {unit} high. There what stands "
-        "around is more than twice too large or "
-        "too high, or the ground ends in sight: predictions from there are about the "
-        "picture, not about a real place",
+        "around is more than twice too large or too high, or the ground ends in sight: "
+        "predictions from there are about the picture, not about a real place",
     )
 
 
@@ -466,14 +483,18 @@ def _describe_limits(limits: Sequence[tuple[float, float]], unit: str) -> str:
         limits: distance and height of each view, see `find_valid_range`.
         unit: unit of these.
     """
-    smallest = min(limits)[0]
-    largest = max(limits)[0]
-    distance = f"{smallest:.3g} {unit}"
-    if largest >= 1.05 * smallest:
-        distance = f"{smallest:.3g} to {largest:.3g} {unit} (by where it looks)"
+    distances = [distance for distance, _ in limits]
+    smallest = min(distances)
+    largest = max(distances)
+    text = f"{smallest:.3g} {unit}"
+    if largest >= 1.05 * smallest:  # else they are the same, for a reader
+        text = f"{smallest:.3g} to {largest:.3g} {unit} (by where it looks)"
+    text += " away"
+    # the height does not depend on the view
     max_height = limits[0][1]
-    height = f" and {max_height:.3g} {unit} high" if math.isfinite(max_height) else ""
-    return f"{distance} away{height}"
+    if math.isfinite(max_height):
+        text += f" and {max_height:.3g} {unit} high"
+    return text
 
 
 def _describe_position(position: Float64Array) -> str:
@@ -514,6 +535,5 @@ def list_outside_remarks(
         )
     return (
         f"{scene.environment_name}: the place holds for a camera at {box} from the "
-        f"object; {outside_views}. Predictions from "
-        "there are not about a real place",
+        f"object; {outside_views}. Predictions from there are not about a real place",
     )

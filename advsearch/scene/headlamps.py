@@ -22,9 +22,10 @@ that of a tail lamp 10 cd in red (UN Regulation 7: from 4).
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -42,7 +43,7 @@ from advsearch.scene.assets import (
 from advsearch.scene.grounds import LUMINANCE
 from advsearch.scene.parts import CAMERA, BeamLamp, LampGlass, MeshPart, ScenePart
 from advsearch.scene.scene_data import AnyScene, SceneData
-from advsearch.scene.settings import LAMPS
+from advsearch.scene.settings import LAMPS, LAMPS_OFF
 from advsearch.scene.things import ThingPart, find_triangle_heights
 
 # degrees above the horizon at which the low beam has half of what it has below
@@ -80,6 +81,8 @@ side, above the ground.
 BEAM_AXES = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 GLASS_MATERIAL = Material(roughness=0.06, specular=0.6)
 GLASS_OFFSET = 0.004  # how far glass stands out from what it lies on, metres
+# how far before the glass of a lamp its beam starts, so that the glass hides none of it
+BEAM_OFFSET = 5.0 * GLASS_OFFSET
 
 
 def compute_candela(kind: str, h: Float64Array, v: Float64Array) -> Float64Array:
@@ -142,8 +145,9 @@ def make_candela_table(kind: str) -> Float32Array:
 def add_lamps(scene: AnyScene) -> AnyScene:
     """Return the scene with the lamps that are on, and no others.
 
-    Those of its object, its things and the car of its camera; lamps that the scene has
-    already are replaced. The same scene is returned if there are neither.
+    Its object, its things and the car of its camera may carry lamps. Lamps that the
+    scene has already are replaced. The same scene is returned if it has none and gets
+    none.
 
     Raises:
         InputError: the light of the environment has no unit, the object's size is not
@@ -152,6 +156,7 @@ def add_lamps(scene: AnyScene) -> AnyScene:
     other_parts = tuple(
         part for part in scene.parts if not isinstance(part, (BeamLamp, LampGlass))
     )
+    # what each car has on: "off", "low" or "high" beam
     kind_by_carrier = {
         "object": get_lamp_kind(scene, "object.lamps"),
         CAMERA: get_lamp_kind(scene, "camera.lamps"),
@@ -160,24 +165,23 @@ def add_lamps(scene: AnyScene) -> AnyScene:
         if isinstance(part, ThingPart):
             kind_by_carrier[part.name] = part.lamps
     kind_by_lit_carrier = {
-        carrier: kind for carrier, kind in kind_by_carrier.items() if kind != LAMPS[0]
+        carrier: kind for carrier, kind in kind_by_carrier.items() if kind != LAMPS_OFF
     }
     if not kind_by_lit_carrier:
-        if len(other_parts) == len(scene.parts):
-            return scene
-        return replace(scene, parts=other_parts)
-    unit = _check_units(scene, next(iter(kind_by_lit_carrier)))
+        had_lamps = len(other_parts) < len(scene.parts)
+        return replace(scene, parts=other_parts) if had_lamps else scene
+    radiance_unit = _check_units(scene, next(iter(kind_by_lit_carrier)))
     scene = replace(scene, parts=other_parts)
     # Two beams of each car: together they are sampled as often as the environment.
     weight = 1.0 / (2 * len(kind_by_lit_carrier))
     lamps: list[ScenePart] = []
     for carrier, kind in kind_by_lit_carrier.items():
-        lamps += _make_lamps(scene, carrier, kind, unit, weight)
+        lamps += _make_lamps(scene, carrier, kind, radiance_unit, weight)
     duplicates = {part.name for part in other_parts} & {lamp.name for lamp in lamps}
     if duplicates:
         raise InputError(
-            "things: lamps of the scene are called "
-            f"{', '.join(sorted(duplicates))}; give yours another name="
+            f"things: lamps of the scene are called {', '.join(sorted(duplicates))}; "
+            "give yours another name="
         )
     return replace(scene, parts=(*other_parts, *lamps))
 
@@ -194,20 +198,22 @@ def _check_units(scene: SceneData, carrier: str) -> float:
     if radiance_unit is None:
         raise InputError(
             f"{setting}: lamps are in candela, and the brightness of this environment "
-            "has no unit; take one of the avenue, "
-            "or leave the lamps off"
+            "has no unit; take one of the avenue, or leave the lamps off"
         )
     if scene.object.size_in_metres is None:
         raise InputError(
             f"{setting}: lamps are so many metres apart, and how large "
-            f"{scene.object_name} is is not known; give its "
-            "longest side in metres, such as `size=4.5`"
+            f"{scene.object_name} is is not known; give its longest side in metres, "
+            "such as `size=4.5`"
         )
     return radiance_unit
 
 
 def get_lamp_kind(scene: SceneData, setting: str) -> str:
-    """Return the word that a setting of lamps has."""
+    """Return the word that a setting of lamps has, one of `LAMPS`.
+
+    The scene's value is the word's index; without one, lamps are off.
+    """
     return LAMPS[int(scene.values.get(setting) or 0.0)]
 
 
@@ -232,18 +238,14 @@ def _make_lamps(
     if carrier == CAMERA:
         # in the coordinates of the camera's car, see `compute_car_pose`
         left_position = np.array(EGO_LAMP_POSITION)
+        right_position = left_position * [1.0, -1.0, 1.0]
         positions = [
-            left_position / scene.size_in_metres,
-            left_position * [1.0, -1.0, 1.0] / scene.size_in_metres,
+            position / scene.size_in_metres
+            for position in (left_position, right_position)
         ]
     else:
         part = scene.meshes[carrier]
-        carrier_metres = (
-            part.size_in_metres if isinstance(part, ThingPart) else scene.size_in_metres
-        )
-        # The carrier's size in metres is that of its longest side.
-        longest_side = float(np.ptp(part.mesh.vertices, axis=0).max())
-        units_per_metre = longest_side / carrier_metres
+        units_per_metre = _count_units_per_metre(scene, part)
         front_power = HEADLAMP_CANDELA / radiance_unit * WHITE
         rear_power = TAILLAMP_CANDELA / radiance_unit * RED
         headlamp_glass = _make_glass(
@@ -266,28 +268,40 @@ def _make_lamps(
         )
 
 
+def _count_units_per_metre(scene: SceneData, part: MeshPart) -> float:
+    """Return how many units of a car's mesh are a metre.
+
+    A car's size in metres is that of its longest side; `part` is the scene's object or
+    a thing beside it.
+    """
+    metres = scene.size_in_metres
+    if isinstance(part, ThingPart):
+        metres = part.size_in_metres
+    longest_side = float(np.ptp(part.mesh.vertices, axis=0).max())
+    return longest_side / metres
+
+
 def _find_beam_positions(
     vertices: Float32Array, units_per_metre: float
 ) -> list[Float64Array]:
     """Return where the left and the right beam start, before the glass of a car.
 
     The glass is one mesh: what lies to the left of its mean is the left lamp. A beam
-    starts just before the middle of its lamp, so that the glass does not hide it.
+    starts `BEAM_OFFSET` before the middle of its lamp. The car drives along +x.
 
     Args:
         vertices: (V, 3) of the glass.
         units_per_metre: a metre in the car's coordinates.
     """
     positions = []
-    for side in (1.0, -1.0):
+    for side in (1.0, -1.0):  # +y is left
         offset = vertices[:, 1] - vertices[:, 1].mean()
         lamp_vertices = vertices[side * offset >= 0.0]
         lower = lamp_vertices.min(axis=0)
         upper = lamp_vertices.max(axis=0)
         center_yz = (lower + upper)[1:] / 2.0
-        positions.append(
-            np.array([upper[0] + 5.0 * GLASS_OFFSET * units_per_metre, *center_yz])
-        )
+        front_x = upper[0] + BEAM_OFFSET * units_per_metre
+        positions.append(np.array([front_x, *center_yz]))
     return positions
 
 
@@ -318,30 +332,19 @@ def _make_glass(
         if MATERIAL_NAMES[lamp_type].search(name) and len(faces)
     ]
     if named_faces:
-        carrier_face = np.concatenate(named_faces)
-        carrier_vertex, faces = np.unique(
-            mesh.faces[carrier_face].astype(np.int64), return_inverse=True
-        )
-        faces = faces.reshape(-1, 3)
-        normals = mesh.normals[carrier_vertex].astype(np.float64)
-        vertices = (
-            mesh.vertices[carrier_vertex] + GLASS_OFFSET * units_per_metre * normals
+        glass = _lift_faces(
+            mesh, np.concatenate(named_faces), GLASS_OFFSET * units_per_metre
         )
     else:
-        vertices, faces = _make_disks(mesh, lamp_type, facing, units_per_metre)
-        normals = np.tile([[facing, 0.0, 0.0]], (len(vertices), 1))
-        carrier_vertex = cKDTree(mesh.vertices).query(vertices)[1]
-        carrier_face = cKDTree(mesh.vertices[mesh.faces].mean(axis=1)).query(
-            vertices[faces].mean(axis=1)
-        )[1]
-    corners = vertices[faces] / units_per_metre
+        glass = _make_disks(mesh, lamp_type, facing, units_per_metre)
+    corners = glass.vertices[glass.faces] / units_per_metre
     # square metres, as seen from where the lamps shine to
     facing_area = facing * compute_area_vectors(corners)[:, 0] / 2.0
     glass_mesh = Mesh(
-        vertices=vertices.astype(np.float32),
-        faces=faces.astype(np.uint32),
-        normals=normals.astype(np.float32),
-        uvs=mesh.uvs[carrier_vertex],
+        vertices=glass.vertices.astype(np.float32),
+        faces=glass.faces.astype(np.uint32),
+        normals=glass.normals.astype(np.float32),
+        uvs=mesh.uvs[glass.vertex_of_carrier],
     )
     # the color of the light, not quite as bright as a base color may be
     glass_color = (0.8 * power / power.max()).astype(np.float32)
@@ -354,27 +357,43 @@ def _make_glass(
         material=GLASS_MATERIAL,
         emission=radiance.astype(np.float32)[None, None],
         carrier=part.name,
-        vertex_of_carrier=carrier_vertex,
-        face_of_carrier=carrier_face,
+        vertex_of_carrier=glass.vertex_of_carrier,
+        face_of_carrier=glass.face_of_carrier,
     )
+
+
+class _Glass(NamedTuple):
+    """The shape of glass, in the coordinates of the car that carries it."""
+
+    vertices: Float64Array  # (V, 3)
+    faces: IntArray  # (F, 3)
+    normals: Float64Array  # (V, 3)
+    vertex_of_carrier: IntArray  # (V,) the car's vertex that each vertex moves with
+    face_of_carrier: IntArray  # (F,) the car's face that each face is taken for
+
+
+def _lift_faces(mesh: Mesh, face: IntArray, offset: float) -> _Glass:
+    """Copy faces (F,) of a car, by index, and move them out along their normals."""
+    vertex, faces = np.unique(mesh.faces[face].astype(np.int64), return_inverse=True)
+    normals = mesh.normals[vertex].astype(np.float64)
+    vertices = mesh.vertices[vertex] + offset * normals
+    return _Glass(vertices, faces.reshape(-1, 3), normals, vertex, face)
 
 
 def _make_disks(
     mesh: Mesh, lamp_type: str, facing: float, units_per_metre: float
-) -> tuple[Float64Array, IntArray]:
+) -> _Glass:
     """Make two disks before what is foremost of a car, for lamps without a material.
 
     They lie at the height and to the sides that `LAMP_HEIGHTS` and `LAMP_OFFSET` have,
     and stand out from the car by `GLASS_OFFSET`. The first is that on the left (+y).
+    They belong to the car's nearest vertices and faces.
 
     Args:
         mesh: mesh of the car.
         lamp_type: lamp type of `MATERIAL_NAMES`.
         facing: 1 for lamps that shine along +x, -1 along -x.
         units_per_metre: a metre in the car's coordinates.
-
-    Returns:
-        Vertices (V, 3) and faces (F, 3).
     """
     # mirrored for tail lamps, so that they look along +x too
     corners = mesh.vertices[mesh.faces].astype(np.float64) * [facing, 1.0, 1.0]
@@ -384,7 +403,7 @@ def _make_disks(
     width = upper[1] - lower[1]
     # a disk takes at most a fifth of a narrow car's width
     rim_offsets = min(LAMP_RADIUS * units_per_metre, 0.1 * width) * _make_circle(facing)
-    vertices = list[Float64Array]()
+    disks = list[Float64Array]()
     for side in (1.0, -1.0):
         center_y = (lower[1] + upper[1]) / 2.0 + side * LAMP_OFFSET * width
         center = np.array([0.0, center_y, lower[2]])
@@ -397,11 +416,30 @@ def _make_disks(
             _find_foremost(corners, disk_vertices, upper[0])
             + GLASS_OFFSET * units_per_metre
         )
-        vertices.append(disk_vertices)
+        disks.append(disk_vertices)
+    return _attach_disks(mesh, disks, facing)
+
+
+def _attach_disks(mesh: Mesh, disks: Sequence[Float64Array], facing: float) -> _Glass:
+    """Return two disks as glass that is carried by a car.
+
+    Each point belongs to the nearest vertex of the car, and each face to the face
+    with the nearest center.
+
+    Args:
+        mesh: mesh of the car.
+        disks: vertices (1 + `N_SPOKES`, 3) of each: its center, and those on the rim.
+        facing: 1 for disks whose front is towards +x, -1 towards -x.
+    """
+    vertices = np.concatenate(disks)
     disk_faces = _make_disk_faces()
-    # a disk has its center and `N_SPOKES` vertices on the rim
+    # those of the second disk count on behind the vertices of the first
     faces = np.concatenate([disk_faces, (1 + N_SPOKES) + disk_faces])
-    return np.concatenate(vertices), faces
+    normals = np.tile([[facing, 0.0, 0.0]], (len(vertices), 1))
+    vertex_of_carrier = cKDTree(mesh.vertices).query(vertices)[1]
+    face_centers = mesh.vertices[mesh.faces].mean(axis=1)
+    face_of_carrier = cKDTree(face_centers).query(vertices[faces].mean(axis=1))[1]
+    return _Glass(vertices, faces, normals, vertex_of_carrier, face_of_carrier)
 
 
 def _make_circle(facing: float) -> Float64Array:
@@ -422,7 +460,7 @@ def _make_disk_faces() -> IntArray:
 def _find_foremost(corners: Float64Array, disk: Float64Array, default: float) -> float:
     """Return the largest x of triangles where a disk covers them, seen along x.
 
-    Only the disk's vertices are looked at, by their y and z; their x does not count.
+    Only the triangles at the disk's vertices count, by their y and z, not their x.
 
     Args:
         corners: (F, 3, 3) of the triangles.
@@ -435,7 +473,7 @@ def _find_foremost(corners: Float64Array, disk: Float64Array, default: float) ->
     )
     # The axis x becomes the height, since `find_triangle_heights` looks along z.
     faces_around = corners[~is_disjoint[:, 1:].any(axis=1)][:, :, [1, 2, 0]]
-    heights = [
+    foremost_x = [
         x for point in disk[:, 1:] for x in find_triangle_heights(faces_around, point)
     ]
-    return max(heights, default=default)
+    return max(foremost_x, default=default)

@@ -127,7 +127,8 @@ def _measure_edges(image: Float64Array) -> float | None:
     ratio = (narrow[is_edge] / np.maximum(wide[is_edge], 1e-12)) ** 2
     # 1.01: so blurred that both copies are alike; the upper end: not blurred at all
     ratio = np.clip(ratio, 1.01, (WIDE / NARROW) ** 2)
-    # s^2 = (b^2 - R^2 a^2) / (R^2 - 1), the formula at the top solved for s^2
+    # An edge blurred by s has the ratio (s^2 + WIDE^2) / (s^2 + NARROW^2): solved for
+    # s^2.
     squared_blur = (WIDE**2 - ratio * NARROW**2) / (ratio - 1.0)
     return float(np.sqrt(np.quantile(squared_blur, SHARP_FRACTION)))
 
@@ -151,9 +152,9 @@ def _calibrate() -> tuple[Float64Array, Float64Array]:
         )
         for index, blur in enumerate(blurs):
             image = ndimage.gaussian_filter(pixels, blur) if blur else pixels
-            measured_blurs[index] += (_measure_edges(image) or 0.0) / len(
-                CALIBRATION_ANGLES
-            )
+            # never None: an edge across the image has enough pixels
+            measured = _measure_edges(image) or 0.0
+            measured_blurs[index] += measured / len(CALIBRATION_ANGLES)
     # Strictly rising, as an interpolation needs it.
     return blurs, np.maximum.accumulate(measured_blurs + 1e-9 * np.arange(len(blurs)))
 

@@ -8,6 +8,7 @@ read through `importlib.resources`.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -56,15 +57,15 @@ def make_finished_surface(
             finish.metallic,
             finish.clearcoat,
         )
-    texel_values = face_values[rasterize_charts(mesh, MATERIAL_MAP_SIDE).face].astype(
-        np.float32
-    )
+    face_of_texel = rasterize_charts(mesh, MATERIAL_MAP_SIDE).face
+    texel_values = face_values[face_of_texel].astype(np.float32)
     surface: dict[str, object] = {
         "type": "principled",
         "base_color": {"type": BASE_COLOR, "filter_type": "bilinear"},
         "specular": main.specular,
         "clearcoat_gloss": 1.0,
     }
+    # in the order of the face values
     for channel, name in enumerate(("roughness", "metallic", "clearcoat")):
         texel_channel = texel_values[:, :, channel : channel + 1]
         surface[name] = {
@@ -120,7 +121,7 @@ def list_environments(split: str | None = None) -> tuple[str, ...]:
 
 
 def _read_environment_facts() -> dict[str, dict[str, Any]]:
-    """Return what the scripts have stored about each bundled environment, by its name."""
+    """Return what the scripts have stored about each bundled environment, by name."""
     text = (_get_data_directory() / "environments" / "environments.json").read_text(
         "utf-8"
     )
@@ -294,7 +295,20 @@ def read_light(path: Path, label: str = "environment") -> LightImage:
             tuple(notes),
         )
     planes, notes = read_exr(path, data)
-    # RGBE cannot hold such values, so that only these files are checked.
+    _check_planes(path, planes)
+
+    def read_rows(top: int, end: int) -> Float32Array:
+        """Return rows (n, W, 3) of the three planes."""
+        return np.stack([plane[top:end] for plane in planes], axis=2).astype(np.float32)
+
+    return LightImage(planes[0].shape, read_rows, tuple(notes))
+
+
+def _check_planes(path: Path, planes: Sequence[Plane]) -> None:
+    """Check the radiance of an ``.exr`` image; an ``.hdr`` can hold no wrong values.
+
+    Raises InputError: a texel is NaN, infinite or negative in one of its three planes.
+    """
     kinds: tuple[tuple[str, Callable[[Plane], BoolArray], str], ...] = (
         ("NaN", np.isnan, "paint them over"),
         (
@@ -314,12 +328,6 @@ def read_light(path: Path, label: str = "environment") -> LightImage:
                 f"{int(bad_texels.sum())} of {bad_texels.size} texels"
                 f" {kind} (the first in row {row}, column {column}: {value}); {remedy}"
             )
-
-    def read_rows(top: int, end: int) -> Float32Array:
-        """Return rows (n, W, 3) of the three planes."""
-        return np.stack([plane[top:end] for plane in planes], axis=2).astype(np.float32)
-
-    return LightImage(planes[0].shape, read_rows, tuple(notes))
 
 
 def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
@@ -366,11 +374,8 @@ def _resize_map(
 ) -> Float32Array:
     """Bring a map to a size from `MIN_MAP_SIZE` to `MAX_MAP_SIZE`.
 
-    A larger one is averaged down, of a smaller one texels are repeated. Both sides
-    shrink by the same factor. A new texel is the mean of those that it covers, weighted
-    by their solid angles, which go by the sine of the polar angle of their row: the
-    weighted texels are averaged, and divided by the averaged weights.
-    `read_rows` and `size` are as in `LightImage`.
+    A larger one is averaged down, both sides by the same factor; the texels of a
+    smaller one are repeated. `read_rows` and `size` are as in `LightImage`.
     """
     height, width = size
     shrink = min(1.0, MAX_MAP_SIZE[0] / height, MAX_MAP_SIZE[1] / width)
@@ -378,25 +383,33 @@ def _resize_map(
         texels = read_rows(0, height)
     else:
         target_shape = max(1, round(height * shrink)), max(1, round(width * shrink))
-        polar = (np.arange(height, dtype=np.float32) + np.float32(0.5)) * np.float32(
-            np.pi / height
-        )
-        row_weights = np.sin(polar)[:, None, None]
-        mean_weight = average_area(row_weights, target_shape[0], 1)
-        texels = (
-            average_in_bands(
-                lambda top, end: read_rows(top, end) * row_weights[top:end],
-                size,
-                target_shape,
-            )
-            / mean_weight
-        )
-    # rounded up; 1 for a map that is large enough
-    repeat_rows, repeat_columns = (
-        -(-smallest // extent)
-        for smallest, extent in zip(MIN_MAP_SIZE, texels.shape[:2], strict=True)
-    )
+        texels = _average_map(read_rows, size, target_shape)
+    # how often a texel is repeated along each side; 1 for a map that is large enough
+    row_repeats = math.ceil(MIN_MAP_SIZE[0] / texels.shape[0])
+    column_repeats = math.ceil(MIN_MAP_SIZE[1] / texels.shape[1])
     return np.asarray(
-        texels.repeat(repeat_rows, axis=0).repeat(repeat_columns, axis=1),
+        texels.repeat(row_repeats, axis=0).repeat(column_repeats, axis=1),
         dtype=np.float32,
     )
+
+
+def _average_map(
+    read_rows: Callable[[int, int], Float32Array],
+    size: tuple[int, int],
+    target_shape: tuple[int, int],
+) -> Float32Array:
+    """Average a map down to a shape, weighted by the solid angles of its texels.
+
+    These go by the sine of the angle between their row and straight up. The weighted
+    texels are averaged, and divided by the averaged weights. `read_rows` and `size` are
+    as in `LightImage`.
+    """
+    height = size[0]
+    polar = (np.arange(height, dtype=np.float32) + np.float32(0.5)) * np.float32(
+        np.pi / height
+    )
+    row_weights = np.sin(polar)[:, None, None]
+    weighted_mean = average_in_bands(
+        lambda top, end: read_rows(top, end) * row_weights[top:end], size, target_shape
+    )
+    return np.asarray(weighted_mean / average_area(row_weights, target_shape[0], 1))

@@ -149,8 +149,10 @@ def _project_faces(
     model = description.camera_model
     has_seam = model is not None and model.kind == EQUIRECTANGULAR
     faces = torch.from_numpy(part.mesh.faces.astype(np.int64))
+    # an opacity means cut-outs
     if part.opacity is not None or has_seam or not bool(is_before[faces].all()):
         return None
+    # positions count from the center of the image
     center = (width / 2.0, height / 2.0)
     return np.asarray(positions.numpy()[faces.numpy()] + center)
 
@@ -172,14 +174,16 @@ class _Outline:
         """
         n_rows, n_columns = self.cells.shape
         pixel_row, pixel_column = np.nonzero(mask)
+        # the cell in which the center of each pixel lies
         row = ((pixel_row + 0.5 - self.top) // self.step).astype(np.int64)
         column = ((pixel_column + 0.5 - self.left) // self.step).astype(np.int64)
         is_inside = (row >= 0) & (row < n_rows) & (column >= 0) & (column < n_columns)
-        dilated_cells = ndimage.binary_dilation(self.cells, np.ones((3, 3)))
-        clipped_cell = row.clip(0, n_rows - 1), column.clip(0, n_columns - 1)
-        return bool(
-            (is_inside & dilated_cells[clipped_cell]).mean() >= MIN_MATCHING_FRACTION
-        )
+        outline_and_neighbours = ndimage.binary_dilation(self.cells, np.ones((3, 3)))
+        # clipped only so that pixels outside of the cells have an index
+        is_near_outline = outline_and_neighbours[
+            row.clip(0, n_rows - 1), column.clip(0, n_columns - 1)
+        ]
+        return bool((is_inside & is_near_outline).mean() >= MIN_MATCHING_FRACTION)
 
 
 def _rasterise_outline(corners: Float64Array) -> _Outline:
@@ -191,10 +195,11 @@ def _rasterise_outline(corners: Float64Array) -> _Outline:
     lower = np.floor(corners.min(axis=(0, 1)))
     upper = np.ceil(corners.max(axis=(0, 1)))
     cell_width = max(1, math.ceil(float((upper - lower).max()) / MAX_OUTLINE_SIZE))
+    # one more, for what is left of a cell at the right and at the bottom
     n_columns, n_rows = map(int, (upper - lower) // cell_width + 1)
-    _, row, column, _ = rasterize_triangles(
-        (corners - lower) / cell_width - 0.5, (n_rows, n_columns)
-    )
+    # the rasteriser has the center of the first cell at 0
+    corners_in_cells = (corners - lower) / cell_width - 0.5
+    _, row, column, _ = rasterize_triangles(corners_in_cells, (n_rows, n_columns))
     cells = np.zeros((n_rows, n_columns), np.bool_)
     cells[row, column] = True
     return _Outline(cells, left=lower[0], top=lower[1], step=cell_width)

@@ -202,6 +202,7 @@ class SpotLamp(_Point):
         The irradiance is that of a surface that faces the lamp.
         """
         to_lamp, irradiance = super().compute_lighting(position)
+        # Degrees from the axis: full light up to `beam`, falling to none at `cutoff`.
         cutoff, beam = self.cone
         distance = max(float(np.linalg.norm(to_lamp)), 1e-12)
         cosine = -to_lamp @ self.to_world[:3, 2] / distance
@@ -257,8 +258,8 @@ class BeamLamp(ScenePart):
     """
 
     carrier: str  # the mesh that carries it, or `CAMERA`
-    # (4, 4) its pose in what carries it (see `compute_carried_pose`): it shines along its +z and
-    # has +y up
+    # (4, 4) its pose in what carries it (see `compute_carried_pose`): it shines along
+    # its +z and has +y up
     pose_on_carrier: Float64Array
     # (h, w) intensities on a plane before it, row 0 on top, as far as tangents of 1 to
     # either side
@@ -338,6 +339,8 @@ class PosedCamera:
 
         `aspect` is its width over its height.
         """
+        # `fov` is along the larger side already, unless it is along the height of an
+        # image that is wider than high
         if not self.upright or aspect <= 1.0:
             return self.fov
         return math.degrees(

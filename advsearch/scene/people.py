@@ -160,9 +160,11 @@ swings, and from which it comes down; at 360 its heel strikes.
 # Stride from which both feet are put onto the ground; below, in proportion.
 FULL_CONTACT_STRIDE = 0.1
 STRAIGHT = {
-    "upperarm": ("lowerarm", (0.02, 0.15, -1.0)), "lowerarm": ("hand", (0.16, 0.05, -1.0)),
-    "thigh": ("calf", (0.0, 0.03, -1.0)), "calf": ("foot", (-0.03, 0.0, -1.0)),
-}  # fmt: skip
+    "upperarm": ("lowerarm", (0.02, 0.15, -1.0)),
+    "lowerarm": ("hand", (0.16, 0.05, -1.0)),
+    "thigh": ("calf", (0.0, 0.03, -1.0)),
+    "calf": ("foot", (-0.03, 0.0, -1.0)),
+}
 """For each bone the joint at its end, and its direction with all angles 0 on the
 left.
 """
@@ -200,9 +202,9 @@ class Person:
         self.defaults = default_by_name | dict(defaults)
         self._bones = [str(bone) for bone in data["bones"]]
         self._parents = [int(parent) for parent in data["parents"]]
-        # `mean` (P, 3) are points in tenths of a millimetre, `basis` (R, P, 3) the
-        # shapes, `shares` (G, A, W, H, R) their factors in each extreme body, with
-        # `stature` and `mass`, and `index` the point of each vertex.
+        # `mean` (P, 3) are points in tenths of a millimetre, `basis` (R, P, 3) shapes
+        # by which they move, `shares` (G, A, W, H, R) the factors of the shapes in each
+        # extreme body, with `stature` and `mass`, and `index` the point of each vertex.
         weight_sums = data["weights"].sum(axis=1, keepdims=True, dtype=np.float32)
         self._tensors = {
             "mean": torch.from_numpy(data["mean"].astype(np.float32) * 1e-4),
@@ -214,9 +216,10 @@ class Person:
         }
         # Points of the left and of the right shoe; `points` is how many vertices each
         # piece of clothing has, and `tags` what it is.
-        is_shoe = np.repeat(data["tags"], data["points"]) == "shoes"
+        tag_of_vertex = np.repeat(data["tags"], data["points"])
+        is_shoe = tag_of_vertex == "shoes"
         shoe_points = np.unique(data["index"][is_shoe].astype(np.int64))
-        is_left = data["mean"][shoe_points, 1] > 0
+        is_left = data["mean"][shoe_points, 1] > 0  # y points to the person's left
         self._tensors["shoe_l"] = torch.from_numpy(shoe_points[is_left])
         self._tensors["shoe_r"] = torch.from_numpy(shoe_points[~is_left])
         self.standing_points = self.pose({})
@@ -233,7 +236,7 @@ class Person:
         return (posed - self.standing_points.to(posed.device)) / self.size
 
     def pose(self, values: Mapping[str, Tensor]) -> Tensor:
-        """Return the vertices (V, 3) in metres.
+        """Return the vertices (V, 3), in metres, of the person in a pose.
 
         The pelvis is above the origin, and the lowest vertex on z = 0.
 
@@ -244,17 +247,7 @@ class Person:
         number_by_name = self._complete_values(values)
         device = number_by_name["height"].device
         mixture, scale = self._mix_phenotype(number_by_name)
-        # Of each gender, age, weight and height (g, a, w, h), the factors of r shapes,
-        # each of which moves points p by coordinates c.
-        coefficients = torch.einsum(
-            "gawh,gawhr->r", mixture, self._get_tensor("shares", device)
-        )
-        points = self._get_tensor("mean", device) + torch.einsum(
-            "r,rpc->pc", coefficients, self._get_tensor("basis", device)
-        )
-        # The joints are the last points, in the order of bones.
-        joints = points[-len(self._bones) :]
-        points = points[: -len(self._bones)]
+        points, joints = self._shape_body(mixture)
         rotations, translations = self._pose_bones(joints, add_walk(number_by_name))
         weights = self._get_tensor("weights", device)
         posed = skin_points(points, weights, rotations, translations)
@@ -327,9 +320,10 @@ class Person:
                 self._bones.index(f"{bone}_{side}")
                 for bone in ("thigh", "calf", "foot")
             )
-            # where skinning puts the two joints
+            # where skinning puts the joints at the upper ends of thigh and foot
             hip_height = (rotations[thigh] @ joints[thigh] + translations[thigh])[2]
             ankle_height = (rotations[foot] @ joints[foot] + translations[foot])[2]
+            # 0 at the hip, 1 at the ankle
             below_hip = (
                 (hip_height - posed[:, 2]) / (hip_height - ankle_height)
             ).clamp(0.0, 1.0)
@@ -382,6 +376,7 @@ class Person:
         age_weights = compute_interpolation_weights(
             number_by_name["age"], number_by_name["age"].new_tensor(AGES)
         )
+        # the extremes are thin, average and heavy, at equal steps of the parameter
         weight_weights = compute_interpolation_weights(
             number_by_name["weight"],
             number_by_name["weight"].new_tensor([0.0, 0.5, 1.0]),
@@ -401,6 +396,23 @@ class Person:
         # Beyond the extremes the body is scaled.
         mixed_height = (height_weights * statures).sum()
         return mixture[..., None] * height_weights, requested_height / mixed_height
+
+    def _shape_body(self, mixture: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the points (P, 3) and the joints (J, 3) of a body at rest.
+
+        `mixture` (G, A, W, H) are the weights of the extremes of gender, age, weight
+        and height, see `_mix_phenotype`. Joints are in the order of bones.
+        """
+        device = mixture.device
+        # the factors of R shapes, each of which moves all points
+        shape_factors = torch.einsum(
+            "gawh,gawhr->r", mixture, self._get_tensor("shares", device)
+        )
+        points = self._get_tensor("mean", device) + torch.einsum(
+            "r,rpc->pc", shape_factors, self._get_tensor("basis", device)
+        )
+        n_joints = len(self._bones)  # they are the last points
+        return points[:-n_joints], points[-n_joints:]
 
     def _pose_bones(
         self, joints: Tensor, angle_by_joint: Mapping[str, Tensor]
@@ -426,17 +438,14 @@ class Person:
             zip(self._bones, self._parents, strict=True)
         ):
             rotation = rotation_by_bone.get(bone, identity)
-            joint_rotations.append(
-                rotation if parent < 0 else joint_rotations[parent] @ rotation
-            )
-            rotations.append(
-                joint_rotations[-1] @ straight_rotations.get(bone, identity)
-            )
-            if parent < 0:
-                positions.append(joints[index])
-            else:
+            position = joints[index]
+            if parent >= 0:  # the root has no parent
+                rotation = joint_rotations[parent] @ rotation
                 bone_vector = joints[index] - joints[parent]
-                positions.append(positions[parent] + rotations[parent] @ bone_vector)
+                position = positions[parent] + rotations[parent] @ bone_vector
+            joint_rotations.append(rotation)
+            rotations.append(rotation @ straight_rotations.get(bone, identity))
+            positions.append(position)
         all_rotations = torch.stack(rotations)
         # so that the joint itself moves to its position
         return all_rotations, torch.stack(positions) - torch.einsum(
@@ -482,31 +491,32 @@ def compute_interpolation_weights(value: Tensor, nodes: Tensor) -> Tensor:
     They sum to 1 from the first node to the last, and beyond these the nearest node has
     all of the weight.
     """
-    # How far the value is through each of the n - 1 intervals: 1 for those before it, 0
-    # for those after it. A node's weight is how far the interval before it is filled
-    # (the first: 1) minus how far the one after it is.
+    # how far the value is through each of the n - 1 intervals
     fraction = (value - nodes[:-1]) / (nodes[1:] - nodes[:-1])
-    # At a node the derivative is that of one side, not the sum of both.
+    # 1 for intervals before the value, 0 for those after it. At a node the derivative
+    # is that of one side, not the sum of both.
     is_within = (fraction >= 0.0) & (fraction < 1.0)
     fraction = torch.where(is_within, fraction, (fraction >= 1.0).to(fraction.dtype))
+    # A node's weight is the fraction of the interval before it (1 for the first node)
+    # minus that of the interval after it (0 for the last).
     return torch.cat([torch.ones_like(fraction[:1]), fraction]) - torch.cat(
         [fraction, torch.zeros_like(fraction[:1])]
     )
 
 
 def add_walk(angle_by_name: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the angles with those of the walk added, within each joint's limits.
+    """Return the angles of joints with those of a walk added, within their limits.
 
-    The swing of each joint in the gait, `GAIT`, is scaled by the stride; the right side
-    is half a cycle behind the left. All are scalar tensors by parameter, degrees; other
+    A walk swings each joint by `GAIT`, scaled by the stride; the right side is half a
+    cycle behind the left. All are scalar tensors by parameter, degrees; other
     parameters are returned as they are.
     """
     angle_by_joint = dict(angle_by_name)
     phase = torch.deg2rad(angle_by_name["walk"])
     stride = angle_by_name["stride"]
     for side, phase_shift in (("left", 0.0), ("right", np.pi)):
-        for joint, tenths in GAIT.items():
-            swing = _compute_gait_angle(tenths, phase, phase_shift)
+        for joint, angles_of_tenths in GAIT.items():
+            swing = _compute_gait_angle(angles_of_tenths, phase, phase_shift)
             angle_by_joint[f"{side}_{joint}"] = (
                 angle_by_joint[f"{side}_{joint}"] + stride * swing
             )
@@ -552,16 +562,17 @@ def _compute_gait_angle(
 
 
 def compute_contact(phase: Tensor) -> Tensor:
-    """Return how much a foot is held to the ground, 0 to 1.
+    """Return how much a foot is held to the ground: 1 while it stands, 0 in its swing.
 
-    The phase is in degrees of the foot's cycle from its heel strike. It is 1 in stance
-    and 0 in the swing, with half a cosine wave in between.
+    Between them lies half a cosine wave. `phase` is in degrees of the foot's cycle from
+    its heel strike: it stands up to `STANCE`, swings from `LIFTED` to `LOWERED`, and
+    stands again at 360.
     """
     degrees = torch.remainder(phase, 360.0)
-    # 0 in stance, rising to 1 as the foot is lifted; then the same as it is lowered
-    lift_phase = ((degrees - STANCE) / (LIFTED - STANCE)).clamp(0.0, 1.0)
-    lower_phase = ((degrees - LOWERED) / (360.0 - LOWERED)).clamp(0.0, 1.0)
-    return 0.5 + 0.5 * torch.cos(np.pi * (lift_phase - lower_phase))
+    # each rises from 0 to 1 while the foot is lifted, or lowered
+    lifted = ((degrees - STANCE) / (LIFTED - STANCE)).clamp(0.0, 1.0)
+    lowered = ((degrees - LOWERED) / (360.0 - LOWERED)).clamp(0.0, 1.0)
+    return 0.5 + 0.5 * torch.cos(np.pi * (lifted - lowered))
 
 
 def skin_points(
@@ -618,7 +629,7 @@ def compute_joint_turns(angle: Mapping[str, Tensor]) -> dict[str, Tensor]:
     About the body's axes: x ahead, y to its left, z up. Bones without a parameter are
     left out. `angle` are degrees by parameter.
     """
-    # The back bends in three equal parts, neck and head share the nod.
+    # The back bends in three equal parts; neck and head have a half each.
     spine, side, turn = (
         angle[name] / 3.0 for name in ("spine", "spine_side", "spine_turn")
     )

@@ -200,8 +200,8 @@ def _check_same_statements(view: PhotographView, first: PhotographView) -> None:
         missing = sorted(other.stated_names - file.stated_names)
         if missing:
             raise FileFormatError(
-                f"{file.file}: expected {missing[0]}, which "
-                f"{Path(other.file).name} states; add it"
+                f"{file.file}: expected {missing[0]}, which {Path(other.file).name} "
+                "states; add it"
             )
 
 
@@ -211,13 +211,20 @@ def _check_same_statements(view: PhotographView, first: PhotographView) -> None:
 def _parse_view(
     file: Path, photograph: Path, entries: Mapping[str, Any]
 ) -> PhotographView:
-    """Return the view that the entries of a camera file describe."""
+    """Return the view that the entries of a camera file describe.
+
+    Args:
+        file: path of the camera file.
+        photograph: path of the photograph that it stands beside.
+        entries: entries of the file, by name.
+    """
     stated = {name: entries[name] for name in VIEW_KEYS & entries.keys()}
-    has_lens = len(entries) > len(stated)
+    has_lens = bool(entries.keys() - VIEW_KEYS)  # all else is about the lens
     pose = None
     if "object_to_camera" in stated:
-        pose = np.eye(4)
         numbers = _parse_numbers(file, "object_to_camera", stated, (12, 16))
+        # the last row may be left out: it stays that of a pose
+        pose = np.eye(4)
         pose[: len(numbers) // 4] = numbers.reshape(-1, 4)
     spec = str(photograph)
     if "part" in stated:
@@ -244,10 +251,17 @@ def _parse_numbers(
 ) -> Float64Array:
     """Return the finite numbers of an entry: a list, a list of rows, or a text.
 
-    OpenCV writes a matrix with its numbers as `data`.
+    Args:
+        file: path of the camera file, for messages.
+        name: name of the entry.
+        stated: entries of the file.
+        counts: how many numbers it may have.
+
+    Raises:
+        FileFormatError: it has others.
     """
     value = stated[name]
-    if isinstance(value, Mapping):
+    if isinstance(value, Mapping):  # a matrix as OpenCV writes it
         value = value.get("data")
     if isinstance(value, str):
         value = value.replace(",", " ").split()
@@ -321,7 +335,8 @@ def put_into_photograph(
         for name, value in view.settings.items()
         if name not in description.requested
     }
-    # A control may vary the pose, and may not vary the ground.
+    # As if the user had requested them: a control may not vary the ground, say. It may
+    # vary the pose.
     fixed = {name for name in stated if not name.startswith(("camera.", "pose."))}
     scene = replace(
         description,

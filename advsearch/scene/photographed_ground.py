@@ -86,12 +86,15 @@ class Photograph:
             [radius * np.cos(azimuth), radius * np.sin(azimuth), np.zeros_like(radius)],
             axis=-1,
         )
-        # from straight up
-        polar = math.pi - np.arctan(radius)
-        n_rows = self._map_rows - self._horizon_row
-        # counted from the horizon; the map's first and last row are the poles
-        lower_row = polar / math.pi * (self._map_rows - 1) - self._horizon_row
-        uvs = np.stack([map_column, 1.0 - (lower_row + 0.5) / n_rows], axis=-1)
+        # The map's first row is straight up, its last one straight down.
+        angle_from_up = math.pi - np.arctan(radius)
+        map_row = angle_from_up / math.pi * (self._map_rows - 1)
+        # the texture's rows begin at the horizon, and v is 1 at its upper border, half
+        # a row above the middle of row 0
+        texture_row = map_row - self._horizon_row
+        n_texture_rows = self._map_rows - self._horizon_row
+        v = 1.0 - (texture_row + 0.5) / n_texture_rows
+        uvs = np.stack([map_column, v], axis=-1)
         normals = np.tile(
             np.array([0.0, 0.0, 1.0], np.float32), (vertices.size // 3, 1)
         )
@@ -112,9 +115,11 @@ class Photograph:
         Differentiable.
         """
         rows = radiance.shape[0]
+        # where the rows of the plane's own map lie in this one
         map_row = torch.arange(
             self._horizon_row, self._map_rows, device=radiance.device
         ) * ((rows - 1) / (self._map_rows - 1))
+        # at most the last but one, so that there is a next row
         upper = map_row.floor().long().clamp_max(rows - 2)
         fraction = (map_row - upper)[:, None, None].to(radiance.dtype)
         lower_half = radiance[upper] + fraction * (

@@ -54,7 +54,7 @@ def rasterize_triangles(
         For each pixel of each triangle, triangle by triangle, the triangle, row and
         column (N,), and the corners' barycentric weights (N, 3).
     """
-    # Wide: which of the candidates lie in a triangle is decided by their weights.
+    # Candidates from a wider range, as their weights decide which lie in a triangle.
     face, row, column = find_candidate_pixels(corners, shape, 10.0 * PIXEL_TOLERANCE)
     weights = compute_barycentric(corners[face], row, column)
     inside = (weights >= -tolerance).all(axis=1)
@@ -336,8 +336,7 @@ def rasterize_charts(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
     if len(face) == 0:
         raise InputError(
             f"mesh texture coordinates: none of the {shape[0]} x {shape[1]} texels "
-            "lies in a triangle; unwrap the mesh "
-            "again"
+            "lies in a triangle; unwrap the mesh again"
         )
     points = np.stack([column, row], axis=1)
     weights = _compute_clipped_weights(corners[face], points)
@@ -423,24 +422,26 @@ class MeshSurface:
     def __init__(self, mesh: Mesh) -> None:
         """Compute boxes and normals of the faces, and which faces are neighbours.
 
-        Neighbours have an edge in common, by the positions of its ends.
+        Neighbours have an edge in common, by the positions of its ends: across a UV
+        seam too, where the vertices are not the same.
         """
         self._corners = mesh.vertices[mesh.faces].astype(np.float64)
         self.normals = _compute_face_normals(mesh)
         self._lower = self._corners.min(axis=1)
         self._upper = self._corners.max(axis=1)
-        # Pairs (E, 2) of faces with an edge in common, across UV seams too.
+        # (F, 3) the same index for vertices at one position
         corners = weld_vertices(mesh)[0][mesh.faces]
+        # (3 F, 2) edges in three blocks, each with one edge of all faces
         edges = np.concatenate(
             [corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]
         )
-        # Each edge is listed once for each of its faces. Sorted by their vertices,
-        # equal edges follow one another, and their faces are neighbours.
+        # Sorted by their ends, equal edges follow one another: their faces are
+        # neighbours.
         edges = np.sort(edges, axis=1)
         order = np.lexsort((edges[:, 1], edges[:, 0]))
         is_same = (edges[order][1:] == edges[order][:-1]).all(axis=1)
-        # The edges are in three blocks, of one edge of each face.
         face = order % len(mesh.faces)
+        # (E, 2) pairs of faces
         self._neighbours = np.stack([face[:-1][is_same], face[1:][is_same]], axis=1)
 
     def find_hit(
@@ -503,8 +504,8 @@ class MeshSurface:
 
         Their bounding boxes reach within a radius of the point (3,), they face a
         direction (3,), and are reached from the face, which always counts, over edges
-        between such faces. The other wall of a cup, or the next slat of a chair, are
-        not.
+        between such faces. So the other wall of a cup is not among them, and neither is
+        the next slat of a chair.
         """
         box_gap = np.maximum(np.maximum(self._lower - point, point - self._upper), 0.0)
         is_near = np.linalg.norm(box_gap, axis=1) <= radius

@@ -267,6 +267,8 @@ class Renderer:
         u = _to_tensor(u)
         if u.ndim == 2 and len(u):
             return torch.stack([self(row, seed, spp) for row in u])
+        # `through` is what is rendered; it is not `u` where a part of the derivative
+        # comes from differences
         u, through = self._check_arguments(u, spp)
         with _leave_inference_mode():
             image = self._render_image(through, seed, spp)
@@ -395,9 +397,9 @@ class Renderer:
             )
             if "backdrop.front" in inputs:
                 is_hidden = inputs["backdrop.front"][..., 0] > 0.5
-                for dim in (0, 1):
+                for dim in (0, 1):  # a pixel's value for all of its points
                     is_hidden = is_hidden.repeat_interleave(subdivision, dim)
-                surfaces.id[is_hidden] = 0
+                surfaces.id[is_hidden] = 0  # no surface
         metres = self.scene.definition[0].size_in_metres
         return replace(
             surfaces, depth=surfaces.depth * metres, z_depth=surfaces.z_depth * metres
@@ -420,8 +422,8 @@ class Renderer:
         Args:
             loss: loss from an image (H, W, 3) sRGB to a number.
             u, seed, spp: as for a call.
-            free: leave out what needs primal renders of its own; coordinates that use
-                differences then have a derivative of zero.
+            free: leave out what costs more renders, that is all differences: their
+                coordinates then have a derivative of zero.
 
         Returns:
             The loss without graph, and (d,) float32.
@@ -502,11 +504,15 @@ class Renderer:
         """
         renders_before = self.renders
         images = list[Tensor]()
+        # without a rig there is one camera, with no mount
         for index, mount in enumerate(self.scene.definition[0].rig or (None,)):
-            camera_seed = seeds.stream(seed, "camera", index) if index else seed
+            # the first camera has the noise of a scene without a rig
+            camera_seed = seed
+            if index > 0:
+                camera_seed = seeds.stream(seed, "camera", index)
             inputs = self._camera_inputs(mount, u)
             hide = "backdrop.color" in inputs
-            if self.moments:
+            if self.moments:  # an exposure of some time
                 rendered = self._render_exposure(mount, u, camera_seed, spp, hide)
             else:
                 rendered = self.render_radiance(
@@ -651,6 +657,7 @@ class Renderer:
         n_points = depth.shape[0] // self.formation.resolution[0]
         surfaces = self.scene.find_surfaces(_select_scene_inputs(inputs), n_points)
         blur = float(inputs["backdrop.blur"]) if "backdrop.blur" in inputs else 0.0
+        # pixels that a blur of this standard deviation reaches, and the one itself
         radius = 1 + math.ceil(3.0 * blur)
         front_inputs["backdrop.front"] = compute_front(
             surfaces, depth, n_points, radius
@@ -739,6 +746,7 @@ class Renderer:
         speeds = torch.zeros(len(self.start))
         coordinates: list[int] = []
         for group in groups:
+            # the two estimators are valid only for what moves no outline
             may_move = {*group.valid} - {"adjoint", "image"}
             if may_move and group.size <= MAX_MEASURED_SIZE:
                 coordinates += range(group.begin, group.begin + group.size)
@@ -869,7 +877,8 @@ class _Radiance(torch.autograd.Function):
                     inputs, image_seeds, spp
                 )
         rendered = renderer.replace_non_finite(rendered)
-        for guide in guides:  # one if it is to be denoised, otherwise none
+        # one image of guides if the result is to be denoised, otherwise none
+        for guide in guides:
             rendered = denoise_image(
                 rendered,
                 guide[..., :3],
@@ -928,9 +937,9 @@ def _reached_inputs(renderer: Renderer, estimator: str) -> frozenset[str]:
     reached: frozenset[str] = frozenset()
     for group in renderer.plan.select_groups(estimator):
         reached |= renderer.routes.get(group.name, frozenset())
-    return (
-        reached & renderer.scene.interior_inputs if estimator == "adjoint" else reached
-    )
+    if estimator == "adjoint":
+        return reached & renderer.scene.interior_inputs
+    return reached
 
 
 class _Differences(torch.autograd.Function):

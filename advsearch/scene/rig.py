@@ -36,6 +36,9 @@ MAX_CAMERAS = 32
 MAX_DISTANCE = 1e4  # limit of the distance to the first camera, metres or object sizes
 ENTRY_KEYS = ("name", "place", "turn", "around", "fov", "later")
 MAX_DELAY = 60.0  # limit of the seconds after the first image
+MAX_TURN = 3600.0  # limit of the angles of an entry, degrees
+MIN_FOV = 1.0  # limits of the field of view of an entry, degrees
+MAX_FOV = 170.0
 # From x to the right, y down, z ahead to Mitsuba's axes: left, up, ahead.
 AXES = np.diag([-1.0, -1.0, 1.0, 1.0])
 FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -129,6 +132,7 @@ def read_rig(spec: str) -> tuple[Mount, ...]:
         return _read_colmap(path, camera_names)
     if Path(path).suffix.lower() == ".json" and "," in camera_names:
         return _read_transforms(path, camera_names)
+    # a single camera is named, or the format has no rigs
     if camera_names or Path(spec).suffix.lower() not in (".yaml", ".yml"):
         return ()
     try:
@@ -138,7 +142,7 @@ def read_rig(spec: str) -> tuple[Mount, ...]:
     if not isinstance(data, dict):
         return ()
     entries = data.get("cameras")
-    if isinstance(entries, list):
+    if isinstance(entries, list):  # our own format
         if set(data) != {"cameras"}:
             raise FileFormatError(
                 f"{spec}: expected `cameras` alone, got "
@@ -216,10 +220,12 @@ def _find_photograph(path: str, files: Mapping[str, str], photograph: Path) -> s
     Raises:
         FileFormatError: no entry fits, or several do equally well.
     """
+    # how many parts, counted from the end, each entry's path has in common
     counts = {
         name: _count_shared_parts(file, photograph) for name, file in files.items()
     }
     largest = max(counts.values(), default=0)
+    # a count of 0 is another file
     names = [name for name, count in counts.items() if count == largest > 0]
     if len(names) == 1:
         return names[0]
@@ -263,8 +269,8 @@ def _check_mounts(spec: str, mounts: Sequence[Mount]) -> None:
     is_moved = not np.allclose(first_mount.pose, np.eye(4))
     if is_moved or first_mount.azimuth or first_mount.delay:
         raise FileFormatError(
-            f"{spec}: the first camera is the scene's own; it takes "
-            "no place, turn, around or later"
+            f"{spec}: the first camera is the scene's own; it takes no place, turn, "
+            "around or later"
         )
 
 
@@ -285,27 +291,17 @@ def _read_entry(spec: str, index: int, entry: Any) -> Mount:
         raise FileFormatError(
             f"{where}: name: expected a short text, got {str(name)[:80]!r}"
         )
-    angles = entry.get("turn", [0.0] * 3)
-    yaw, pitch, roll = _parse_numbers(where, "turn", angles, 3, 3600.0)
-    # About y, x and z.
-    rotation = (
-        make_rotation(0.0, yaw, 0.0)
-        @ make_rotation(0.0, 0.0, pitch)
-        @ make_rotation(roll, 0.0, 0.0)
-    )
-    position = _parse_numbers(
-        where, "place", entry.get("place", [0.0] * 3), 3, MAX_DISTANCE
-    )
-    pose = make_pose(rotation, position)
+    pose = _read_entry_pose(where, entry)
     (orbit_angle,) = _parse_numbers(
-        where, "around", [entry.get("around", 0.0)], 1, 3600.0
+        where, "around", [entry.get("around", 0.0)], 1, MAX_TURN
     )
     fov = None
     if "fov" in entry:
-        (fov,) = _parse_numbers(where, "fov", [entry["fov"]], 1, 170.0)
-        if fov < 1.0:
+        (fov,) = _parse_numbers(where, "fov", [entry["fov"]], 1, MAX_FOV)
+        if fov < MIN_FOV:
             raise FileFormatError(
-                f"{where}: fov: expected 1 to 170 degrees, got {fov:g}"
+                f"{where}: fov: expected {MIN_FOV:g} to {MAX_FOV:g} degrees, got "
+                f"{fov:g}"
             )
     (delay,) = _parse_numbers(where, "later", [entry.get("later", 0.0)], 1, MAX_DELAY)
     if delay < 0.0:
@@ -315,10 +311,43 @@ def _read_entry(spec: str, index: int, entry: Any) -> Mount:
     return Mount(name=name, pose=pose, azimuth=orbit_angle, fov=fov, delay=delay)
 
 
+def _read_entry_pose(where: str, entry: Mapping[str, Any]) -> Float64Array:
+    """Return the pose (4, 4) of an entry of our own format, by `turn` and `place`.
+
+    It leads from the camera's axes, x to the right, y down, z ahead, to those of the
+    first camera. `where` is the beginning of an error.
+    """
+    angles = entry.get("turn", [0.0] * 3)
+    yaw, pitch, roll = _parse_numbers(where, "turn", angles, 3, MAX_TURN)
+    # in these axes the yaw turns about y, the pitch about x, the roll about z
+    rotation = (
+        make_rotation(0.0, yaw, 0.0)
+        @ make_rotation(0.0, 0.0, pitch)
+        @ make_rotation(roll, 0.0, 0.0)
+    )
+    position = _parse_numbers(
+        where, "place", entry.get("place", [0.0] * 3), 3, MAX_DISTANCE
+    )
+    return make_pose(rotation, position)
+
+
 def _parse_numbers(
     where: str, key: str, value: Any, count: int, limit: float
 ) -> list[float]:
-    """Return a list of `count` numbers up to a limit, or raise FileFormatError."""
+    """Return an entry as a list of `count` finite numbers, none larger than a limit.
+
+    The limit is that of their absolute values.
+
+    Args:
+        where: file and camera, for messages.
+        key: name of the entry, for messages.
+        value: the entry.
+        count: how many numbers it has to have.
+        limit: the limit.
+
+    Raises:
+        FileFormatError: it is no such list.
+    """
     is_valid = (
         isinstance(value, list)
         and len(value) == count
@@ -329,8 +358,8 @@ def _parse_numbers(
     )
     if not is_valid:
         raise FileFormatError(
-            f"{where}: {key}: expected {count} numbers up to "
-            f"{limit:g}, got {str(value)[:80]!r}"
+            f"{where}: {key}: expected {count} numbers up to {limit:g}, got "
+            f"{str(value)[:80]!r}"
         )
     return list(map(float, value))
 
@@ -353,12 +382,10 @@ def _read_camchain(spec: str, data: Mapping[str, Any]) -> tuple[Mount, ...]:
         for name, camera in data.items()
         if isinstance(camera, dict) and "intrinsics" in camera
     }
+    # shorter names first: cam9 comes before cam10
     names = sorted(cameras, key=lambda name: (len(str(name)), str(name)))
-    if (
-        len(names) < 2
-        or len(names) > MAX_CAMERAS
-        or not all(KALIBR_TRANSFORM in cameras[name] for name in names[1:])
-    ):
+    has_extrinsics = all(KALIBR_TRANSFORM in cameras[name] for name in names[1:])
+    if not 2 <= len(names) <= MAX_CAMERAS or not has_extrinsics:
         return ()
     # Each transform leads from the previous camera's coordinates to the camera's.
     poses = [np.eye(4)]
@@ -395,8 +422,8 @@ def _parse_transforms(path: str) -> dict[str, Any]:
         isinstance(frame, dict) for frame in frames
     ):
         raise FileFormatError(
-            f"{path}: expected `frames`, a list with a camera each, "
-            "as nerfstudio writes it"
+            f"{path}: expected `frames`, a list with a camera each, as nerfstudio "
+            "writes it"
         )
     return dict(data)
 
@@ -438,11 +465,11 @@ def _read_frame_models(
 
 
 def _read_applied_scale(path: str, data: Mapping[str, Any]) -> float:
-    """Return the factor that is already applied to the positions of a transforms.json.
+    """Return the factor by which the positions of a transforms.json are scaled already.
 
-    It is nerfstudio's `applied_scale`, times the scale within its `applied_transform`,
-    a matrix of 3 or 4 rows. Its rotation and its shift move all cameras alike, and do
-    not count. Instant NGP's `scale` and `offset` are applied by the program that reads
+    It is nerfstudio's `applied_scale`, times the scale within its `applied_transform`.
+    The rotation and the shift of that move all cameras alike, and do not count.
+    Instant NGP's `scale` and `offset` are applied by the program that reads
     the file, so the positions in it are without them.
 
     Raises:
@@ -455,26 +482,12 @@ def _read_applied_scale(path: str, data: Mapping[str, Any]) -> float:
             path, "applied_scale", [data["applied_scale"]], 1, 1.0 / MIN_SCALE
         )
     if data.get("applied_transform") is not None:
-        rows = _to_rows(data["applied_transform"])
-        cells = [cell for row in rows for cell in row]
-        count = 12 if len(rows) == 3 else 16
-        numbers = _parse_numbers(path, "applied_transform", cells, count, MAX_DISTANCE)
-        linear = np.reshape(numbers, (-1, 4))[:3, :3]
-        # a rotation times s has the determinant s^3, and times its transpose s^2
-        turn_scale = abs(float(np.linalg.det(linear))) ** (1.0 / 3.0)
-        if not np.allclose(
-            linear @ linear.T, turn_scale**2 * np.eye(3), atol=1e-3 * turn_scale**2
-        ):
-            raise FileFormatError(
-                f"{path}: applied_transform: expected a rotation, a shift and a scale, "
-                "got another map"
-            )
-        scale *= turn_scale
+        scale *= _measure_scale(path, data["applied_transform"])
     if not MIN_SCALE <= scale <= 1.0 / MIN_SCALE:
         limits = f"from {MIN_SCALE:g} to {1.0 / MIN_SCALE:g}"
         raise FileFormatError(
-            f"{path}: applied_scale: expected a scale {limits}, got "
-            f"{scale:g}; correct it"
+            f"{path}: applied_scale: expected a scale {limits}, got {scale:g}; correct "
+            "it"
         )
     return scale
 
@@ -499,24 +512,26 @@ def _read_image_model(path: str, words: Sequence[str]) -> CameraModel:
 
 
 def _parse_images(path: str) -> dict[str, list[str]]:
-    """Return the words of the lines of COLMAP's images.txt by the image's id.
+    """Return the ten words that COLMAP's images.txt has of each image, by its id.
 
-    Every second line has a rotation (quaternion, real part first) and a shift from the
-    world to the camera, the id of the camera, and the file.
+    They are the id, a quaternion with the real part first, a shift, the id of the
+    camera, and the file. Quaternion and shift lead from the world to the camera.
     """
     text = read_existing_text(path, "COLMAP's images", MAX_IMAGES_SIZE)
     lines = [line for line in text.splitlines() if not line.startswith("#")]
-    # Every second line has points.
-    image_lines = [line.split(maxsplit=9) for line in lines[::2]]
-    words_by_id = {words[0]: words for words in image_lines if words}
+    # A line of an image and a line of its points take turns; points are not read.
+    image_lines = [line for line in lines[::2] if line.strip()]
+    # the last of ten words is the file, whose name may have blanks
+    words_of_images = [line.split(maxsplit=9) for line in image_lines]
+    words_by_id = {words[0]: words for words in words_of_images}
     if not words_by_id:
         raise FileFormatError(
             f"{path}: expected 2 to {MAX_CAMERAS} different cameras, got none"
         )
-    if len(words_by_id) < sum(bool(line.strip()) for line in lines[::2]):
+    if len(words_by_id) < len(image_lines):
         raise FileFormatError(
-            f"{path}: expected each image once, got one with the "
-            "same number twice; correct the file"
+            f"{path}: expected each image once, got one with the same number twice; "
+            "correct the file"
         )
     return words_by_id
 
@@ -524,15 +539,14 @@ def _parse_images(path: str) -> dict[str, list[str]]:
 def _parse_image(where: str, words: Sequence[str]) -> Float64Array:
     """Return the pose (4, 4), from the camera to the world, of an image of COLMAP.
 
-    `words` are its line: the id, a quaternion with the real part first, a shift, from
-    the world to the camera, the camera's id and the file. Raises FileFormatError for
-    others.
+    `words` are those of its line, see `_parse_images`. Raises FileFormatError: they are
+    not ten, or have no quaternion of length 1.
     """
     if len(words) != 10:
         raise FileFormatError(
             f"{where}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, got "
-            f"{len(words)} words; a line of "
-            "points, perhaps an empty one, stands between two images"
+            f"{len(words)} words; a line of points, perhaps an empty one, stands "
+            "between two images"
         )
     try:
         numbers = list(map(float, words[1:8]))
@@ -547,7 +561,7 @@ def _parse_image(where: str, words: Sequence[str]) -> Float64Array:
     rotation = np.reshape(
         compute_rotation_entries(x / length, y / length, z / length, w / length), (3, 3)
     )
-    # the file has the map from the world to the camera
+    # inverted, as the file has the map from the world to the camera
     return np.asarray(np.linalg.inv(make_pose(rotation, shift)), np.float64)
 
 
@@ -596,8 +610,32 @@ def _make_mounts(
     )
 
 
+def _measure_scale(path: str, applied_transform: Any) -> float:
+    """Return the scale of nerfstudio's `applied_transform`.
+
+    It has 3 or 4 rows of 4 numbers. Raises FileFormatError: it is no rotation times a
+    scale, with a shift.
+    """
+    rows = _to_rows(applied_transform)
+    cells = [cell for row in rows for cell in row]
+    count = 12 if len(rows) == 3 else 16
+    numbers = _parse_numbers(path, "applied_transform", cells, count, MAX_DISTANCE)
+    linear = np.reshape(numbers, (-1, 4))[:3, :3]
+    # a rotation times s has the determinant s^3, and times its transpose it is s^2
+    scale = float(abs(float(np.linalg.det(linear))) ** (1.0 / 3.0))
+    if not np.allclose(linear @ linear.T, scale**2 * np.eye(3), atol=1e-3 * scale**2):
+        raise FileFormatError(
+            f"{path}: applied_transform: expected a rotation, a shift and a scale, "
+            "got another map"
+        )
+    return scale
+
+
 def _parse_rigid(where: str, key: str, value: Any) -> Float64Array:
-    """Return an entry as a rigid transform (4, 4), or raise FileFormatError."""
+    """Return an entry of four rows as a rigid transform (4, 4): rotation and shift.
+
+    Raises FileFormatError: it is another map. `where` and `key` name it in the message.
+    """
     cells = [cell for row in _to_rows(value) for cell in row]
     numbers = _parse_numbers(where, key, cells, 16, MAX_DISTANCE)
     matrix = np.array(numbers).reshape(4, 4)

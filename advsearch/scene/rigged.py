@@ -143,6 +143,7 @@ class SkeletonRig:
             return np.pad(values, ((0, 0), (0, max_joints - values.shape[1])))
 
         points = np.concatenate([part.vertices for part in parts])
+        # counted on from the nodes of the parts before
         joints = np.concatenate(
             [
                 pad_joints(part.joints + start)
@@ -165,32 +166,32 @@ class SkeletonRig:
             torch.cat([nodes for nodes, _ in self._nodes_by_depth])
         )
         self._local_matrices = torch.from_numpy(self.skeleton.local_matrices)
-        # The rotation nearest to each node's matrix in the scene, without its scale and
-        # shear.
+        # The axes of each node at rest: the rotation nearest to its matrix, without its
+        # scale and shear (polar decomposition).
         world = self._compute_world(self._local_matrices)[:, :3, :3].numpy()
-        left, _, right = np.linalg.svd(world)  # polar decomposition
+        left, _, right = np.linalg.svd(world)
         self._axes = torch.from_numpy(left @ right)
         self._rest = self.pose({})
 
     def _add_targets(self, parts: Sequence[Movable], vertices: IntArray) -> None:
         """Store the morph targets of parts, for the vertices (V,) of the mesh.
 
-        A target names the vertices of its part that it moves. The mesh has some of
-        them, perhaps several times and in another order: for each the rows of the mesh
-        are found, and the offsets are put into that order.
+        A morph target moves some vertices of its part by offsets. The mesh has the
+        part's vertices in another order, some several times and some not at all: the
+        offsets are put into the order of the mesh.
 
         Args:
             parts: parts of the file.
             vertices: (V,) for each vertex of the mesh its index in the concatenated
                 vertices of all parts.
         """
-        counts = [len(part.vertices) for part in parts]
-        vertex_starts = np.cumsum([0, *counts])
-        for part, start, count in zip(parts, vertex_starts, counts, strict=False):
+        start = 0  # index of the part's first vertex among those of all parts
+        for part in parts:
+            count = len(part.vertices)
             is_of_part = (vertices >= start) & (vertices < start + count)
             mesh_rows = np.flatnonzero(is_of_part)
             for index, target in enumerate(part.targets):
-                # of each vertex of the part, its row in the target; -1: it stays
+                # for each vertex of the part its row in the target; -1 if it stays
                 row_of_vertex = np.full(count, -1)
                 row_of_vertex[target.rows] = np.arange(len(target.rows))
                 target_rows = row_of_vertex[vertices[mesh_rows] - start]
@@ -205,6 +206,7 @@ class SkeletonRig:
                         offsets=torch.from_numpy(target.offsets[target_rows[is_moved]]),
                     )
                 )
+            start += count
 
     # ---- Parameters ----
 
@@ -259,7 +261,7 @@ class SkeletonRig:
     # ---- Vertices ----
 
     def offsets(self, values: Mapping[str, Tensor], clip: str | None = None) -> Tensor:
-        """Return how far vertices move from the mesh at rest, (V, 3) float32.
+        """Return how far the vertices of the mesh move from rest, (V, 3) float32.
 
         The result is in the unit of the mesh, and differentiable.
 
@@ -272,9 +274,9 @@ class SkeletonRig:
             InputError: the file's numbers are so large that vertices are not finite.
         """
         posed = self.pose(values, clip)
-        offsets = (posed - self._rest.to(posed.device)) @ self._to_mesh.to(
-            posed.device
-        ).T
+        device = posed.device
+        # `_to_mesh` is the linear map from the file's coordinates to the mesh's
+        offsets = (posed - self._rest.to(device)) @ self._to_mesh.to(device).T
         if not bool(torch.isfinite(offsets.detach()).all()):
             cause = f"the clip {clip}" if clip else "such turns"
             raise InputError(
@@ -300,7 +302,8 @@ class SkeletonRig:
                 playing_clip, seconds.to(device)
             )
         local_matrices = self._turn_joints(local_matrices, number_by_name)
-        # (joints, 3, 4) from the rest pose to the scene, without the last row
+        # (joints, 3, 4) from the rest pose to the scene, without the last row, which is
+        # 0 0 0 1
         joint_matrices = (
             self._compute_world(local_matrices)[self._nodes.to(device)]
             @ self._inverse_binds.to(device)
@@ -333,11 +336,13 @@ class SkeletonRig:
         """
         points = self._points.to(device)
         for target in self._targets:
+            # the parameter's value, or else the clip's, or else that at rest
             weight = number_by_name.get(f"{target.name}.{WEIGHT}")
-            if weight is None and target.node in clip_weights:
-                weight = clip_weights[target.node][target.index_in_node]
-            elif weight is None:
-                weight = torch.tensor(target.rest_weight, dtype=torch.float64)
+            if weight is None:
+                if target.node in clip_weights:
+                    weight = clip_weights[target.node][target.index_in_node]
+                else:
+                    weight = torch.tensor(target.rest_weight, dtype=torch.float64)
             # A weight of 0 is left out, unless its derivative is wanted.
             if weight.requires_grad or float(weight) != 0.0:
                 offsets = weight.to(device) * target.offsets.to(device)
@@ -403,6 +408,7 @@ class SkeletonRig:
         """
         device = local_matrices.device
         rotation_to_mesh = self._rotation_to_mesh.to(device)
+        # the joints of which a turn about any axis is set, each once
         joints = dict.fromkeys(
             name.rpartition(".")[0]
             for name in number_by_name
@@ -417,9 +423,9 @@ class SkeletonRig:
                         make_axis_rotation(axis, number_by_name[f"{joint}.{axis}"])
                         @ rotation
                     )
-            # A turn about the object's axes is R. Conjugation brings it to the axes of
-            # the file, then to those of the parent node at rest, in which local
-            # matrices are.
+            # It is about the axes of the object; local matrices are in those of the
+            # parent node. The same turn in other axes: first in those of the file, then
+            # in those of the parent at rest.
             rotation = rotation_to_mesh.T @ rotation @ rotation_to_mesh
             parent = int(self.skeleton.parents[node])
             if parent >= 0:
@@ -461,12 +467,13 @@ def _group_by_depth(parents: IntArray) -> list[tuple[Tensor, Tensor]]:
     """
     levels = list[tuple[Tensor, Tensor]]()
     nodes = np.flatnonzero(parents < 0)
+    # position of each node among those of its depth, once that is known
     row_in_level = np.zeros(len(parents), np.int64)
     while len(nodes):
         parent_rows = row_in_level[parents[nodes]]
         levels.append((torch.from_numpy(nodes), torch.from_numpy(parent_rows)))
         row_in_level[nodes] = np.arange(len(nodes))
-        nodes = np.flatnonzero(np.isin(parents, nodes))
+        nodes = np.flatnonzero(np.isin(parents, nodes))  # their children
     return levels
 
 

@@ -85,7 +85,11 @@ class Parameter:
         periodic: bool = False,
         log: bool = False,
     ) -> Parameter:
-        """Make a number that moves no outlines; see `moving` for one that does."""
+        """Make a parameter that is one number and moves no outlines.
+
+        See `moving` for one that does, and `Parameter` for the arguments: `text` is its
+        description.
+        """
         return cls(
             name=name,
             shape=(),
@@ -319,8 +323,8 @@ CAMERA = (
         low=1e-4,
         high=1e5,
         default="fits the object",
-        text="Distance to the object's middle; in object sizes where its size in metres "
-        "is not known.",
+        text="Distance to the object's middle; in object sizes where its size in "
+        "metres is not known.",
         search=(0.8, 1.5),
         log=True,
     ),
@@ -359,8 +363,8 @@ EXPOSURE_VALUE = Parameter(
     low=-10.0,
     high=24.0,
     default="metered",
-    description="Absolute exposure in place of the metered one, in the avenue: 14 is for sun, 5 "
-    "for lit streets.",
+    description="Absolute exposure in place of the metered one, in the avenue: 14 is "
+    "for sun, 5 for lit streets.",
     estimators=(),
 )
 RAINDROPS = (
@@ -397,6 +401,7 @@ RAINDROPS = (
 )
 # what the lamps of a car may be: with either beam its tail lamps shine too
 LAMPS = ("off", "low", "high")
+LAMPS_OFF = LAMPS[0]
 
 
 def _make_lamp_parameter(whose: str) -> Parameter:
@@ -411,7 +416,7 @@ def _make_lamp_parameter(whose: str) -> Parameter:
         unit="name",
         low=0.0,
         high=len(LAMPS) - 1.0,
-        default=LAMPS[0],
+        default=LAMPS_OFF,
         description=text,
         options=LAMPS,
         estimators=(),
@@ -481,8 +486,8 @@ GROUND = (
         unit="name",
         low=0.0,
         high=len(GROUND_KINDS) - 1.0,
-        default="what the environment has: photograph where the map is a file, a road in "
-        "a street, else table",
+        default="what the environment has: photograph where the map is a file, a road "
+        "in a street, else table",
         description="What the object stands on: a square table, the floor that the "
         "environment's photograph shows, a road, "
         "or a place with all that stands in it: an avenue, a crossing, a car "
@@ -505,7 +510,8 @@ GROUND = (
         low=-1e4,
         high=1e4,
         default=0.0,
-        description="Height of the ground that takes the shadow in a photograph (`backdrop`).",
+        description="Height of the ground that takes the shadow in a photograph "
+        "(`backdrop`).",
     ),
     *Parameter.colors(
         "of the table.", defaults=(0.55, 0.45, 0.37), estimators=("differences",)
@@ -517,8 +523,8 @@ GROUND = (
         low=1e-3,
         high=1000.0,
         default=f"1.6, or {DEFAULT_PHOTOGRAPH_HEIGHT:g} object sizes",
-        description="Height above the floor from which the photograph was taken; in object "
-        "sizes as `camera.distance`.",
+        description="Height above the floor from which the photograph was taken; in "
+        "object sizes as `camera.distance`.",
     ),
     Parameter(
         "radius",
@@ -527,8 +533,8 @@ GROUND = (
         low=1e-3,
         high=1e5,
         default="5 heights",
-        description="How far from the photograph's camera its floor is empty; in object "
-        "sizes as `camera.distance`.",
+        description="How far from the photograph's camera its floor is empty; in "
+        "object sizes as `camera.distance`.",
     ),
 )
 MATERIAL = (

@@ -59,19 +59,21 @@ _SMOOTHING_ROUNDS = 10
 
 
 def unwrap(soup: TriangleSoup, chart_group: IntArray | None = None) -> TriangleSoup:
-    """Return a soup with texture coordinates from xatlas; deterministic.
+    """Return faces with texture coordinates from xatlas; deterministic.
 
-    The charts do not overlap and lie inside the unit square. The faces of a mesh in
-    very many pieces become triangles of one size, side by side in a grid.
+    The charts, pieces of the surface in the texture, do not overlap and lie inside the
+    unit square. The faces of a mesh in very many pieces become triangles of one size,
+    side by side in a grid.
 
     Args:
         soup: the faces.
         chart_group: (F,) faces with different numbers get charts of their own.
     """
-    patch = _find_patches(soup)
+    patch = _find_patches(soup)  # (F,) the patch of each face, which is cut out
     if chart_group is not None:
-        pairs = patch * (int(chart_group.max()) + 1) + chart_group
-        patch = np.unique(pairs, return_inverse=True)[1].reshape(-1)
+        # patches are cut further where the group changes
+        patch_and_group = patch * (int(chart_group.max()) + 1) + chart_group
+        patch = np.unique(patch_and_group, return_inverse=True)[1].reshape(-1)
     if int(patch.max()) >= _MAX_PATCHES:
         return replace(soup, uvs=_make_grid_uvs(len(soup.faces)))
     groups = group_indices(patch)
@@ -80,7 +82,8 @@ def unwrap(soup: TriangleSoup, chart_group: IntArray | None = None) -> TriangleS
     for index, group in enumerate(groups):
         _, corners, atlas_uvs = atlas[index]
         uvs[group] = np.asarray(atlas_uvs, dtype=np.float64)[np.asarray(corners)]
-    # look-ups repeat at the border, where xatlas leaves no gap
+    # A look-up near the border also reads the opposite one, and xatlas leaves no gap
+    # there: the charts are shrunk by half a gap on each side.
     margin = 0.5 * ATLAS_PADDING / ATLAS_SIZE
     return replace(soup, uvs=margin + (1.0 - 2.0 * margin) * np.clip(uvs, 0.0, 1.0))
 
@@ -161,13 +164,14 @@ def _find_patches(soup: TriangleSoup) -> IntArray:
     """
     normals: Float64Array = normalize_vectors(soup.compute_face_vectors())
     count = len(normals)
+    # the two faces of each shared edge; their corners are numbered 3 face + k
     left, right, _ = find_shared_edges(soup.faces)
-    # faces of both corners (3 face + k) of an edge
     face = left // 3
     neighbour = right // 3
     is_flush = (normals[face] * normals[neighbour]).sum(axis=1) > _MIN_FLUSH_COSINE
     plane = find_components(count, face[is_flush], neighbour[is_flush])
     patch = np.zeros(count, dtype=np.int64)
+    # whether both faces of an edge stay in one patch
     is_same = np.ones(len(face), np.bool_)
     if count > _FACES_PER_ATLAS or not _are_straight(normals, plane):
         direction = _find_directions(normals, face, neighbour)
@@ -306,7 +310,8 @@ class SurfaceParts:
         self.corners = _unwrap_mesh(mesh) if self.is_unwrapped else self._mesh_uvs
         charts = _rasterise_map(mesh, self.corners)
         self.counts_faces = len(mesh.faces) <= MAX_FACES
-        faces = np.arange(len(mesh.faces) if self.counts_faces else 0)
+        n_face_parts = len(mesh.faces) if self.counts_faces else 0
+        faces = np.arange(n_face_parts)  # indices of the faces that are parts
         self.count = MAP_SIZE * MAP_SIZE + len(faces)
         self.is_covered = charts.is_covered
         self.face = np.concatenate([charts.face.reshape(-1), faces])
@@ -333,22 +338,25 @@ class SurfaceParts:
     def find_cells(self, face: IntArray, uv: Float64Array) -> IntArray:
         """Return the index of the map's cell (n,) in which each point on a face lies.
 
-        Where the map has texture coordinates of its own, a point is taken to it by its
-        barycentric weights in the face. What is outside counts as on the border.
+        Where the map has texture coordinates of its own, `is_unwrapped`, a point is
+        taken to it by its barycentric weights in the face. What is outside of the map
+        counts as on its border.
 
         Args:
             face: (n,) index of the face.
             uv: (n, 2) the mesh's own texture coordinates.
         """
         if self.is_unwrapped:
-            # The order is (row, column), so v and u. No area: all three weights alike.
+            # its arguments are in the order of rows and columns: v, then u
             weights = compute_barycentric(self._mesh_uvs[face], uv[:, 1], uv[:, 0])
+            # of a face without area, whose weights are not finite, the middle is taken
             weights = np.nan_to_num(weights, nan=1 / 3, posinf=1 / 3, neginf=1 / 3)
             weights = np.clip(weights, 0.0, 1.0)
             weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
             uv = np.einsum("nk,nkc->nc", weights, self.corners[face])
-        cells = np.floor(np.stack([uv[:, 0], 1 - uv[:, 1]]) * MAP_SIZE)
-        column, row = np.clip(cells, 0, MAP_SIZE - 1).astype(np.int64)
+        # v points up, and rows go down
+        column_and_row = np.floor(np.stack([uv[:, 0], 1 - uv[:, 1]]) * MAP_SIZE)
+        column, row = np.clip(column_and_row, 0, MAP_SIZE - 1).astype(np.int64)
         return np.asarray(row * MAP_SIZE + column)
 
 
@@ -356,8 +364,7 @@ def _unwrap_mesh(mesh: Mesh) -> Float64Array:
     """Return new texture coordinates (F, 3, 2) of a mesh that do not overlap.
 
     Vertices at the same position count as one, so that charts are not cut at old seams,
-    and the mesh is scaled to a size of 1, as `unwrap` expects. Old texture coordinates,
-    normals and colors play no part.
+    and the mesh is scaled to a size of 1, as `unwrap` expects.
     """
     lower = mesh.vertices.min(axis=0)
     upper = mesh.vertices.max(axis=0)
@@ -366,6 +373,7 @@ def _unwrap_mesh(mesh: Mesh) -> Float64Array:
     unique_points, unique_index = np.unique(points, axis=0, return_inverse=True)
     faces = unique_index.reshape(-1)[mesh.faces.astype(np.int64)]
     n_faces = len(faces)
+    # only points and faces count: the rest says that nothing is known
     soup = TriangleSoup(
         points=unique_points,
         faces=faces,
@@ -381,6 +389,7 @@ def _rasterise_map(mesh: Mesh, uvs: Float64Array) -> Charts:
     """Rasterise texture coordinates (F, 3, 2) of a mesh's faces into the map's
     cells.
     """
+    # every corner of a face becomes a vertex, as its texture coordinates are its own
     vertex = mesh.faces.reshape(-1)
     faces = np.arange(len(vertex), dtype=np.uint32).reshape(-1, 3)
     flat_uvs = uvs.reshape(-1, 2).astype(np.float32)
@@ -393,8 +402,7 @@ def _has_unique_uvs(mesh: Mesh, uvs: Float64Array) -> bool:
 
     They do if they lie in the unit square, give almost all of the surface an area,
     cover enough of the square, and hardly any of it twice. The last two are tested on a
-    raster of `_TEST_RASTER_SIZE`; a negative tolerance there leaves out pixels on the
-    border of a face, which neighbours share.
+    raster of `_TEST_RASTER_SIZE` pixels a side.
     """
     if uvs.min() < 0.0 or uvs.max() > 1.0:
         return False
@@ -403,6 +411,8 @@ def _has_unique_uvs(mesh: Mesh, uvs: Float64Array) -> bool:
     is_flat = np.abs(compute_doubled_areas(uvs)) < 1e-12
     if areas[is_flat].sum() > MAX_FLAT_FRACTION * areas.sum():
         return False
+    # The raster has the center of its first pixel at 0. By the negative tolerance a
+    # pixel on the border of two faces is in neither.
     _, row, column, _ = rasterize_triangles(
         uvs * _TEST_RASTER_SIZE - 0.5,
         (_TEST_RASTER_SIZE, _TEST_RASTER_SIZE),

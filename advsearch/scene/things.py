@@ -11,7 +11,7 @@ from above; at 0 a thing faces where the object does.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -40,9 +40,10 @@ from advsearch.scene.grounds import has_lanes
 from advsearch.scene.importing.files import make_safe_name
 from advsearch.scene.parts import Footprint, MeshPart, make_mesh_part
 from advsearch.scene.scene_data import AnyScene, SceneData
-from advsearch.scene.settings import LAMPS
+from advsearch.scene.settings import LAMPS, LAMPS_OFF
 
 MAX_DISTANCE = 1000.0  # how far from the object a thing may stand, metres
+MAX_HEADING = 3600.0  # limit of a heading, degrees
 MAX_THINGS = 64  # things beside an object
 EYE_SIZE = 1e-3  # half the width of what stands for a camera, object sizes
 OPTIONS = ("heading", "size", "name", "label", "lamps", "facing")
@@ -71,7 +72,7 @@ class RequestedThing:
     name: str = ""  # what it is called in the scene
     # what a model should call it; None for what the object of that name is called
     label: str | None = None
-    lamps: str = LAMPS[0]  # one of `settings.LAMPS`, of a car
+    lamps: str = LAMPS_OFF  # one of `settings.LAMPS`, of a car
     # the axis of its file that is its front; None for what its format says
     facing: str | None = None
 
@@ -81,7 +82,7 @@ class ThingPart(MeshPart):
     """A thing beside the object."""
 
     size_in_metres: float = 1.0  # its longest side
-    lamps: str = LAMPS[0]  # which it has on
+    lamps: str = LAMPS_OFF  # which it has on
 
 
 def parse_things(things_spec: str | None) -> tuple[RequestedThing, ...]:
@@ -96,19 +97,18 @@ def parse_things(things_spec: str | None) -> tuple[RequestedThing, ...]:
     things: list[RequestedThing] = []
     for part in filter(None, map(str.strip, (things_spec or "").split(";"))):
         thing = _parse_thing(part)
-        reserved = [*RESERVED_NAMES, *(other.name for other in things)]
-        if thing.name in reserved and "name=" in part:
+        used_names = [*RESERVED_NAMES, *(other.name for other in things)]
+        if thing.name in used_names and "name=" in part:
             raise InputError(
                 f"things: {part}: another thing of the scene is called "
                 f"{thing.name}; choose another name"
             )
-        # car, car-2, car-3: the number before is taken off again
-        suffix = 2
-        while thing.name in reserved:
-            thing = replace(
-                thing, name=f"{thing.name.removesuffix(f'-{suffix - 1}')}-{suffix}"
-            )
-            suffix += 1
+        # car, car-2, car-3: each number takes the place of the one before
+        number = 2
+        while thing.name in used_names:
+            plain_name = thing.name.removesuffix(f"-{number - 1}")
+            thing = replace(thing, name=f"{plain_name}-{number}")
+            number += 1
         things.append(thing)
     if len(things) > MAX_THINGS:
         raise InputError(f"things: expected at most {MAX_THINGS}, got {len(things)}")
@@ -122,48 +122,60 @@ def _parse_thing(part: str) -> RequestedThing:
     UnknownNameError: it is not as described there.
     """
     object_spec, separator, rest = part.rpartition("@")
+    object_spec = object_spec.strip()
+    # X, Y, and then options such as heading=180
     words = [word.strip() for word in rest.split(",")]
-    options = dict(word.partition("=")[::2] for word in words[2:])
-    if (
-        not separator
-        or not object_spec.strip()
-        or len(words) < 2
-        or any("=" not in word for word in words[2:])
-    ):
+    option_words = words[2:]
+    has_position = bool(separator) and len(words) >= 2
+    has_options = all("=" in word for word in option_words)
+    if not (object_spec and has_position and has_options):
         raise InputError(
-            "things: expected WHAT@X,Y in metres, such as "
-            f"car@12,3.5,heading=180, got {part!r}"
+            "things: expected WHAT@X,Y in metres, such as car@12,3.5,heading=180, got "
+            f"{part!r}"
         )
-    for name in options:
-        if name not in OPTIONS:
-            raise UnknownNameError(f"option of things {part!r}:", name, OPTIONS)
-    lamps = options.get("lamps", LAMPS[0])
-    if lamps not in LAMPS:
-        raise UnknownNameError(f"lamps of things {part!r}:", lamps, LAMPS)
-    x, y = (
-        _parse_number(part, name, word, -MAX_DISTANCE, MAX_DISTANCE)
-        for name, word in zip("xy", words, strict=False)
-    )
+    options = _parse_options(part, option_words)
+    x = _parse_number(part, "x", words[0], -MAX_DISTANCE, MAX_DISTANCE)
+    y = _parse_number(part, "y", words[1], -MAX_DISTANCE, MAX_DISTANCE)
     heading = 0.0
     if "heading" in options:
-        heading = _parse_number(part, "heading", options["heading"], -3600.0, 3600.0)
+        heading = _parse_number(
+            part, "heading", options["heading"], -MAX_HEADING, MAX_HEADING
+        )
     size = None
     if "size" in options:
         size = _parse_number(part, "size", options["size"], MIN_METRES, MAX_METRES)
-    name = make_safe_name(
-        Path(options.get("name") or object_spec.strip().partition("#")[0])
-    )
+    # without the part of the file that is behind a #
+    name = make_safe_name(Path(options.get("name") or object_spec.partition("#")[0]))
     return RequestedThing(
-        object_spec=object_spec.strip(),
+        object_spec=object_spec,
         x=x,
         y=y,
         heading=heading,
         size=size,
         name=name,
         label=options.get("label"),
-        lamps=lamps,
+        lamps=options.get("lamps", LAMPS_OFF),
         facing=options.get("facing"),
     )
+
+
+def _parse_options(part: str, words: Iterable[str]) -> dict[str, str]:
+    """Return the options of a thing, words such as heading=180, by name.
+
+    `part` is the text of the thing, for messages. Raises UnknownNameError: there is no
+    such option, or no such word for its lamps.
+    """
+    options: dict[str, str] = {}
+    for word in words:
+        name, _, value = word.partition("=")
+        options[name] = value
+    for name in options:
+        if name not in OPTIONS:
+            raise UnknownNameError(f"option of things {part!r}:", name, OPTIONS)
+    lamps = options.get("lamps", LAMPS_OFF)
+    if lamps not in LAMPS:
+        raise UnknownNameError(f"lamps of things {part!r}:", lamps, LAMPS)
+    return options
 
 
 def _parse_number(part: str, name: str, text: str, low: float, high: float) -> float:
@@ -190,8 +202,8 @@ def add_things(
     Args:
         scene: scene with the object.
         things_spec: the setting; None for no things.
-        load: loads an object by its name or file, and the axis that its front
-            faces.
+        load: loads an object; its arguments are a name or a file, and the axis of
+            the file that is the object's front, None for what its format says.
 
     Raises:
         InputError: the text is invalid, a name is taken, or sizes in metres are not
@@ -204,8 +216,7 @@ def add_things(
     if scene.object.size_in_metres is None:
         raise InputError(
             f"things: they stand in metres beside {scene.object_name}, whose size in "
-            "metres is not known; say it: its "
-            "longest side, such as `size=0.1`"
+            "metres is not known; say it: its longest side, such as `size=0.1`"
         )
     parts = list[ThingPart]()
     remarks = list[str]()
@@ -240,8 +251,8 @@ def _make_thing(
         )
     if name in {part.name for part in scene.parts}:
         raise InputError(
-            f"things: something of the scene is called {name} "
-            "already; add name=NAME to it"
+            f"things: something of the scene is called {name} already; add name=NAME "
+            "to it"
         )
     pose = _compute_pose(scene, asset, thing, asset.size_in_metres)
     part = make_mesh_part(name, asset, pose, asset.material)
@@ -283,8 +294,7 @@ def _compute_pose(
     requested: RequestedThing,
     metres: float,
 ) -> Float64Array:
-    """Return the pose (4, 4) of a thing: at its place, on the ground, turned and
-    scaled.
+    """Return the pose (4, 4) of a thing on the ground where it is requested.
 
     Args:
         scene: scene with the object, whose size is the unit of lengths.
@@ -294,21 +304,12 @@ def _compute_pose(
     """
     # the point of the mesh that is put on the ground, and its longest side
     foot_point, extent = find_footing(asset.mesh.vertices.astype(np.float64))
-    scaled_rotation = (
-        metres
-        / scene.size_in_metres
-        / extent
-        * make_rotation(requested.heading, 0.0, 0.0)
-    )
-    position = (
-        compute_center(scene)[:2]
-        + np.array([requested.x, requested.y]) / scene.size_in_metres
-    )
-    return make_pose(
-        scaled_rotation,
-        np.array([*position, find_ground_height(scene, position)])
-        - scaled_rotation @ foot_point,
-    )
+    scale = metres / scene.size_in_metres / extent
+    scaled_rotation = scale * make_rotation(requested.heading, 0.0, 0.0)
+    offset = np.array([requested.x, requested.y]) / scene.size_in_metres
+    position = compute_center(scene)[:2] + offset
+    stand_point = np.array([*position, find_ground_height(scene, position)])
+    return make_pose(scaled_rotation, stand_point - scaled_rotation @ foot_point)
 
 
 def find_ground_height(scene: SceneData, position: Float64Array) -> float:
@@ -337,21 +338,20 @@ def find_triangle_heights(corners: Float64Array, position: Float64Array) -> list
     that stands upright does not. Its height is that of its plane at the point.
     """
     a, b, c = np.moveaxis(corners, 1, 0)
-    # Signed, from above, of the triangles that the point makes with each side. Divided
-    # by their sum they are the weights of the corners opposite, a, b and c.
+    # The point makes a triangle with each side; the areas, signed and seen from above.
+    # Divided by their sum they are the weights of the opposite corners a, b and c.
     doubled_areas = [
         (end[:, 0] - start[:, 0]) * (position[1] - start[:, 1])
         - (end[:, 1] - start[:, 1]) * (position[0] - start[:, 0])
         for start, end in ((b, c), (c, a), (a, b))
     ]
     total_area = doubled_areas[0] + doubled_areas[1] + doubled_areas[2]
-    barycentric = np.stack(doubled_areas) / np.where(
-        np.abs(total_area) > 1e-12, total_area, np.nan
-    )
-    is_over_point = (barycentric >= 0.0).all(axis=0)
-    heights: list[float] = (
-        (barycentric * [a[:, 2], b[:, 2], c[:, 2]]).sum(axis=0)[is_over_point].tolist()
-    )
+    # NaN, for which comparisons are false, for a triangle that stands upright
+    divisor = np.where(np.abs(total_area) > 1e-12, total_area, np.nan)
+    barycentric = np.stack(doubled_areas) / divisor
+    contains_point = (barycentric >= 0.0).all(axis=0)
+    plane_heights = (barycentric * [a[:, 2], b[:, 2], c[:, 2]]).sum(axis=0)
+    heights: list[float] = plane_heights[contains_point].tolist()
     return heights
 
 
@@ -421,6 +421,5 @@ def list_camera_remarks(
     fraction = 100.0 * len(solid_names) / len(eyes)
     return (
         f"The camera is inside {solids} of the place in {fraction:.0f} % of the views: "
-        "it sees no object from there; "
-        "narrow where it goes.",
+        "it sees no object from there; narrow where it goes.",
     )

@@ -19,7 +19,7 @@ class Window(NamedTuple):
 
     @classmethod
     def from_mask(cls, mask: Tensor) -> Window | None:
-        """Return the smallest window with all pixels of a mask (H, W); None if empty."""
+        """Return the smallest window around a mask (H, W); None if it is empty."""
         rows = mask.any(dim=1).nonzero().flatten()
         columns = mask.any(dim=0).nonzero().flatten()
         if not len(rows):

@@ -55,7 +55,7 @@ def test_viewpoints_are_predicted_and_fresh_samples_are_rendered(whole: tuple[Pa
     assert predicted and found.count(("map", True, 4)) == 9 and len(found) == predicted + checked + 9
     assert result.renders["products"] == predicted + 9
     compared = 3 * acceptance.N_FIRST_VIEWS
-    assert result.renders["verification"] == growing.CENTRE_TRIALS + checked + compared
+    assert result.renders["verification"] == growing.CENTER_TRIALS + checked + compared
 
 
 class Stopping(Impatient):

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 from pydantic import TypeAdapter
+from torch import Tensor
 
 from advsearch.extend import Problem, RunContext, gradients, results, seeds, workbench
 from advsearch.questions.check.leaving_out import (
@@ -38,8 +39,10 @@ N_SEEDS = (6, 16)
 # the same for the model's loss, whose renders have more samples
 N_MODEL_SEEDS = (3, 6)
 HINT = "`resolution` or fewer controls shorten it, `seconds` ends it"
+OMISSION_HINT = "`specialise=false` leaves it out"
 Finding = CheckedRow | SearchPlan | results.PathLength | GainRow | TexelRow
 FINDINGS: TypeAdapter[list[Finding]] = TypeAdapter(list[Finding])
+FindingType = TypeVar("FindingType")
 
 
 @dataclass(frozen=True)
@@ -135,27 +138,24 @@ class GradientCheck:
 
     def _make_result(self, findings: list[Finding]) -> CheckResult:
         """Return the result of what is measured so far."""
-
-        def select(kind: type[Any]) -> list[Any]:
-            """Return the findings of a type."""
-            return [finding for finding in findings if isinstance(finding, kind)]
-
         configs = [part.config for part in self.parts]
+        objects = dict.fromkeys(config.object for config in configs)
+        environments = dict.fromkeys(config.environment_name for config in configs)
         controls = dict.fromkeys(name for config in configs for name in config.controls)
+        plans = _select(findings, SearchPlan)
+        lengths = _select(findings, results.PathLength)
         return self.context.result(
             CheckResult,
-            object=",".join(dict.fromkeys(config.object for config in configs)),
-            environment=",".join(
-                dict.fromkeys(config.environment_name for config in configs)
-            ),
+            object=",".join(objects),
+            environment=",".join(environments),
             controls=list(controls),
             measured=self.parts_done,
             planned=len(self.parts),
-            rows=select(CheckedRow),
-            plan=next(iter(select(SearchPlan)), None),
-            bounces=next(iter(select(results.PathLength)), None),
-            gains=select(GainRow),
-            texels=select(TexelRow),
+            rows=_select(findings, CheckedRow),
+            plan=plans[0] if plans else None,
+            bounces=lengths[0] if lengths else None,
+            gains=_select(findings, GainRow),
+            texels=_select(findings, TexelRow),
         )
 
     def _measure_parts(self) -> Iterator[Finding]:
@@ -179,7 +179,8 @@ class GradientCheck:
         for finding in measure(part, title):
             findings.append(finding.to_dict())
             yield finding
-            # Reported after it is stored: a reader may stop the check then.
+            # Reported after it was yielded: who collects findings may stop the check
+            # there.
             if isinstance(finding, CheckedRow):
                 self._report_row(finding)
         self.measurements.put(part.key, findings)
@@ -204,6 +205,7 @@ class GradientCheck:
         config = part.config
         problem, _ = workbench.problem_from_config(config, denoise="none")
         renderer = problem.renderer
+        # The raw image has no tone curve.
         renderer.formation = replace(renderer.formation, transfer="linear")
         renderer.plan = renderer.plan.with_pixel_steps()
         loss = gradients.make_smooth_loss(renderer.formation.resolution, config.seed)
@@ -212,7 +214,7 @@ class GradientCheck:
             self._make_bench(part, renderer, loss, spp),
             reference_spp=REFERENCE_SPP,
             reference_repeats=N_SEEDS,
-            reference_factors=gradients.FACTORS[:2],
+            reference_factors=gradients.FACTORS[:2],  # two steps of differences
             list_tries=gradients.list_attempts,
             stage=partial(self._begin_stage, title),
         )
@@ -277,12 +279,12 @@ class GradientCheck:
         """Yield the cosines of gradients with converged ones, by samples per pixel."""
         plan = problem.renderer.plan
         # not fewer samples than the search has
-        counts = tuple(
+        larger_counts = tuple(
             count
             for count in (*planning.SAMPLE_COUNTS, MAX_SPP)
             if count >= problem.spp
         )
-        counts = counts or (problem.spp,)
+        counts = larger_counts or (problem.spp,)
         self.progress.stage(
             f"{title}: the model's gradients",
             planning.count_cosine_samples(plan, counts=counts),
@@ -323,6 +325,7 @@ class GradientCheck:
         )
 
     def _begin_stage(self, title: str, name: str, max_steps: int) -> None:
+        """Begin a stage of the progress, of a part with a title."""
         self.progress.stage(f"{title}: {name}", max_steps, hint=HINT, at_most=True)
 
     def _plan_search(
@@ -347,45 +350,67 @@ class GradientCheck:
         yield SearchPlan(**{**vars(summary), "spp": spp, "left_out": left_out})
         if not config.specialise:
             return
-        u = gradients.find_interior_point(renderer)
-        seed = seeds.stream(config.seed, "leaving out")
-        hint = "`specialise=false` leaves it out"
-        tick = self.progress.advance
-
-        def measure_length() -> results.PathLength:
-            """Measure the longest light paths that matter, at the problem's start."""
-            title = "finding how many bounces of light matter"
-            max_images = planning.count_bounce_images(problem)
-            self.progress.stage(title, max_images, hint=hint, at_most=True)
-            return planning.measure_problem_bounces(problem, config.seed, tick=tick)
-
         length = self.measurements.get_row(
-            f"{part.key} bounces", results.PathLength, measure_length
+            f"{part.key} bounces",
+            results.PathLength,
+            lambda: self._measure_path_length(problem, config.seed),
         )
         yield length
-
-        def measure_part_gains() -> list[GainRow]:
-            """Measure what each thing that is left out saves."""
-            title = "measuring what leaving things out saves"
-            self.progress.stage(title, MAX_GRADIENTS, hint=hint, at_most=True)
-            return measure_gains(
-                renderer,
-                problem.compute_loss,
-                u,
-                seed=seed,
-                spp=problem.spp,
-                depth=length.depth,
-                tick=tick,
-            )
-
+        u = gradients.find_interior_point(renderer)
+        seed = seeds.stream(config.seed, "leaving out")
         yield from self.measurements.get_rows(
-            f"{part.key} gains", GainRow, measure_part_gains
+            f"{part.key} gains",
+            GainRow,
+            lambda: self._measure_gains(problem, u, seed, length.depth),
         )
         yield from self.measurements.get_rows(
             f"{part.key} texels",
             TexelRow,
             lambda: measure_texels(renderer, u, seed=seed),
         )
+
+    def _measure_path_length(self, problem: Problem, seed: int) -> results.PathLength:
+        """Measure the longest light paths that matter, at the problem's start."""
+        self.progress.stage(
+            "finding how many bounces of light matter",
+            planning.count_bounce_images(problem),
+            hint=OMISSION_HINT,
+            at_most=True,
+        )
+        tick = self.progress.advance
+        return planning.measure_problem_bounces(problem, seed, tick=tick)
+
+    def _measure_gains(
+        self, problem: Problem, u: Tensor, seed: int, depth: int
+    ) -> list[GainRow]:
+        """Measure what each thing that is left out saves.
+
+        Args:
+            problem: problem of the scene.
+            u: (d,) the configuration.
+            seed: seed of the renders.
+            depth: segments of the longest light path of the search.
+        """
+        self.progress.stage(
+            "measuring what leaving things out saves",
+            MAX_GRADIENTS,
+            hint=OMISSION_HINT,
+            at_most=True,
+        )
+        return measure_gains(
+            problem.renderer,
+            problem.compute_loss,
+            u,
+            seed=seed,
+            spp=problem.spp,
+            depth=depth,
+            tick=self.progress.advance,
+        )
+
+
+def _select(findings: Sequence[Finding], kind: type[FindingType]) -> list[FindingType]:
+    """Return the findings of a type."""
+    return [finding for finding in findings if isinstance(finding, kind)]
 
 
 def list_left_out(renderer: gradients.Renderer) -> list[str]:

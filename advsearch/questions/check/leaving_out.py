@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import statistics
 import time
-from collections import defaultdict
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -17,6 +17,7 @@ from advsearch.questions.check.result import GainRow, TexelRow
 ITEMS = gradients.OMISSIONS
 EVERYTHING = frozenset(ITEMS)  # leave out all that can be
 NOTHING = frozenset[str]()
+SEARCH = ""  # the renderer of the search, which computes no item
 ALL = "everything above"
 BOUNCES = "bounces"
 """Names of the rows in which all items are put back together, and in which paths have
@@ -74,34 +75,34 @@ def measure_gains(
         A row for each item, one for the bounces if these are limited, and one for all.
     """
     variants = _make_variants(renderer, depth)
-    # by item; "" is the renderer of the search
-    images = defaultdict[str, list[Tensor]](list)
-    slopes = defaultdict[str, list[Tensor]](list)
-    times = defaultdict[str, list[float]](list)
+    measurements = {item: _Measurements() for item in variants}
     # The first gradient of each compiles, so that these are not timed.
     for noise_seed in (seed, seeds.stream(seed, "another")):
         for item, variant in variants.items():
             with torch.no_grad():
-                images[item].append(variant(u, noise_seed, spp))
-            slopes[item].append(variant.gradient(loss, u, noise_seed, spp)[1])
+                measurements[item].images.append(variant(u, noise_seed, spp))
+            _, gradient = variant.gradient(loss, u, noise_seed, spp)
+            measurements[item].gradients.append(gradient)
             tick()
     for number in range(repeats):
         for item, variant in variants.items():
             begin = time.perf_counter()
             variant.gradient(loss, u, seeds.stream(seed, "round", number), spp)
-            times[item].append(time.perf_counter() - begin)
+            measurements[item].seconds.append(time.perf_counter() - begin)
             tick()
+    search = measurements.pop(SEARCH)
     return [
-        _compare_item(item, images, slopes, times) for item in variants if item != ""
+        _compare_item(item, search, with_item)
+        for item, with_item in measurements.items()
     ]
 
 
 def _make_variants(
     renderer: gradients.Renderer, depth: int | None
 ) -> dict[str, gradients.Renderer]:
-    """Return the renderer of a search, by "", and others by the item that they compute.
+    """Return the renderer of a search, and others by the item that they compute.
 
-    The renderer of the search leaves out everything that it can; each of the others
+    That of the search (`SEARCH`) leaves out everything that it can; each of the others
     computes one item of that, or all (`ALL`).
 
     Args:
@@ -110,53 +111,60 @@ def _make_variants(
     """
     scene = renderer.scene
     depth = scene.max_depth if depth is None else depth
-    is_limited = depth != scene.max_depth
-    variants = {"": renderer}
-    if is_limited:
-        variants[""] = renderer.copy_with(scene.copy_with(max_depth=depth))
+    variants = {SEARCH: renderer}
+    if depth != scene.max_depth:
+        variants[SEARCH] = renderer.copy_with(scene.copy_with(max_depth=depth))
     for item in ITEMS:
         leave_out = EVERYTHING - {item}
         variants[item] = renderer.copy_with(
             scene.copy_with(max_depth=depth, leave_out=leave_out)
         )
-    # It leaves out the same things, but no bounces.
     if depth < scene.max_depth:
+        # It leaves out the same things as the search, but no bounces.
         variants[BOUNCES] = renderer
     variants[ALL] = renderer.copy_with(scene.copy_with(leave_out=NOTHING))
     return variants
 
 
+@dataclass
+class _Measurements:
+    """What is measured with one renderer.
+
+    Attributes:
+        images: images (H, W, 3) at two seeds.
+        gradients: gradients (d,) at two seeds.
+        seconds: times of gradients.
+    """
+
+    images: list[Tensor] = field(default_factory=list)
+    gradients: list[Tensor] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+
+
 def _compare_item(
-    item: str,
-    images: Mapping[str, list[Tensor]],
-    slopes: Mapping[str, list[Tensor]],
-    times: Mapping[str, list[float]],
+    item: str, search: _Measurements, with_item: _Measurements
 ) -> GainRow:
-    """Compare the renderer that computes an item with the one that leaves it out.
+    """Compare the renderer that computes an item with that of the search.
 
-    Measurements are by the item that is computed; those under "" are without any.
-
-    `time_gain` is how many times as long the renderer with the item takes to images of
-    the same noise: the ratio of the seconds, times that of the variances.
+    `time_gain` is how much longer the one with the item takes for an image as noisy:
+    the ratio of the seconds, times that of the variances.
 
     Args:
         item: its name.
-        images: images at two seeds.
-        slopes: gradients at two seeds.
-        times: times of gradients, in seconds.
+        search: measurements without any of the items.
+        with_item: measurements with the item.
     """
-    image_difference = _relative_difference(images[""], images[item])
-    gradient_difference = _relative_difference(slopes[""], slopes[item])
-    noise_without = _difference(images[""])
+    image_difference = _relative_difference(search.images, with_item.images)
+    gradient_difference = _relative_difference(search.gradients, with_item.gradients)
+    search_noise = _difference(search.images)
     variance_gain = 1.0
-    if noise_without > 0.0:
-        variance_gain = (_difference(images[item]) / noise_without) ** 2
-    seconds_without = statistics.median(times[""])
-    seconds = statistics.median(times[item])
+    if search_noise > 0.0:
+        variance_gain = (_difference(with_item.images) / search_noise) ** 2
+    seconds = statistics.median(with_item.seconds)
     return GainRow(
         item=item,
         what=WHAT[item],
-        time_gain=variance_gain * seconds / seconds_without,
+        time_gain=variance_gain * seconds / statistics.median(search.seconds),
         picture_difference=image_difference,
         gradient_difference=gradient_difference,
         safe=max(image_difference, gradient_difference) <= AGREEMENT_LIMIT,
@@ -206,25 +214,38 @@ def measure_texels(
         for name in sorted(renderer.routes.get(group.name, ())):
             n_pixels = _count_pixels(renderer, inputs, name, seed, spp)
             n_visible = _count_visible_texels(renderer, inputs, name, seed, spp)
-            size = max(inputs[name].shape[:2])
-            # Halved as long as enough texels per pixel would still be visible.
-            enough = size
-            while enough > 2:
-                # The number of texels falls with the square of the side.
-                n_visible_of_half = n_visible * (enough / 2 / size) ** 2
-                if n_visible_of_half < TEXELS_PER_PIXEL * n_pixels:
-                    break
-                enough //= 2
+            side = max(inputs[name].shape[:2])
             rows.append(
                 TexelRow(
                     control=group.control,
-                    side=size,
+                    side=side,
                     seen=n_visible,
                     pixels=n_pixels,
-                    enough=enough,
+                    enough=_find_sufficient_side(side, n_visible, n_pixels),
                 )
             )
     return rows
+
+
+def _find_sufficient_side(side: int, n_visible: int, n_pixels: int) -> int:
+    """Return the side of a texture, halved as often as the pixels resolve as much.
+
+    After each halving there have to be `TEXELS_PER_PIXEL` visible texels for each
+    pixel.
+
+    Args:
+        side: side of the texture, in texels.
+        n_visible: its visible texels.
+        n_pixels: pixels that show it.
+    """
+    sufficient = side
+    while sufficient > 2:
+        # The number of texels falls with the square of the side.
+        n_visible_of_half = n_visible * (sufficient / 2 / side) ** 2
+        if n_visible_of_half < TEXELS_PER_PIXEL * n_pixels:
+            break
+        sufficient //= 2
+    return sufficient
 
 
 def _count_pixels(
@@ -234,14 +255,21 @@ def _count_pixels(
     seed: int,
     spp: int,
 ) -> int:
-    """Count the pixels that show a texture: they differ if it is white or black."""
+    """Count the pixels that show a texture: they differ if it is white or black.
+
+    Args:
+        renderer: renderer of the scene.
+        inputs: inputs of the scene.
+        name: name of the input that is the texture.
+        seed: seed of the renders.
+        spp: samples per pixel.
+    """
     scene = renderer.scene
     white = {**inputs, name: torch.full_like(inputs[name], 1.0)}
     black = {**inputs, name: torch.full_like(inputs[name], 0.0)}
-    difference = (
-        scene.render_guides(white, seed, spp)[0]
-        - scene.render_guides(black, seed, spp)[0]
-    )
+    white_albedo, _ = scene.render_guides(white, seed, spp)
+    black_albedo, _ = scene.render_guides(black, seed, spp)
+    difference = white_albedo - black_albedo
     return int((difference.amax(dim=-1) > 0.0).sum())
 
 

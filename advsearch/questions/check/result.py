@@ -238,16 +238,17 @@ LOSSES = {
 
 def make_check_view(result: CheckResult) -> ShownResult:
     """Return the view of a check."""
-    rows = result.rows
-    sections = [ResultPart(text=[READING] if rows else [])]
+    sections = [ResultPart(text=[READING] if result.rows else [])]
     for loss, title in LOSSES.items():
         derivatives = [
-            row for row in rows if row.loss == loss and row.quantity == "derivative"
+            row
+            for row in result.rows
+            if row.loss == loss and row.quantity == "derivative"
         ]
         sections.append(
             ResultPart.make_table(derivatives, DERIVATIVE_COLUMNS, title=title)
         )
-    gradient_rows = [row for row in rows if row.quantity == "gradient"]
+    gradient_rows = [row for row in result.rows if row.quantity == "gradient"]
     sections += [
         ResultPart.make_table(
             gradient_rows,
@@ -296,22 +297,22 @@ def _verdict(result: CheckResult) -> str:
 def _reason_texts(result: CheckResult) -> list[str]:
     """Return why a search takes its estimators and steps: each reason once."""
     groups = result.plan.groups if result.plan else []
-    names_by_reason: dict[tuple[str, str], list[str]] = {}
-    for group in groups:
-        key = (group.estimator, group.reason)
-        names_by_reason.setdefault(key, []).append(group.name)
-    for group in groups:
-        if group.step_reason:
-            key = ("step", group.step_reason)
-            names_by_reason.setdefault(key, []).append(group.name)
+    # all estimators come first, then the steps
+    choices = [(group.name, group.estimator, group.reason) for group in groups]
+    choices += [
+        (group.name, "step", group.step_reason) for group in groups if group.step_reason
+    ]
+    names_by_choice: dict[tuple[str, str], list[str]] = {}
+    for name, choice, reason in choices:
+        names_by_choice.setdefault((choice, reason), []).append(name)
     return [
         f"{choice} of {', '.join(names)}: {reason}"
-        for (choice, reason), names in names_by_reason.items()
+        for (choice, reason), names in names_by_choice.items()
     ]
 
 
 def _left_out_texts(result: CheckResult) -> list[str]:
-    """Return what a search leaves out."""
+    """Return what a search leaves out, in sentences."""
     texts = [*result.plan.left_out] if result.plan else []
     bounces = result.bounces
     if bounces:
@@ -319,10 +320,10 @@ def _left_out_texts(result: CheckResult) -> list[str]:
             f"light paths of a long search: at most {bounces.depth} segments of "
             f"{bounces.full}: {bounces.reason}"
         )
-    for texels in result.texels:
+    for row in result.texels:
         texts.append(
-            f"texels of {texels.control}: {texels.seen} are seen in {texels.pixels} "
-            f"pixels, which resolve {texels.enough} of {texels.side} a side"
+            f"texels of {row.control}: {row.seen} are seen in {row.pixels} "
+            f"pixels, which resolve {row.enough} of {row.side} a side"
         )
     return texts
 
@@ -352,4 +353,5 @@ def find_inadequate(rows: Sequence[CheckedRow]) -> list[str]:
 
 
 def _difference_text(fraction: float) -> str:
+    """Describe by how much something differs, as a fraction of its noise."""
     return "not at all" if fraction == 0.0 else f"by {fraction:.2g} of its noise"

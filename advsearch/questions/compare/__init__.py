@@ -106,15 +106,16 @@ class CompareConfig(SweepConfig):
 
     @model_validator(mode="after")
     def _check_settings(self) -> CompareConfig:
-        """Reject settings of a sweep where stored ones are compared, and a single
-        model.
+        """Reject settings that do not belong to what is compared.
+
+        Without an `object` stored sweeps are compared, which takes no settings of a new
+        sweep; with one, models, of which there have to be two.
         """
-        if not self.object:
+        compares_stored_sweeps = not self.object
+        if compares_stored_sweeps:
             for declared in settings.settings(type(self)):
-                if (
-                    declared.field not in STORED_SWEEP_SETTINGS
-                    and getattr(self, declared.field) != declared.default
-                ):
+                is_set = getattr(self, declared.field) != declared.default
+                if is_set and declared.field not in STORED_SWEEP_SETTINGS:
                     raise InputError(
                         f"{declared.name}: says how models are shown pictures, and no "
                         "`object` is named; add `object`, "
@@ -163,24 +164,10 @@ def compare(context: RunContext[CompareConfig]) -> CompareResult:
     # these import torch and pandas
     from advsearch.questions.compare.images import PairImages
     from advsearch.questions.compare.pairs import compare_sides
-    from advsearch.questions.compare.sides import find_different_settings, read_sides
+    from advsearch.questions.compare.sides import find_different_settings
 
     config = context.config
-    progress = context.progress
-    sides: list[Side] = []
-    n_renders = 0
-    if config.object:
-        result = context.run_part(
-            "sweep", config.make_sweep_config().with_python_parts_of(config)
-        )
-        n_renders = sum(getattr(result, "renders", {}).values())
-        if not result.is_unfinished:
-            sides = read_sides([RunDirectory.locate_part(context.run.path, "sweep")])
-    else:
-        progress.stage("reading rows")
-        sides = read_sides(
-            [directory.find_run(name) for name in settings.split_names(config.compared)]
-        )
+    sides, n_sweep_renders = load_sides(context)
     if not sides:
         context.ending = results.INTERRUPTED
     differ = find_different_settings(sides) if sides else []
@@ -189,7 +176,7 @@ def compare(context: RunContext[CompareConfig]) -> CompareResult:
     images = PairImages(context)
     pairs: list[ComparedPair] = []
     for number, side in enumerate(sides[1:], start=1):
-        progress.stage("counting pairs")
+        context.progress.stage("counting pairs")
         try:
             pair = compare_sides(sides[0], side, config.seed)
         except InputError as error:  # the library that finds rules is missing
@@ -203,9 +190,32 @@ def compare(context: RunContext[CompareConfig]) -> CompareResult:
         differ=differ,
         sides=[count_side(side) for side in sides],
         pairs=pairs,
-        renders=n_renders + images.n_rendered,
+        renders=n_sweep_renders + images.n_rendered,
         warnings=list(dict.fromkeys([*warnings, *images.warnings])),
     )
+
+
+def load_sides(context: RunContext[CompareConfig]) -> tuple[list[Side], int]:
+    """Read the sides of stored sweeps, or of a new sweep of models.
+
+    Returns:
+        The sides, none if the new sweep was interrupted; and the images that it
+        rendered.
+    """
+    from advsearch.questions.compare.sides import read_sides  # imports pandas
+
+    config = context.config
+    if not config.object:
+        context.progress.stage("reading rows")
+        names = settings.split_names(config.compared)
+        return read_sides([directory.find_run(name) for name in names]), 0
+    sweep = context.run_part(
+        "sweep", config.make_sweep_config().with_python_parts_of(config)
+    )
+    n_renders = sum(getattr(sweep, "renders", {}).values())
+    if sweep.is_unfinished:
+        return [], n_renders
+    return read_sides([RunDirectory.locate_part(context.run.path, "sweep")]), n_renders
 
 
 def describe_sweeps(config: CompareConfig, sides: Sequence[Side]) -> dict[str, Any]:
@@ -256,29 +266,31 @@ def find_comparison_warnings(sides: Sequence[Side], differ: Sequence[str]) -> li
     """
     if not sides:
         return []
-    cautions = [text for side in sides for text in side.sweep.summary.warnings]
+    warnings = [text for side in sides for text in side.sweep.summary.warnings]
     if len(differ) > 1:
         names = f"{', '.join(differ[:-1])} and {differ[-1]}"
-        cautions.append(
+        warnings.append(
             f"The sweeps differ in {names}: what is told here is of all of "
             "that together."
         )
     if not differ:
-        cautions.append(
+        warnings.append(
             "The sweeps have the same settings: what differs is in files, "
             "in versions, or in the machine."
         )
     rows = sides[0].rows
-    if len(rows) > 1 and rows["unit"].nunique() == 1:
-        unit = rows.attrs["unit name"]
-        cautions.append(
-            f"All pairs are of one {unit}: the shares are of this one, and "
+    # Rows of one unit, such as the frames of one drive, are not independent.
+    is_of_single_unit = rows["unit"].nunique() == 1
+    if len(rows) > 1 and is_of_single_unit:
+        unit_name = rows.attrs["unit name"]
+        warnings.append(
+            f"All pairs are of one {unit_name}: the shares are of this one, and "
             "nothing is shown of others."
         )
     tasks = {side.sweep.summary.task for side in sides}
     if len(tasks) > 1:
-        cautions.append(
+        warnings.append(
             "What counts as right is judged by different tasks: "
             f"{', '.join(sorted(tasks))}."
         )
-    return cautions
+    return warnings

@@ -43,40 +43,36 @@ class PairImages:
     _unavailable: set[str] = field(default_factory=set)
 
     def list_examples(
-        self, first: Side, second: Side, pair: int
+        self, first: Side, second: Side, pair_number: int
     ) -> Iterator[PairPicture]:
         """Yield pairs of which one prediction is right, the largest margin gaps first.
 
         There are at most as many in favor of either side as the setting `pictures`
         says. Their images are stored in the run; a pair of which one cannot be has
-        none. Two models of one sweep have the same image.
+        none.
 
         Args:
             first, second: the sides, with rows in the same order.
-            pair: number of these two sides, for the names of the files.
+            pair_number: number of these two sides, for the names of the files.
         """
         run = self.context.run
         rows = select_examples(first, second, self.context.config.pictures)
-        is_same_sweep = first.sweep.folder == second.sweep.folder
         sides = {"a": first, "b": second}
+        is_same_sweep = first.sweep.folder == second.sweep.folder
+        # Two models of one sweep have the same image.
         if is_same_sweep and first.rows["number"].equals(second.rows["number"]):
             sides = {"a": first}
         files = {
-            row: [f"images/pair-{pair}-{row}-{letter}.jpg" for letter in sides]
+            row: [f"images/pair-{pair_number}-{row}-{letter}.jpg" for letter in sides]
             for row in rows
         }
         self._save_images(rows, sides, files, run)
         for row in rows:
-            values = first.rows.loc[row, first.varying_parameters].items()
-            rounded_values = {
-                name: value if isinstance(value, str) else float(f"{value:.6g}")
-                for name, value in values
-            }
             right_side = first if first.is_right[row] else second
             is_complete = all((run.path / file).is_file() for file in files[row])
             yield PairPicture(
                 number=row,
-                values=rounded_values,
+                values=_round_values(first, row),
                 right=right_side.name,
                 answers=(first.rows["label"][row], second.rows["label"][row]),
                 pictures=files[row] if is_complete else [],
@@ -142,6 +138,15 @@ class PairImages:
             return
         self.context.run.write_file(image.file, scenes.render_thumbnail(image.number))
         self.n_rendered += 1
+
+
+def _round_values(side: Side, row: int) -> dict[str, str | float]:
+    """Return the values of a row's parameters, numbers with six digits."""
+    values = side.rows.loc[row, side.varying_parameters].items()
+    return {
+        name: value if isinstance(value, str) else float(f"{value:.6g}")
+        for name, value in values
+    }
 
 
 def select_examples(first: Side, second: Side, limit: int) -> list[int]:

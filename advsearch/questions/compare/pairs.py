@@ -25,7 +25,7 @@ IntArray = npt.NDArray[np.int64]
 def compare_sides(
     first: Side, second: Side, seed: int, *, with_rules: bool = True
 ) -> ComparedPair:
-    """Count the pairs of two sides; images are added later.
+    """Count the pairs of two sides; `shown` has no examples yet.
 
     `worse` has rules under which only the first side is right, `better` those for the
     second; None without rules.
@@ -38,38 +38,38 @@ def compare_sides(
     Raises:
         InputError: rules are sought and scikit-learn is missing.
     """
-    shared = [
+    shared_parameters = [
         name
         for name in first.varying_parameters
         if name in second.rows.attrs["units"]
         and has_same_values(first.rows[name], second.rows[name])
     ]
-    units = first.rows["unit"].to_numpy()
-    n_units = len(np.unique(units))
-    only_first = first.is_right & ~second.is_right
-    only_second = ~first.is_right & second.is_right
+    # the unit of each pair, such as the drive that a frame is of
+    unit_of_pair = first.rows["unit"].to_numpy()
+    n_units = len(np.unique(unit_of_pair))
+    has_single_pairs = n_units == len(unit_of_pair)
     _, _, p_value = statistics.clustered.compare_paired(
-        first.is_right, second.is_right, units
+        first.is_right, second.is_right, unit_of_pair
     )
     worse = None
     better = None
     if with_rules:
-        table = rules.make_table(first.rows, shared)
-        # Rules say where `correct` is rare: here where one side alone is right.
-        worse = find_pair_rules(table.assign(correct=~only_first), seed)
-        better = find_pair_rules(table.assign(correct=~only_second), seed)
+        table = rules.make_table(first.rows, shared_parameters)
+        worse = find_pair_rules(table, first.is_right & ~second.is_right, seed)
+        better = find_pair_rules(table, ~first.is_right & second.is_right, seed)
+    parts = list[PairPart]()
+    for name in shared_parameters:
+        parts += count_by_parameter(first, second, name)
     return ComparedPair(
         first=first.name,
         second=second.name,
-        units=None if n_units == len(units) else n_units,
+        units=None if has_single_pairs else n_units,
         unit=first.rows.attrs["unit name"],
-        **count_pairs(first.is_right, second.is_right, units),
+        **count_pairs(first.is_right, second.is_right, unit_of_pair),
         p=p_value,
         worse=worse,
         better=better,
-        parts=[
-            part for name in shared for part in count_by_parameter(first, second, name)
-        ],
+        parts=parts,
         shown=[],
     )
 
@@ -84,32 +84,38 @@ def count_by_parameter(first: Side, second: Side, name: str) -> Iterator[PairPar
         name: name of the parameter.
     """
     column = first.rows[name]
-    unit = "" if column.dtype == "category" else first.rows.attrs["units"][name]
-    units = first.rows["unit"].to_numpy()
-    for value, mask in split_by_value(column, first.rows.attrs["edges"].get(name)):
+    unit_of_measure = ""
+    if column.dtype != "category":
+        unit_of_measure = first.rows.attrs["units"][name]
+    unit_of_pair = first.rows["unit"].to_numpy()  # see `count_pairs`
+    edges = first.rows.attrs["edges"].get(name)
+    for value, mask in split_by_value(column, edges):
         if mask.any():
             counts = count_pairs(
-                first.is_right[mask], second.is_right[mask], units[mask]
+                first.is_right[mask], second.is_right[mask], unit_of_pair[mask]
             )
-            yield PairPart(parameter=name, unit=unit, value=value, **counts)
+            yield PairPart(parameter=name, unit=unit_of_measure, value=value, **counts)
 
 
 def count_pairs(
-    first_right: BoolArray, second_right: BoolArray, units: IntArray
+    first_right: BoolArray, second_right: BoolArray, unit_of_pair: IntArray
 ) -> dict[str, Any]:
     """Return the fields of `PairCounts`.
 
     Args:
         first_right, second_right: whether each side is right (n,).
-        units: the unit of each pair (n,); pairs of one unit are not independent.
+        unit_of_pair: the unit of each pair (n,), such as the drive that a frame is of;
+            pairs of one unit are not independent.
     """
     difference, interval, _ = statistics.clustered.compare_paired(
-        first_right, second_right, units
+        first_right, second_right, unit_of_pair
     )
-    pairs_per_unit = statistics.clustered.sum_per_unit(np.ones(len(units)), units)
-    shares = [
+    n_pairs_of_unit = statistics.clustered.sum_per_unit(
+        np.ones(len(unit_of_pair)), unit_of_pair
+    )
+    accuracies = [
         statistics.clustered.mean_rate(
-            statistics.clustered.sum_per_unit(is_right, units), pairs_per_unit
+            statistics.clustered.sum_per_unit(is_right, unit_of_pair), n_pairs_of_unit
         )
         for is_right in (first_right, second_right)
     ]
@@ -118,7 +124,7 @@ def count_pairs(
         "first_only": int((first_right & ~second_right).sum()),
         "second_only": int((~first_right & second_right).sum()),
         "neither": int((~first_right & ~second_right).sum()),
-        "shares": tuple(shares),
+        "shares": tuple(accuracies),
         "difference": difference,
         "interval": interval,
     }
@@ -147,42 +153,49 @@ def split_by_value(
             yield bounds, bins == index
     elif column.nunique() <= MAX_VALUES:
         for value in np.unique(column):
-            yield float(f"{value:.6g}"), np.asarray(column == value)
+            rounded_value = float(f"{value:.6g}")
+            yield rounded_value, np.asarray(column == value)
 
 
-def find_pair_rules(table: pd.DataFrame, seed: int) -> list[PairRule] | None:
+def find_pair_rules(
+    table: pd.DataFrame, is_only_right: BoolArray, seed: int
+) -> list[PairRule] | None:
     """Find rules under which only one side is right more often; None for too few pairs.
 
     Args:
-        table: table of pairs (`rules`); `correct` is False where that side alone is
-            right.
+        table: table of pairs, as `rules.make_table` makes it.
+        is_only_right: whether that side alone is right (n,).
         seed: seed of the halves that choose and count.
     """
+    # Rules say where `correct` is rare: here where that side alone is right.
+    table = table.assign(correct=~is_only_right)
     if len(table) < rules.MIN_ROWS or not table.attrs["units"]:
         return None
     choosing, counting = rules.split_in_halves(table, seed)
     found_rules = rules.find_rules(choosing, counting, seeds.stream(seed, "compare"))
-    return [
-        PairRule(
-            conditions=[condition.row for condition in rule.conditions],
-            elsewhere=count_exceptions(rule.elsewhere),
-            **vars(count_exceptions(rule.inside)),
+    pair_rules = []
+    for rule in found_rules.accepted:
+        inside = count_exceptions(rule.inside)
+        pair_rules.append(
+            PairRule(
+                conditions=[condition.row for condition in rule.conditions],
+                elsewhere=count_exceptions(rule.elsewhere),
+                **vars(inside),
+            )
         )
-        for rule in found_rules.accepted
-    ]
+    return pair_rules
 
 
 def count_exceptions(pairs: pd.DataFrame) -> CountOf:
-    """Count the pairs that are not `correct`, with their share and its interval.
-
-    Rate and interval of the correct ones are turned around: 1 - rate.
-    """
-    lower, upper = rules.estimate_interval(pairs)
-    share = None if pairs.empty else 1.0 - rules.estimate_rate(pairs)
+    """Count the pairs that are not `correct`, with their fraction and its interval."""
+    lower, upper = rules.estimate_interval(pairs)  # of the correct ones
+    fraction = None
+    if not pairs.empty:
+        fraction = 1.0 - rules.estimate_rate(pairs)
     n_exceptions = int((~pairs["correct"]).sum())
     return CountOf(
         count=n_exceptions,
         total=len(pairs),
         interval=(1.0 - upper, 1.0 - lower),
-        share=share,
+        share=fraction,
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -241,17 +241,14 @@ def format_prediction_time(seconds: float) -> str:
 
 
 def summarize_difference(pair: ComparedPair) -> str:
-    """Summarise the difference of two sides in a sentence."""
+    """Summarize the difference of two sides in a sentence."""
     first_accuracy, second_accuracy = map(wording.percent, pair.accuracies)
-    of_units = (
-        ""
-        if pair.units is None
-        else f" of {wording.format_count(pair.units, pair.unit)}"
-    )
+    pictures = wording.format_count(pair.pairs, "picture")
+    if pair.units is not None:
+        pictures += f" of {wording.format_count(pair.units, pair.unit)}"
     return (
         f"{pair.first} is right in {first_accuracy} and {pair.second} in "
-        f"{second_accuracy} of the same "
-        f"{wording.format_count(pair.pairs, 'picture')}{of_units}: a difference of "
+        f"{second_accuracy} of the same {pictures}: a difference of "
         f"{100.0 * pair.difference:+.1f} points "
         f"(95 % interval {format_points_interval(pair.interval)})."
     )
@@ -270,11 +267,11 @@ def describe_exclusive_pairs(pair: ComparedPair) -> str:
     if pair.p > SIGNIFICANCE:
         reservation = ". That there is a difference is not shown"
     p_text = f"= {pair.p:.2g}" if pair.p >= 0.0001 else "< 0.0001"
+    # without units, pairs are independent
     test = "exact McNemar test" if pair.units is None else f"by {pair.unit}"
     return (
         f"{pair.first} alone is right in {pair.first_only} and {pair.second} alone in "
-        f"{pair.second_only} "
-        f"({test}, p {p_text}){reservation}."
+        f"{pair.second_only} ({test}, p {p_text}){reservation}."
     )
 
 
@@ -310,73 +307,96 @@ def _parameter_tables(pair: ComparedPair) -> Iterator[ResultPart]:
     A terminal shows the `MAX_TABLES` parameters over whose values the difference varies
     most, and a sentence about the others.
     """
-    tables: dict[str, list[PairPart]] = {}
+    parts_by_title: dict[str, list[PairPart]] = {}
     for part in pair.parts:
-        unit = f", {part.unit}" if part.unit not in ("", "1", "name") else ""
-        tables.setdefault(f"{part.parameter}{unit}", []).append(part)
-    range_of_difference = {
-        name: np.ptp([part.difference for part in parts])
-        for name, parts in tables.items()
-    }
-    by_range = sorted(tables, key=range_of_difference.__getitem__, reverse=True)
-    in_terminal = by_range[:MAX_TABLES]
-    heads = ["", "pairs", pair.first, pair.second, "difference, points (95 % interval)"]
-    heads += [f"{pair.first} alone", f"{pair.second} alone"]
-    for name, parts in tables.items():
+        has_unit = part.unit not in ("", "1", "name")  # "1" of numbers, "name" of names
+        title = f"{part.parameter}, {part.unit}" if has_unit else part.parameter
+        parts_by_title.setdefault(title, []).append(part)
+    titles_in_terminal = _find_most_varying(parts_by_title)
+    heads = [
+        "",
+        "pairs",
+        pair.first,
+        pair.second,
+        "difference, points (95 % interval)",
+        f"{pair.first} alone",
+        f"{pair.second} alone",
+    ]
+    for title, parts in parts_by_title.items():
         rows = [_part_cells(part) for part in parts]
-        only = "" if name in in_terminal else "page"
-        yield ResultPart(name, heads=heads, rows=rows, only=only)
-    if len(in_terminal) < len(tables):
-        more = (
+        only = "" if title in titles_in_terminal else "page"
+        yield ResultPart(title, heads=heads, rows=rows, only=only)
+    if len(titles_in_terminal) < len(parts_by_title):
+        remark = (
             "The difference varies most over these; the page has all "
-            f"{len(tables)} "
-            "parameters."
+            f"{len(parts_by_title)} parameters."
         )
-        yield ResultPart(text=[more], only="text")
+        yield ResultPart(text=[remark], only="text")
+
+
+def _find_most_varying(parts_by_title: Mapping[str, Sequence[PairPart]]) -> list[str]:
+    """Return the `MAX_TABLES` titles over whose parts the difference varies most."""
+    range_of_difference = {
+        title: np.ptp([part.difference for part in parts])
+        for title, parts in parts_by_title.items()
+    }
+    descending = sorted(
+        parts_by_title, key=range_of_difference.__getitem__, reverse=True
+    )
+    return descending[:MAX_TABLES]
 
 
 def _part_cells(part: PairPart) -> list[str]:
     """Return the cells of a row of a parameter's table."""
-    accuracies = [wording.percent(accuracy) for accuracy in part.accuracies]
-    difference = (
-        f"{100.0 * part.difference:+.0f} ({format_points_interval(part.interval)})"
-    )
-    alone = [str(part.first_only), str(part.second_only)]
+    first_accuracy, second_accuracy = map(wording.percent, part.accuracies)
+    difference = f"{100.0 * part.difference:+.0f}"
     return [
         wording.format_parameter_value(part.value),
         str(part.pairs),
-        *accuracies,
-        difference,
-        *alone,
+        first_accuracy,
+        second_accuracy,
+        f"{difference} ({format_points_interval(part.interval)})",
+        str(part.first_only),
+        str(part.second_only),
     ]
 
 
 def _rule_texts(pair: ComparedPair) -> Iterator[str]:
-    yield from _worse_texts(pair.worse, pair.first_only, pair.first, pair.second)
-    yield from _worse_texts(pair.better, pair.second_only, pair.second, pair.first)
+    """Yield the rules under which either side is worse."""
+    yield from _worse_texts(
+        pair.worse, pair.first_only, better_side=pair.first, worse_side=pair.second
+    )
+    yield from _worse_texts(
+        pair.better, pair.second_only, better_side=pair.second, worse_side=pair.first
+    )
 
 
 def _worse_texts(
-    rules: Sequence[PairRule] | None, n_alone: int, name: str, other: str
+    rules: Sequence[PairRule] | None,
+    n_exclusive: int,
+    *,
+    better_side: str,
+    worse_side: str,
 ) -> Iterator[str]:
     """Yield the rules under which one side is worse than another.
 
     Args:
-        rules: rules under which only `name` is right; None if they were not sought.
-        n_alone: pairs that only `name` gets right.
-        name: name of the better side.
-        other: other of the worse side.
+        rules: rules under which only the better side is right; None if they were not
+            sought.
+        n_exclusive: pairs that only the better side gets right.
+        better_side, worse_side: names of the sides.
     """
-    if rules is None or not n_alone:
+    if rules is None or not n_exclusive:
         return
-    where = f"Where {other} is worse than {name}:"
+    beginning = f"Where {worse_side} is worse than {better_side}:"
     if not rules:
-        yield f"{where} no values stand out from chance."
+        yield f"{beginning} no values stand out from chance."
     for index, rule in enumerate(rules):
+        # A rule is counted on the pairs that no rule before it covers.
         rest = "elsewhere" if index == 0 else "in what no rule before covers"
         conditions = wording.format_conditions(rule.conditions)
         yield (
-            f"{where} {conditions}, in {rule.text} pairs; {rest} in "
+            f"{beginning} {conditions}, in {rule.text} pairs; {rest} in "
             f"{rule.elsewhere.text}."
         )
 
@@ -412,31 +432,34 @@ def _pictures_of(name: str, pair: ComparedPair) -> Iterator[ResultPart]:
     """
     title = f"Only {name} gets right:"
     lines: list[list[str]] = []
-    without_pictures: list[str] = []
+    lines_without_pictures: list[str] = []
     groups: list[list[views.Picture]] = []
     for example in pair.shown:
         if example.right != name:
             continue
-        values = _values_text(example)
-        captions = _captions(example, pair)
-        line = "; ".join([*captions, values])
+        line = "; ".join([*_captions(example, pair), _values_text(example)])
         lines.append([line, *example.pictures])
-        if not example.pictures:
-            without_pictures.append(line)
-            continue
-        if len(example.pictures) != 2:  # both sides have the same image
-            captions = ["; ".join(captions)]
-        captions[0] += f"; {values}"
-        groups.append(
-            [
-                views.Picture(file, caption)
-                for file, caption in zip(example.pictures, captions, strict=True)
-            ]
-        )
+        if example.pictures:
+            groups.append(_group_pictures(example, pair))
+        else:
+            lines_without_pictures.append(line)
     if groups and all(len(group) == 1 for group in groups):
         groups = [[group[0] for group in groups]]
     yield ResultPart(title, rows=lines[:MAX_PICTURES], only="text")
-    yield ResultPart(title, without_pictures, pictures=groups, only="page")
+    yield ResultPart(title, lines_without_pictures, pictures=groups, only="page")
+
+
+def _group_pictures(example: PairPicture, pair: ComparedPair) -> list[views.Picture]:
+    """Return the images of a pair with captions; values are with the first one."""
+    captions = _captions(example, pair)
+    is_shared_image = len(example.pictures) == 1
+    if is_shared_image:
+        captions = ["; ".join(captions)]
+    captions[0] += f"; {_values_text(example)}"
+    return [
+        views.Picture(file, caption)
+        for file, caption in zip(example.pictures, captions, strict=True)
+    ]
 
 
 def make_compare_claims(result: CompareResult) -> Iterator[views.Claim]:
@@ -445,15 +468,17 @@ def make_compare_claims(result: CompareResult) -> Iterator[views.Claim]:
         method = "Newcombe's, of pairs" if pair.units is None else f"over {pair.unit}s"
         statement = (
             f"{summarize_difference(pair)} {describe_exclusive_pairs(pair)} The "
-            "interval of the "
-            f"difference is {method}."
+            f"interval of the difference is {method}."
         )
-        side = next(side for side in result.sides if side.name == pair.second)
-        outcomes = wording.format_outcomes(side.outcomes, result.task)
+        second = next(side for side in result.sides if side.name == pair.second)
+        outcomes = wording.format_outcomes(second.outcomes, result.task)
         if outcomes:
             statement += f" Of the others {pair.second} has {outcomes}."
-        what = f"configurations in which {pair.second} is right"
         extent = results.Extent.from_count(
-            what, side.correct, side.configurations, side.interval, side.accuracy
+            f"configurations in which {pair.second} is right",
+            second.correct,
+            second.configurations,
+            second.interval,
+            second.accuracy,
         )
         yield views.Claim(kind="measured", statement=statement, extent=extent)

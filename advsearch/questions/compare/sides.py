@@ -83,7 +83,8 @@ def read_sides(paths: Sequence[Path]) -> list[Side]:
     """Read the sides that sweeps compare, each with a different name.
 
     A sweep has a side for each of its models. The sweep of an adversarial scene has
-    these without it and with it; along with other sweeps, only with it.
+    these without it and with it; along with other sweeps, only with it. Images in which
+    the object is out of view of one side are left out of all.
 
     Raises:
         FileFormatError: a folder has another run, or a sweep that has not ended.
@@ -122,27 +123,33 @@ def name_sides(sides: Sequence[Side]) -> list[str]:
     If some names are still equal, the directory of the sweep precedes them; if that is
     not enough, a number.
     """
-    columns = [
-        column
-        for column in SIDE_COLUMNS
-        if len({side.labels[column] for side in sides}) > 1
-    ]
-    names = [
-        ", ".join(
+    columns = _find_different_columns(sides)
+    names = []
+    for side in sides:
+        # an empty label: the scene without an adversarial one
+        labels = [
             wording.shorten_names(side.labels[column]) or "as it is"
             for column in columns
-        )
-        for side in sides
-    ]
+        ]
+        names.append(", ".join(labels))
     if len(set(names)) < len(names):
         folders = [side.sweep.folder.name for side in sides]
         names = [
-            ", ".join(filter(None, name_parts))
-            for name_parts in zip(folders, names, strict=True)
+            f"{folder}, {name}" if name else folder
+            for folder, name in zip(folders, names, strict=True)
         ]
     if len(set(names)) < len(names):
         names = [f"{number}: {name}" for number, name in enumerate(names, start=1)]
     return names
+
+
+def _find_different_columns(sides: Sequence[Side]) -> list[str]:
+    """Return the names of `SIDE_COLUMNS` in which sides differ."""
+    return [
+        column
+        for column in SIDE_COLUMNS
+        if len({side.labels[column] for side in sides}) > 1
+    ]
 
 
 def read_sweep_sides(path: Path, *, is_only_sweep: bool) -> Iterator[Side]:
@@ -154,6 +161,37 @@ def read_sweep_sides(path: Path, *, is_only_sweep: bool) -> Iterator[Side]:
     Args:
         path: the run directory of the sweep.
         is_only_sweep: whether no other sweep is compared.
+
+    Raises:
+        FileFormatError: the sweep has not ended, or lacks rows.
+    """
+    sweep, rows = _read_finished_sweep(path)
+    models = sweep.config.models
+    model_index = rows["step"] % len(models)
+    rows["number"] = rows["step"] // len(models)
+    rows["correct"] = rows["correct"] == 1
+    scene_masks = [rows["number"] >= 0]  # all rows are of one scene
+    if sweep.config.adversarial_of:
+        # The second half of the images are of the adversarial scene.
+        n_images = sweep.summary.planned // len(models)
+        is_adversarial = rows["number"] >= n_images // 2
+        scene_masks = [is_adversarial]
+        if is_only_sweep:
+            scene_masks = [~is_adversarial, is_adversarial]
+    for is_of_scene in scene_masks:
+        for index, model in enumerate(models):
+            is_of_side = is_of_scene & (model_index == index)
+            side_rows = rows[is_of_side].reset_index(drop=True)
+            labels = {"object": sweep.summary.object, "model": model, "answer": ""}
+            # Where rows differ in one of these, it has a column.
+            for column in SIDE_COLUMNS:
+                if column in side_rows:
+                    labels[column] = ",".join(side_rows[column].unique())
+            yield Side(name="", sweep=sweep, labels=labels, rows=side_rows)
+
+
+def _read_finished_sweep(path: Path) -> tuple[workbench.StoredSweep, pd.DataFrame]:
+    """Read a sweep and its rows.
 
     Raises:
         FileFormatError: the sweep has not ended, or lacks rows.
@@ -172,27 +210,7 @@ def read_sweep_sides(path: Path, *, is_only_sweep: bool) -> Iterator[Side]:
             f"{path}: expected {summary.planned} rows, as its summary says, got "
             f"{len(rows)}; sweep again"
         )
-    models = sweep.config.models
-    model_index = rows["step"] % len(models)
-    rows["number"] = rows["step"] // len(models)
-    rows["correct"] = rows["correct"] == 1
-    scene_masks = [rows["number"] >= 0]  # all rows
-    if sweep.config.adversarial_of:
-        # The second half of the images are of the adversarial scene.
-        is_adversarial = rows["number"] >= summary.planned // len(models) // 2
-        scene_masks = [is_adversarial]
-        if is_only_sweep:
-            scene_masks = [~is_adversarial, is_adversarial]
-    for is_of_scene in scene_masks:
-        for index, model in enumerate(models):
-            side_rows = rows[is_of_scene & (model_index == index)].reset_index(
-                drop=True
-            )
-            labels = {"object": summary.object, "model": model, "answer": ""}
-            for column in SIDE_COLUMNS:
-                if column in side_rows:
-                    labels[column] = ",".join(side_rows[column].unique())
-            yield Side(name="", sweep=sweep, labels=labels, rows=side_rows)
+    return sweep, rows
 
 
 def check_same_draws(first: Side, second: Side) -> None:
@@ -207,11 +225,10 @@ def check_same_draws(first: Side, second: Side) -> None:
     if first.sweep.folder == second.sweep.folder:
         return
     where = f"{first.sweep.folder} and {second.sweep.folder}"
+    first_settings = first.sweep.config.get_deciding_settings()
+    second_settings = second.sweep.config.get_deciding_settings()
     for name in DRAW_SETTINGS:
-        if (
-            first.sweep.config.get_deciding_settings()[name]
-            != second.sweep.config.get_deciding_settings()[name]
-        ):
+        if first_settings[name] != second_settings[name]:
             raise InputError(
                 f"compared: expected sweeps of the same draws, got {where}, whose "
                 f"`{name}` differ; sweep one of them "
@@ -228,15 +245,12 @@ def check_same_draws(first: Side, second: Side) -> None:
     for name in first.rows.attrs["units"]:
         is_sampled = name not in (*SIDE_COLUMNS, "environment")
         is_shared = name in second.rows.attrs["units"]
-        if (
-            is_sampled
-            and is_shared
-            and not has_same_values(first.rows[name], second.rows[name])
-        ):
+        if not is_sampled or not is_shared:
+            continue
+        if not has_same_values(first.rows[name], second.rows[name]):
             raise InputError(
                 f"compared: expected sweeps of the same draws, got {where} with other "
-                f"values of {name}; sweep both "
-                "again"
+                f"values of {name}; sweep both again"
             )
 
 
@@ -257,18 +271,14 @@ def find_different_settings(sides: Sequence[Side]) -> list[str]:
     one sweep do. `SECONDARY_SETTINGS` are left out.
     """
     first, *others = (side.sweep.config.get_deciding_settings() for side in sides)
-    deciding = {
+    differing_settings = {
         name for other in others for name in other if other[name] != first[name]
     }
-    differing_columns = {
-        column
-        for column in SIDE_COLUMNS
-        if len({side.labels[column] for side in sides}) > 1
-    }
-    differing_settings = {
+    # These are not among the deciding settings.
+    differing_settings |= {
         name
         for name in SIDE_SETTINGS
         if len({getattr(side.sweep.config, name) for side in sides}) > 1
     }
-    names = deciding | differing_columns | differing_settings
+    names = differing_settings | set(_find_different_columns(sides))
     return sorted(names - set(SECONDARY_SETTINGS))

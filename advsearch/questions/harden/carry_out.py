@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from advsearch.extend import (
     InputError,
@@ -37,6 +37,7 @@ from advsearch.questions.harden.result import (
     HardenResult,
     Share,
     SplitSide,
+    TrainingRound,
 )
 from advsearch.questions.harden.rounds import (
     WEIGHTS_FILE,
@@ -56,17 +57,29 @@ from advsearch.questions.harden.training import ClassifierTrainer, Examples
 
 ARGUMENTS_NOTE = "means"
 """Note of a run: which arguments that only Python can pass it has."""
-MEASUREMENTS = {
-    "before": ("attacking the model as it is", None),
-    "stronger_before": ("attacking it with a stronger search", "before"),
-    "after": ("attacking the hardened model", None),
-    "stronger": ("attacking it with a stronger search", "after"),
-}
-"""Measurements by their name in the table, each with its title in the progress.
 
-A stronger search also names the usual one: where that has found a wrong prediction,
-the stronger one is not run.
-"""
+
+class Measurement(NamedTuple):
+    """A search over each control in each measured scene.
+
+    Attributes:
+        title: title in the progress.
+        weaker: name of the measurement with the usual search, if this one has a
+            stronger search: where the usual one has found a wrong prediction, the
+            stronger one is not run.
+    """
+
+    title: str
+    weaker: str | None = None
+
+
+MEASUREMENTS = {
+    "before": Measurement("attacking the model as it is"),
+    "stronger_before": Measurement("attacking it with a stronger search", "before"),
+    "after": Measurement("attacking the hardened model"),
+    "stronger": Measurement("attacking it with a stronger search", "after"),
+}
+"""Measurements by their name in the table, in the order in which they are made."""
 
 TRAINERS: Mapping[str, Callable[..., Trainer]] = {
     "classification": ClassifierTrainer,
@@ -94,28 +107,48 @@ def run_hardening(
     context.progress.stage(workbench.LOADING)
     workbench.check_run_settings(config)
     check_settings(config, beside, loss)
-    loaded, warnings = load_task_model(config, model)
-    splits = scenes.make_splits(config, loaded)
-    work = SceneJobs(config, loaded, splits, context.progress)
+    original_model, warnings = load_task_model(config, model)
+    splits = scenes.make_splits(config, original_model)
+    work = SceneJobs(config, original_model, splits, context.progress)
+    trainer = make_trainer(work, optimiser, examples=beside, loss=loss)
+    # `beside` is of classifiers only, `loss` of the others.
+    arguments: dict[str, Any] = {"optimiser": optimiser, "loss": loss}
+    if config.task_name == "classification":
+        arguments = {"optimiser": optimiser, "beside": beside}
+    check_same_arguments(context.run, arguments)
+    workbench.check_digests(context.run, [original_model])
 
-    is_classifier = config.task_name == "classification"
-    student = make_trainable(loaded, config.layers, logits=is_classifier)
-    python_arguments: dict[str, Any] = {"loss": loss}
-    if is_classifier:
-        python_arguments = {"beside": beside}
-    course_arguments = dict(python_arguments)
-    if config.data:
-        course_arguments["custom_items"] = read_coco(Path(config.data), loaded)
-    course = TRAINERS[config.task_name](work, student, optimiser, **course_arguments)
-    check_same_arguments(context.run, {"optimiser": optimiser, **python_arguments})
-    workbench.check_digests(context.run, [loaded])
-
-    hardening = Hardening(context.run, course)
+    hardening = Hardening(context.run, trainer)
     worker = "advsearch.questions.harden.scenes:load_scene_work"
     with context.until_interrupted():
         with workbench.open_executor(config, worker, context.progress) as work.executor:
             hardening.execute(context)
     return hardening.make_result(context, warnings)
+
+
+def make_trainer(
+    work: SceneJobs,
+    optimiser: MakeOptimizer | None,
+    examples: Examples | None,
+    loss: Loss | None,
+) -> Trainer:
+    """Create the trainer of a task, with a copy of the model that is trained.
+
+    Args:
+        work: the settings and the original model.
+        optimiser: creates the optimizer; None for the trainer's own.
+        examples: further batches of images, of a classifier.
+        loss: loss of a detector or a segmenter; None for the network's own.
+    """
+    config = work.config
+    is_classifier = config.task_name == "classification"
+    student = make_trainable(work.model, config.layers, logits=is_classifier)
+    arguments: dict[str, Any] = {"loss": loss}
+    if is_classifier:
+        arguments = {"beside": examples}
+    if config.data:
+        arguments["custom_items"] = read_coco(Path(config.data), work.model)
+    return TRAINERS[config.task_name](work, student, optimiser, **arguments)
 
 
 def check_settings(
@@ -159,18 +192,17 @@ def load_task_model(config: HardenConfig, model: Any = None) -> tuple[Model, lis
     """
     try:
         task = workbench.make_task(config.task)
-        (loaded, *_), warnings = workbench.load_models(
-            [model or config.model], task, config
-        )
+        models, warnings = workbench.load_models([model or config.model], task, config)
     except errors.ModelError as error:
         if config.task_name != "classification":
             raise
+        # The advice that follows is of commands which take any task.
         text = str(error).partition(": use `task=")[0]
         raise errors.ModelError(
             f"{text}; harden trains classifiers, and with `task` detectors and "
             "segmenters"
         ) from error
-    return loaded, warnings
+    return models[0], warnings
 
 
 def check_same_arguments(run: RunDirectory, arguments: Mapping[str, Any]) -> None:
@@ -187,9 +219,9 @@ def check_same_arguments(run: RunDirectory, arguments: Mapping[str, Any]) -> Non
     was_passed = json.loads(run.store.read_note(ARGUMENTS_NOTE) or "{}")
     # What the first session noted stays.
     run.store.write_note(ARGUMENTS_NOTE, json.dumps({**is_passed, **was_passed}))
-    for name, passed_before in was_passed.items():
-        if passed_before != is_passed[name]:
-            preposition = "with" if passed_before else "without"
+    for name, began_with_it in was_passed.items():
+        if began_with_it != is_passed[name]:
+            preposition = "with" if began_with_it else "without"
             raise InputError(
                 f"{run.path}: cannot resume: it began {preposition} `{name}`, which "
                 "only Python gives; resume it with advsearch.harden(..., run=..., "
@@ -219,8 +251,8 @@ class Hardening:
         self.is_wrong = {
             (row.kind, row.step): bool(row.success) for row in run.store.rows()
         }
-        self.clean_is_right: Mapping[str, list[bool]] = {}
-        self.outcomes: Mapping[str, dict[str, int]] = {}
+        self.clean_is_right: dict[str, list[bool]] = {}
+        self.outcomes: dict[str, dict[str, int]] = {}
         n_training = self.config.scenes * self.config.rounds
         self.n_scenes = {
             TRAINING: n_training,
@@ -234,74 +266,62 @@ class Hardening:
 
         Whatever an earlier session of the run has done is not done again.
         """
-        stages = context.stages
         splits = self.scenes.splits
-        weights = b""
         scenes.check_disjoint(
             splits[HELD_OUT], [splits[name] for name in (TRAINING, FURTHER, VALIDATION)]
         )
         gc.freeze()  # for the same reason as in `load_scene_work`
         try:
-            for measurement in MEASUREMENTS:
-                if measurement == "after":
-                    stages.begin("training", "training")
-                    self.rounds.execute()
-                    weights = (self.run.path / WEIGHTS_FILE).read_bytes()
-                if "stronger" not in measurement:
-                    stages.begin("measurement", MEASUREMENTS[measurement][0])
-                self._measure(measurement, weights or None)
+            context.stages.begin("measurement", MEASUREMENTS["before"].title)
+            self._measure("before", weights=None)
+            self._measure("stronger_before", weights=None)
+
+            context.stages.begin("training", "training")
+            self.rounds.execute()
+            weights = (self.run.path / WEIGHTS_FILE).read_bytes()
+
+            context.stages.begin("measurement", MEASUREMENTS["after"].title)
+            self._measure("after", weights)
+            self._measure("stronger", weights)
             self._evaluate_plain_images(weights)
         finally:
-            stages.end()
+            context.stages.end()
             gc.unfreeze()
 
     def _evaluate_plain_images(self, weights: bytes) -> None:
-        """Evaluate both models on plain images of the held-out scenes."""
+        """Evaluate the original and the hardened model on plain held-out images.
+
+        Args:
+            weights: weights of the hardened model, safetensors.
+        """
         jobs = [
             partial(SceneJobs.evaluate_plain_images, number=number, weights=weights)
             for number in range(self.n_scenes[HELD_OUT])
         ]
         title = "looking at plain pictures of held-out scenes"
         evaluations = [value for _, value in self.scenes.run_jobs(title, jobs)]
-        clean = {}
-        outcomes = {}
         for when in ("before", "after"):
-            clean[when] = [
-                is_right for evaluation in evaluations for is_right in evaluation[when]
-            ]
+            is_right = list[bool]()
             outcome_counts = Counter[str]()
             for evaluation in evaluations:
+                is_right += evaluation[when]
                 outcome_counts.update(evaluation.get(f"outcomes {when}", ()))
-            outcomes[when] = dict(outcome_counts)
-        self.clean_is_right = clean
-        self.outcomes = outcomes
+            self.clean_is_right[when] = is_right
+            self.outcomes[when] = dict(outcome_counts)
 
-    def _measure(self, measurement: str, weights: bytes | None) -> None:
+    def _measure(self, name: str, weights: bytes | None) -> None:
         """Attack the model on the held-out scenes that are not measured yet.
 
         Args:
-            measurement: a key of `MEASUREMENTS`.
+            name: a key of `MEASUREMENTS`.
             weights: safetensors; None for those that the model was loaded with.
         """
-        title, usual = MEASUREMENTS[measurement]
-        keys = [
-            (control, number)
-            for number, control in product(
-                range(self.config.measured), self.config.controls
-            )
-            if (f"{measurement} {control}", number) not in self.is_wrong
-        ]
-        # What the usual search has found is not searched again by the stronger one.
-        found = [
-            (control, number)
-            for control, number in keys
-            if usual and self.is_wrong[f"{usual} {control}", number]
-        ]
-        to_attack = [key for key in keys if key not in found]
-        for control, number in found:
-            self._record(measurement, control, number, True)
-
-        steps_factor = scenes.STRONGER_STEPS_FACTOR if usual else 1
+        measurement = MEASUREMENTS[name]
+        steps_factor = 1
+        if measurement.weaker is not None:
+            steps_factor = scenes.STRONGER_STEPS_FACTOR
+            self._record_weaker(name, measurement.weaker)
+        to_attack = self._list_unmeasured(name)
         jobs = [
             partial(
                 SceneJobs.attack_held_out,
@@ -313,9 +333,30 @@ class Hardening:
             for control, number in to_attack
         ]
         hint = "`measured` and `steps` shorten it"
-        for index, status in self.scenes.run_jobs(title, jobs, hint=hint):
+        for index, status in self.scenes.run_jobs(measurement.title, jobs, hint=hint):
             control, number = to_attack[index]
-            self._record(measurement, control, number, status != ROBUST)
+            self._record(name, control, number, status != ROBUST)
+
+    def _list_unmeasured(self, name: str) -> list[tuple[str, int]]:
+        """Return the controls and scene numbers that a measurement has not done yet."""
+        return [
+            (control, number)
+            for number, control in product(
+                range(self.config.measured), self.config.controls
+            )
+            if (f"{name} {control}", number) not in self.is_wrong
+        ]
+
+    def _record_weaker(self, name: str, weaker: str) -> None:
+        """Record, without a stronger search, what the usual search has found wrong.
+
+        Args:
+            name: the measurement with the stronger search.
+            weaker: the one with the usual search.
+        """
+        for control, number in self._list_unmeasured(name):
+            if self.is_wrong[f"{weaker} {control}", number]:
+                self._record(name, control, number, True)
 
     def _record(
         self, measurement: str, control: str, number: int, is_wrong: bool
@@ -341,8 +382,7 @@ class Hardening:
     def _find_robust(
         self, measurement: str, controls: Collection[str]
     ) -> list[bool] | None:
-        """Return whether each measured scene withstood the searches over all of some
-        controls.
+        """Return whether each measured scene withstood the searches of all controls.
 
         None if a scene is not measured yet with one of them.
 
@@ -356,7 +396,8 @@ class Hardening:
                 self.is_wrong.get((f"{measurement} {control}", number))
                 for control in controls
             ]
-            if None in is_wrong:
+            is_unmeasured = None in is_wrong
+            if is_unmeasured:
                 return None
             is_robust.append(not any(is_wrong))
         return is_robust
@@ -367,25 +408,19 @@ class Hardening:
         """Return the result of the run, as far as it is measured."""
         config = self.config
         is_done = context.ending == "done"
-        if is_done and self.rounds.best == 0:  # the network before all rounds
+        is_unchanged = self.rounds.best == 0  # round 0 is the original network
+        if is_done and is_unchanged:
             text = (
                 "No round kept the clean accuracy, so the weights are the model's own."
             )
             warnings = [*warnings, text]
         before = self._find_robust("before", config.controls)
         after = self._find_robust("after", config.controls)
-        rounds = [
-            training_round.model_copy(
-                update={"kept": is_done and number == self.rounds.best}
-            )
-            for number, training_round in enumerate(self.rounds.results)
-        ]
         training_split = self.scenes.splits[TRAINING]
-        facts = self.scenes.executor and self.scenes.executor.facts
-        weights_path = self.run.path / WEIGHTS_FILE
         return context.result(
             HardenResult,
             **_compare_robustness(before, after),
+            **self._list_files(is_done),
             environment=",".join(training_split.environments),
             objects=list(training_split.objects),
             before=make_share(before),
@@ -394,21 +429,46 @@ class Hardening:
             clean_after=self._make_clean_share("after"),
             table=self._make_control_rows(),
             split=self._make_split_rows(),
-            rounds=rounds,
+            rounds=self._mark_best_round(is_done),
             search=f"{config.policy_name}, {config.steps} steps",
             stronger_search="portfolio of pgd with restarts, cmaes and random, "
             f"{scenes.STRONGER_STEPS_FACTOR * config.steps} steps",
-            hardened=self._make_hardened_name() if is_done else None,
-            weights=str(weights_path) if is_done else None,
-            pictures=str(self.run.path / IMAGE_DIRECTORY) if is_done else None,
-            shared=results.SharedWork.of_facts(facts, facts.machines if facts else {}),
+            shared=self._describe_workers(),
             warnings=warnings,
             seconds=context.stages.seconds,
         )
 
+    def _mark_best_round(self, is_done: bool) -> list[TrainingRound]:
+        """Return the rounds so far, the best one marked as kept once all are done."""
+        return [
+            training_round.model_copy(
+                update={"kept": is_done and number == self.rounds.best}
+            )
+            for number, training_round in enumerate(self.rounds.results)
+        ]
+
+    def _list_files(self, is_done: bool) -> dict[str, str | None]:
+        """Return the fields that name the files of the result; None before it is done."""
+        if not is_done:
+            return dict.fromkeys(("hardened", "weights", "pictures"))
+        return {
+            "hardened": self._make_hardened_name(),
+            "weights": str(self.run.path / WEIGHTS_FILE),
+            "pictures": str(self.run.path / IMAGE_DIRECTORY),
+        }
+
+    def _describe_workers(self) -> results.SharedWork | None:
+        """Return how workers shared the scenes; None without workers."""
+        if not self.scenes.executor or not self.scenes.executor.facts:
+            return None
+        stats = self.scenes.executor.facts
+        return results.SharedWork.of_facts(stats, stats.machines)
+
     def _make_clean_share(self, when: str) -> Share | None:
-        """Return the fraction of right plain images "before" or "after"; None if it is
-        not measured.
+        """Return the fraction of right plain images; None if it is not measured.
+
+        Args:
+            when: "before" or "after".
         """
         return make_share(
             self.clean_is_right.get(when), scenes.CLEAN_VIEWS, self.outcomes.get(when)
@@ -427,17 +487,20 @@ class Hardening:
         return rows
 
     def _make_split_rows(self) -> dict[str, SplitSide]:
-        """Describe the parts of the split."""
+        """Describe the parts of the split: objects, environments, scenes and views."""
         training_views, validation_views = self.trainer.n_views
         n_views = {
             TRAINING: training_views,
-            FURTHER: 1,
+            FURTHER: 1,  # a new scene teaches more than another view
             VALIDATION: validation_views,
             HELD_OUT: scenes.CLEAN_VIEWS,
         }
         return {
-            name: SplitSide.of(
-                {**vars(split), "scenes": self.n_scenes[name], "views": n_views[name]}
+            name: SplitSide(
+                objects=list(split.objects),
+                environments=list(split.environments),
+                scenes=self.n_scenes[name],
+                views=n_views[name],
             )
             for name, split in self.scenes.splits.items()
         }
@@ -454,11 +517,11 @@ class Hardening:
 def _compare_robustness(
     before: Sequence[bool] | None, after: Sequence[bool] | None
 ) -> dict[str, Any]:
-    """Return the fields of the paired comparison of scenes; empty if they are not
-    measured.
+    """Return the fields of a result that compare scenes before and after.
 
     Args:
-        before, after: whether each scene is robust, in the same order; None if unknown.
+        before, after: whether each scene is robust, in the same order; None if that is
+            not measured, which leaves the fields out.
     """
     if before is None or after is None:
         return {}

@@ -24,18 +24,19 @@ WHITE_LIGHT_CHANGES = 0.5
 def vary_environment(
     environment: assets.EnvironmentAsset, rng: np.random.Generator
 ) -> assets.EnvironmentAsset:
-    """Change the tint and contrast of an environment; perhaps mirror it or add a soft
-    light.
+    """Change the tint and contrast of an environment.
 
-    Each of the latter two happens in half of the cases.
+    In half of the cases it is mirrored; in half of them a soft light is added.
     """
     radiance = environment.radiance
     if rng.random() < 0.5:
         radiance = radiance[:, ::-1]
-    radiance = radiance * np.exp(rng.normal(0.0, 0.1, 3)).astype(np.float32)
+    tint = np.exp(rng.normal(0.0, 0.1, 3)).astype(np.float32)
+    radiance = radiance * tint
     # contrast: a power of the radiance relative to the mean
-    mean = float(radiance.mean()) + 1e-6
-    radiance = mean * (radiance / mean) ** np.float32(rng.uniform(0.8, 1.15))
+    mean = float(radiance.mean()) + 1e-6  # not 0
+    power = np.float32(rng.uniform(0.8, 1.15))
+    radiance = mean * (radiance / mean) ** power
     if rng.random() < 0.5:
         height, width = radiance.shape[:2]
         lobe = sample_lobe(height, width, rng)
@@ -58,17 +59,18 @@ def sample_lobe(
             azimuths across.
         rng: samples its direction, its size and its strength.
     """
+    # zenith angle and azimuth of each texel, and of the light
     theta = (np.arange(height) + 0.5)[:, None] * math.pi / height
     phi = (np.arange(width) + 0.5)[None, :] * 2.0 * math.pi / width
-    zenith = rng.uniform(0.1, 1.3)
-    azimuth = rng.uniform(0.0, 2.0 * math.pi)
-    # of the angle between the direction of each texel and that of the light
-    cosine = np.cos(theta) * math.cos(zenith) + np.sin(theta) * math.sin(
-        zenith
-    ) * np.cos(phi - azimuth)
+    light_theta = rng.uniform(0.1, 1.3)
+    light_phi = rng.uniform(0.0, 2.0 * math.pi)
+    # of the angle between both directions
+    vertical = np.cos(theta) * math.cos(light_theta)
+    horizontal = np.sin(theta) * math.sin(light_theta)
+    cosine = vertical + horizontal * np.cos(phi - light_phi)
     sharpness = rng.uniform(20.0, 150.0)
-    lobe = rng.uniform(2.0, 12.0) * np.exp(sharpness * (cosine - 1.0))
-    return np.asarray(lobe)
+    strength = rng.uniform(2.0, 12.0)
+    return np.asarray(strength * np.exp(sharpness * (cosine - 1.0)))
 
 
 def change_white_light(
@@ -76,14 +78,15 @@ def change_white_light(
 ) -> assets.EnvironmentAsset:
     """Change the color temperature of an environment in half of the cases.
 
-    The linear sRGB channels are multiplied by exp(a * `WARM`), with a uniform in
-    `WARM_RANGE`. Relative to daylight (D65), the light of a black body of 2,700 K (an
-    incandescent lamp) has a of about 1, and that of 10,000 K (a clear sky in the shade)
-    about -0.24.
+    The linear sRGB channels are multiplied by exp(warmth * `WARM`), where the warmth is
+    uniform in `WARM_RANGE`. A warmth of 0 is daylight (D65), 1 the light of a black
+    body of 2,700 K (an incandescent lamp), and -0.24 that of 10,000 K (a clear sky in
+    the shade).
     """
     if rng.random() >= WHITE_LIGHT_CHANGES:
         return environment
-    factors = np.exp(rng.uniform(*WARM_RANGE) * np.asarray(WARM)).astype(np.float32)
+    warmth = rng.uniform(*WARM_RANGE)
+    factors = np.exp(warmth * np.asarray(WARM)).astype(np.float32)
     return replace(
         environment, radiance=np.ascontiguousarray(environment.radiance * factors)
     )

@@ -57,8 +57,8 @@ TRIALS = 6
 """Of a search."""
 N_VIEWS = 3
 """Views of a plain scene."""
-WORST_LOOKS = 5
-"""How often an epoch uses an adversarial image, relative to a plain one."""
+WORST_USES_PER_EPOCH = 5
+"""How often an epoch uses an adversarial image; a plain one it uses once."""
 MAX_BYTES = 256 << 20
 """Size of a COCO file."""
 MAX_SIZE = 8192
@@ -98,8 +98,9 @@ class Example(NamedTuple):
         truth: Any = problem.find_truth(problem.add_conditions(configuration, seed))
         # A region of segmentation has no box, nor has an object out of view.
         box = getattr(truth, "box", None)
-        box_list = [box] if box else []
-        boxes = torch.tensor(box_list, dtype=torch.float32).reshape(-1, 4)
+        boxes = torch.zeros(0, 4, dtype=torch.float32)
+        if box:
+            boxes = torch.tensor([box], dtype=torch.float32)
         labels = torch.tensor([truth.labels[0]] * len(boxes), dtype=torch.int64)
         return cls(
             levels=color.to_uint8(problem.picture(configuration, seed, SPP)),
@@ -147,16 +148,30 @@ def read_coco(directory: Path, model: Model) -> list[Example]:
         examples = []
         for image in coco["images"]:
             file = _locate_image(image_directory, str(image["file_name"]), path)
-            pixels = torch.from_numpy(workbench.load_upright(file, MAX_SIZE))
-            if pixels.shape[:2] != (image["height"], image["width"]):
-                raise ValueError(f"{image['file_name']} of another size than it says")
+            levels = _read_levels(file, image)
             boxes, labels = _read_boxes(annotations_of_image, image, label_of_category)
-            examples.append(Example(color.to_uint8(pixels), boxes, labels))
+            examples.append(Example(levels, boxes, labels))
         return examples
     except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise errors.FileFormatError(
             f"{path}: expected COCO's JSON beside images/, got {str(error)[:120]}"
         ) from None
+
+
+def _read_levels(file: Path, image: Mapping[str, Any]) -> Tensor:
+    """Read an image (H, W, 3) uint8.
+
+    Args:
+        file: the file of the image.
+        image: COCO's description of the image.
+
+    Raises:
+        ValueError: it has another size than the description.
+    """
+    pixels = torch.from_numpy(workbench.load_upright(file, MAX_SIZE))
+    if pixels.shape[:2] != (image["height"], image["width"]):
+        raise ValueError(f"{image['file_name']} of another size than it says")
+    return color.to_uint8(pixels)
 
 
 def _group_annotations(
@@ -187,8 +202,7 @@ def _read_boxes(
     boxes = torch.tensor(
         [annotation["bbox"] for annotation in annotations], dtype=torch.float32
     ).reshape(-1, 4)
-    # COCO has the width and the height of a box.
-    boxes[:, 2:] += boxes[:, :2]
+    boxes[:, 2:] += boxes[:, :2]  # COCO has the width and the height of a box
     labels = torch.tensor(
         [label_of_category[annotation["category_id"]] for annotation in annotations],
         dtype=torch.int64,
@@ -209,9 +223,10 @@ def _locate_image(directory: Path, name: str, coco_file: Path) -> Path:
     """
     relative_path = Path(name)
     file = directory / relative_path
+    names_other_directory = relative_path.is_absolute() or ".." in relative_path.parts
+    # A link may lead outside of the directory.
     if (
-        relative_path.is_absolute()
-        or ".." in relative_path.parts
+        names_other_directory
         or file.is_symlink()
         or directory not in file.resolve().parents
     ):
@@ -239,25 +254,25 @@ def compute_network_loss(
     Raises:
         ModelError: the network returns no loss.
     """
+    # The network inside a wrapper of ours, or else the network itself.
     inner: Any = getattr(network, "network", network)
-    returned: Any = None
+    loss: Any = None
     if hasattr(inner, "config"):  # of transformers
-        labels = _transformers_labels(x, targets)
-        returned = inner(pixel_values=x, labels=labels).loss
-    elif inner is not network:  # of torchvision, in a wrapper of ours
-        returned = inner(list(x), list(targets))
+        loss = inner(pixel_values=x, labels=_transformers_labels(x, targets)).loss
+    elif inner is not network:  # of torchvision
+        loss = inner(list(x), list(targets))
     elif len(inspect.signature(network.forward).parameters) > 1:
-        returned = network(x, list(targets))
-    if isinstance(returned, Mapping):
-        returned = torch.stack([loss.sum() for loss in returned.values()]).sum()
-    if not isinstance(returned, Tensor) or returned.numel() != 1:
+        loss = network(x, list(targets))
+    if isinstance(loss, Mapping):
+        loss = torch.stack([part.sum() for part in loss.values()]).sum()
+    if not isinstance(loss, Tensor) or loss.numel() != 1:
         raise errors.ModelError(
             "the network returns no loss: its `forward` has to take targets after its "
             "input and return a loss or a "
             "mapping of losses; or give `loss`, a function of network, input and "
             "targets, in Python"
         )
-    return returned.sum()
+    return loss.sum()
 
 
 def _transformers_labels(
@@ -267,7 +282,8 @@ def _transformers_labels(
 
     Boxes have a center and a size, as fractions of the input's size.
     """
-    size = x.new_tensor([x.shape[-1], x.shape[-2]] * 2)
+    height, width = x.shape[-2:]
+    size = x.new_tensor([width, height, width, height])
     labels = []
     for target in targets:
         lower, upper = (target["boxes"] / size).split(2, dim=1)
@@ -330,7 +346,8 @@ class DetectorTrainer(Trainer):
                 plain.append(plain_image)
                 worst.append(worst_image)
                 self.work.progress.advance(1)
-            # Further views vary in what the last control does not search.
+            # The first view is that of the search. Further views vary in what the last
+            # control does not search.
             problem, _ = self.work.make_problem(scene_split, number, controls[-1:])
             plain += [
                 Example.render(problem, seeds.stream(seed, "plain", view))
@@ -360,14 +377,15 @@ class DetectorTrainer(Trainer):
         return plain, worst
 
     def uses_per_epoch(self, item: Example) -> int:
-        return WORST_LOOKS if item.is_adversarial else 1
+        """Return how often an epoch uses an image, more often an adversarial one."""
+        return WORST_USES_PER_EPOCH if item.is_adversarial else 1
 
     @contextmanager
     def gradient_context(self, new: Sequence[Example]) -> Iterator[ComputeGradient]:
-        """Return a context in which gradients are computed in training mode.
+        """Put the network into training mode while gradients are computed.
 
-        Batch normalization and dropout stay in evaluation mode. Afterwards the network
-        is in evaluation mode.
+        Its batch normalization and dropout stay in evaluation mode. Afterwards all of
+        it is in evaluation mode.
         """
         network = self.student.network.train()
         for module in network.modules():
@@ -392,23 +410,24 @@ class DetectorTrainer(Trainer):
         network.eval()
 
     def make_input(self, item: Example, is_mirrored: bool) -> tuple[Tensor, Target]:
-        """Return the network's input (1, ...) for an image, and the target in its
-        pixels.
+        """Return the network's input (1, ...) for an image, and its target.
 
-        The target has "boxes" (K, 4), x0, y0, x1, y1, and "labels" (K,). A mirrored
-        image has mirrored boxes.
+        The target has "boxes" (K, 4), x0, y0, x1, y1 in pixels of the input, and
+        "labels" (K,).
+
+        Args:
+            item: the image and its boxes.
+            is_mirrored: whether image and boxes are mirrored.
         """
         levels = item.levels
         boxes = item.boxes
         height, width = item.levels.shape[:2]
         if is_mirrored:
             levels = levels.flip(1)
-            boxes = torch.stack(
-                [width - boxes[:, 2], boxes[:, 1], width - boxes[:, 0], boxes[:, 3]],
-                dim=1,
-            )
-        rows, columns = self.student.model.input_size
-        scale = torch.tensor([columns / width, rows / height] * 2)
+            x0, y0, x1, y1 = boxes.unbind(dim=1)
+            boxes = torch.stack([width - x1, y0, width - x0, y1], dim=1)
+        input_height, input_width = self.student.model.input_size
+        scale = torch.tensor([input_width / width, input_height / height] * 2)
         x = self.student.model.prepare(levels[None] / 255.0)[:1]
         return x, {
             "boxes": (boxes * scale).to(x.device),
@@ -519,6 +538,7 @@ class SegmenterTrainer(DetectorTrainer):
     """
 
     def default_loss(self) -> Loss:
+        """Return the loss that is used if the caller passes none."""
         task = workbench.make_task(self.config.task)
         return partial(compute_pixel_loss, task)
 
@@ -573,8 +593,9 @@ def compute_pixel_loss(
     """
     classes = torch.stack([target["classes"] for target in targets])
     is_object = torch.stack([target["object"] for target in targets])
+    # The network inside a wrapper of ours, or else the network itself.
     inner: Any = getattr(network, "network", network)
-    if hasattr(inner, "config"):
+    if hasattr(inner, "config"):  # of transformers
         loss: Tensor = inner(pixel_values=x, labels=classes).loss
         return loss
     logits = task.read(network(x), len(x))

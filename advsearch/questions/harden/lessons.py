@@ -99,7 +99,11 @@ class TextureLesson(Lesson):
     texture: Tensor
 
     def compute_image(self, u: Tensor) -> Tensor:
-        """Return the image (H, W, 3) of a texture, with a graph."""
+        """Return the image (H, W, 3) of a texture, with a graph.
+
+        Args:
+            u: the texture as a configuration (d,), without the conditions.
+        """
         inputs = self.space.inputs(u)
         texture_inputs = {name: inputs[name] for name in self.linear.linearized_at}
         image: Tensor = self.linear.predict_image(
@@ -127,20 +131,21 @@ class RenderedLesson(Lesson):
 
     @classmethod
     def create(
-        cls, right: tuple[int, ...], plain: Tensor, images: Tensor
+        cls, right_classes: tuple[int, ...], plain: Tensor, images: Tensor
     ) -> RenderedLesson:
         """Create a lesson whose first image is the worst so far.
 
         Args:
-            right: indices of the right classes.
+            right_classes: indices of the right classes.
             plain: the plain image (H, W, 3) in [0, 1].
             images: the other images (N, H, W, 3) in [0, 1].
         """
+        never_evaluated = torch.full((len(images),), torch.inf)
         return cls(
-            right,
+            right_classes,
             color.to_uint8(plain),
             color.to_uint8(images),
-            torch.full((len(images),), torch.inf),
+            never_evaluated,
         )
 
     @property
@@ -205,14 +210,12 @@ def _make_texture_lessons(
     for number in range(views):
         view_seed = seeds.stream(seed, "lesson", number)
         configuration = problem.add_conditions(domain.start, view_seed)
-        # A clone does not keep the full configuration in memory.
-        conditions = configuration[domain.dim :].clone()
         linear = problem.make_linear_renderer(configuration, view_seed, MATRIX_SPP)
         levels = color.to_uint8(linear(configuration))
+        linear.release_scene(full_space)
         texture = shared_texture
         if not shares_texture:
             texture = _sample_texture(domain, view_seed)
-        linear.release_scene(full_space)
         texture_lessons.append(
             TextureLesson(
                 right_classes=right_classes,
@@ -220,7 +223,8 @@ def _make_texture_lessons(
                 space=space,
                 domain=domain,
                 linear=linear,
-                conditions=conditions,
+                # A clone does not keep the full configuration in memory.
+                conditions=configuration[domain.dim :].clone(),
                 texture=texture,
             )
         )
@@ -248,12 +252,13 @@ def _make_rendered_lessons(
     rendered_lessons = []
     for number in range(views):
         view_seed = seeds.stream(seed, "lesson", number)
-        full_configuration = problem.add_conditions(domain.start, view_seed)
-        conditions = full_configuration[domain.dim :].clone()
-        plain_image, *images = (
+        # A configuration is what is searched, then the conditions.
+        full_start = problem.add_conditions(domain.start, view_seed)
+        conditions = full_start[domain.dim :].clone()
+        plain_image, *images = [
             render(torch.cat([u, conditions]), seed=view_seed, spp=SPP)
             for u in _sample_lesson_configurations(problem, view_seed, n_tries)
-        )
+        ]
         rendered_lessons.append(
             RenderedLesson.create(right_classes, plain_image, torch.stack(images))
         )
@@ -268,19 +273,18 @@ def _sample_lesson_configurations(
     Args:
         problem: problem of the scene.
         seed: seed of the samples.
-        n_tries: number of further configurations after the start; None for two only: a
-            random control changed by itself, and all of them.
+        n_tries: number of further configurations after the start. None for two
+            configurations only: a random control changed by itself, and all of them.
     """
     domain = problem.domain
     generator = torch.Generator().manual_seed(seed)
     if n_tries is not None:
         return [domain.start, *sample_configurations(domain, generator, n_tries)]
     n_controls = len(problem.searched_space.controls)
-    *single_changes, joint_change = sample_configurations(
-        domain, generator, 1 + n_controls
-    )
-    index = torch.randint(len(single_changes), (), generator=generator)
-    return [single_changes[index], joint_change]
+    # each control by itself, then all together
+    samples = sample_configurations(domain, generator, n_controls + 1)
+    index = torch.randint(n_controls, (), generator=generator)
+    return [samples[index], samples[-1]]
 
 
 def _make_plain_lessons(problem: Problem, views: int, seed: int) -> list[Lesson]:
@@ -308,26 +312,39 @@ def sample_configurations(
     """
     samples = domain.sample(generator, count)  # (count, d)
     is_at_bound = torch.rand(samples.shape, generator=generator) < 0.5
-    has_bounds = torch.rand(count, 1, generator=generator) < 0.5
-    is_at_bound = is_at_bound & has_bounds
+    uses_bounds = torch.rand(count, 1, generator=generator) < 0.5
+    is_at_bound = is_at_bound & uses_bounds
+    for block, columns in domain.list_block_slices():
+        if block.options or block.periodic:
+            is_at_bound[:, columns] = False
+    is_unchanged = _alternate_controls(domain, count)
+    is_lower_nearer = samples - domain.lower < domain.upper - samples
+    nearer_bound = torch.where(is_lower_nearer, domain.lower, domain.upper)
+    samples = torch.where(is_at_bound, nearer_bound, samples)
+    samples = torch.where(is_unchanged, domain.start, samples)
+    return torch.stack([domain.project(u) for u in samples])
+
+
+def _alternate_controls(domain: policies.Domain, count: int) -> Tensor:
+    """Return a mask (count, d) of the values that stay as they are at the start.
+
+    The controls change each by itself in turn, then all together, then the first by
+    itself again.
+    """
     control_of_block = [
         block.name.rpartition(".")[0] for block, _ in domain.list_block_slices()
     ]
     controls = list(dict.fromkeys(control_of_block))
-    # (count,) the index of the control that changes; one past the last means all
+    all_change = len(controls)
+    # (count,) the index of the control that changes, or `all_change`
     turn = torch.arange(count) % (len(controls) + 1)
-    for control, (block, columns) in zip(
+    is_unchanged = torch.zeros(count, domain.dim, dtype=torch.bool)
+    for control, (_, columns) in zip(
         control_of_block, domain.list_block_slices(), strict=True
     ):
-        if block.options or block.periodic:
-            is_at_bound[:, columns] = False
-        is_unchanged = (turn != controls.index(control)) & (turn != len(controls))
-        samples[is_unchanged, columns] = domain.start[columns]
-        is_at_bound[is_unchanged, columns] = False
-    is_lower_nearer = samples - domain.lower < domain.upper - samples
-    nearer_bound = torch.where(is_lower_nearer, domain.lower, domain.upper)
-    samples = torch.where(is_at_bound, nearer_bound, samples)
-    return torch.stack([domain.project(u) for u in samples])
+        changes = (turn == controls.index(control)) | (turn == all_change)
+        is_unchanged[:, columns] = ~changes[:, None]
+    return is_unchanged
 
 
 def negative_log_likelihood(
@@ -392,12 +409,12 @@ def _update_losses(batch: Sequence[Lesson], model: Model) -> None:
     if not rendered_lessons:
         return
     n_images = [len(lesson.images) for lesson in rendered_lessons]
-    right = []
+    right_classes = []
     for lesson in rendered_lessons:
-        right += [lesson.right_classes] * len(lesson.images)
+        right_classes += [lesson.right_classes] * len(lesson.images)
     with torch.no_grad():
         images = torch.cat([lesson.images for lesson in rendered_lessons]) / 255.0
-        losses = negative_log_likelihood(model(images), right)
+        losses = negative_log_likelihood(model(images), right_classes)
     for lesson, lesson_losses in zip(
         rendered_lessons, losses.split(n_images), strict=True
     ):
@@ -406,7 +423,7 @@ def _update_losses(batch: Sequence[Lesson], model: Model) -> None:
 
 def ascend_textures(
     selected: Sequence[Lesson],
-    gradients_of: Callable[[Sequence[TextureLesson]], Sequence[Tensor]],
+    compute_gradients: Callable[[Sequence[TextureLesson]], Sequence[Tensor]],
     steps: int = 1,
 ) -> None:
     """Take steps of steepest ascent with the textures of lessons, in place.
@@ -415,7 +432,7 @@ def ascend_textures(
 
     Args:
         selected: the lessons.
-        gradients_of: returns the gradient of each lesson, as
+        compute_gradients: returns the gradient of each lesson, as
             `compute_texture_gradients` does.
         steps: number of steps.
     """
@@ -424,18 +441,17 @@ def ascend_textures(
     ]
     if not texture_lessons:
         return
-    # Views that share a texture have one tensor.
+    # Views that share a texture have one tensor: any of them stands for it.
     lesson_of_texture = {id(lesson.texture): lesson for lesson in texture_lessons}
     for _ in range(steps):
-        gradient_of_texture = dict[int, Tensor]()
-        gradients = gradients_of(texture_lessons)
+        gradient_sums = dict[int, Tensor]()  # by the id of the texture
+        gradients = compute_gradients(texture_lessons)
         for lesson, gradient in zip(texture_lessons, gradients, strict=True):
             texture_id = id(lesson.texture)
-            earlier = gradient_of_texture.get(texture_id, 0.0)
-            gradient_of_texture[texture_id] = gradient + earlier
+            gradient_sums[texture_id] = gradient + gradient_sums.get(texture_id, 0.0)
         for texture_id, lesson in lesson_of_texture.items():
             direction = lesson.domain.steepest(
-                lesson.texture, gradient_of_texture[texture_id]
+                lesson.texture, gradient_sums[texture_id]
             )
             moved_texture = lesson.texture + STEP_FRACTION * direction
             lesson.texture.copy_(lesson.domain.project(moved_texture))
@@ -487,14 +503,16 @@ def save_lesson_images(
 
 
 def _write_webdataset(directory: Path) -> None:
-    """Write the images of a directory into a tar beside it; see
-    `save_lesson_images`.
+    """Write the images of a directory into a tar beside it.
+
+    `save_lesson_images` describes directory and tar.
     """
     with (
         writing.replace_file(directory.with_suffix(".tar")) as temporary_path,
         tarfile.open(temporary_path, "w") as tar,
     ):
         for path in sorted(directory.glob("*/*.png")):
+            # CLASS-LABEL/ROUND-LESSON-KIND.png, with four digits for the class
             class_index = int(path.parent.name[:4])
             kind = path.stem.rpartition("-")[2]
             metadata = json.dumps({"class": class_index, "kind": kind})

@@ -34,12 +34,11 @@ class Trainable:
         Args:
             images: (N, H, W, 3) sRGB in [0, 1].
         """
+        # `model` predicts without gradients for its weights.
         trained_model = replace(self.model, module=self.network, attached=False)
         with self._mixed_precision():
-            x = self.model.preprocessing(images.to(self.model.device)).to(
-                self.model.dtype
-            )
-            logits: Tensor = trained_model.run_network(x)
+            x = self.model.preprocessing(images.to(self.model.device))
+            logits: Tensor = trained_model.run_network(x.to(self.model.dtype))
         return logits
 
     def evaluation_logits(self, images: Tensor) -> Tensor:
@@ -50,12 +49,12 @@ class Trainable:
 
     def make_twin(self) -> Trainable:
         """Return the same weights with gradients of their own, for another thread."""
-        net: nn.Module = self.model.with_network(self.network).module  # type: ignore[assignment]
+        network: nn.Module = self.model.with_network(self.network).module  # type: ignore[assignment]
         for parameter, original in zip(
-            net.parameters(), self.network.parameters(), strict=True
+            network.parameters(), self.network.parameters(), strict=True
         ):
             parameter.requires_grad_(original.requires_grad)
-        return Trainable(net, self.model.with_network(net))
+        return Trainable(network, self.model.with_network(network))
 
     def parameters(self) -> list[nn.Parameter]:
         """Return the parameters that are trained."""
@@ -98,21 +97,21 @@ def make_trainable(
         raise errors.ModelError(
             f"model {model.name}: only a classifier that returns logits can be hardened"
         )
-    net = model.copy_network()
-    net.eval().requires_grad_(True)
+    network = model.copy_network()
+    network.eval().requires_grad_(True)
     if layers == "last":
-        # layers with parameters of their own, in the order of definition
-        owners = [
+        # in the order of definition
+        layers_with_parameters = [
             layer
-            for layer in net.modules()
+            for layer in network.modules()
             if next(layer.parameters(recurse=False), None) is not None
         ]
-        net.requires_grad_(False)
-        owners[-1].requires_grad_(True)
-    copied = Trainable(net, model.with_network(net))
-    if not copied.parameters():
+        network.requires_grad_(False)
+        layers_with_parameters[-1].requires_grad_(True)
+    trainable = Trainable(network, model.with_network(network))
+    if not trainable.parameters():
         raise errors.ModelError(f"model {model.name}: has no parameters to train")
-    return copied
+    return trainable
 
 
 @contextmanager
@@ -182,18 +181,20 @@ class Augmentation:
         scale = _uniform(
             self.smallest_crop, self.largest_crop, count, generator=generator
         )
-        # in the coordinates of `affine_grid`, in which the image extends from -1 to 1
-        shift = _uniform(-1.0, 1.0, count, 2, generator=generator).view(2, count)
-        shift = shift * (1.0 - scale).abs()
-        mirror = 1.0 - 2.0 * _choose(self.flip, count, generator).float()
+        # In the coordinates of `affine_grid` the image extends from -1 to 1: a crop is
+        # inside it if its middle is moved by at most 1 - scale.
+        relative_shift = _uniform(-1.0, 1.0, count, 2, generator=generator)
+        shift_x, shift_y = relative_shift.view(2, count) * (1.0 - scale).abs()
+        is_mirrored = _choose(self.flip, count, generator)
+        mirror = 1.0 - 2.0 * is_mirrored.float()  # -1 or 1
         degrees = _uniform(-self.turn, self.turn, count, generator=generator)
         angle = degrees * (math.pi / 180.0)
         cosine = scale * angle.cos()
         sine = scale * angle.sin()
         # rows of the matrices from coordinates of the crop to those of the image
         rows = (
-            torch.stack([cosine * mirror, -sine, shift[0]], 1),
-            torch.stack([sine * mirror, cosine, shift[1]], 1),
+            torch.stack([cosine * mirror, -sine, shift_x], 1),
+            torch.stack([sine * mirror, cosine, shift_y], 1),
         )
         grid = F.affine_grid(
             torch.stack(rows, 1), list(images.shape), align_corners=False
@@ -205,22 +206,17 @@ class Augmentation:
     def _change_colors(self, x: Tensor, generator: Generator) -> Tensor:
         """Change contrast, brightness and color of images (N, 3, H, W)."""
         count = len(x)
-        gain = 1.0 + _uniform(
-            -self.contrast, self.contrast, count, generator=generator
-        ).view(count, 1, 1, 1)
-        color = 1.0 + _uniform(
-            -self.colour, self.colour, count, 3, generator=generator
-        ).view(count, 3, 1, 1)
+        contrast = _uniform(-self.contrast, self.contrast, count, generator=generator)
+        color = _uniform(-self.colour, self.colour, count, 3, generator=generator)
         brightness = _uniform(
             -self.brightness, self.brightness, count, generator=generator
-        ).view(count, 1, 1, 1)
-        # ((x - mean) gain + mean + brightness) color, as one affine map
-        mean = x.mean(dim=(1, 2, 3), keepdim=True)
-        return torch.addcmul(
-            (mean * (1.0 - gain) + brightness) * color,
-            x,
-            gain * color,
         )
+        contrast_factor = 1.0 + contrast.view(count, 1, 1, 1)
+        color_factor = 1.0 + color.view(count, 3, 1, 1)
+        mean = x.mean(dim=(1, 2, 3), keepdim=True)
+        # ((x - mean) * contrast + mean + brightness) * color, as one affine map of x
+        shift = mean * (1.0 - contrast_factor) + brightness.view(count, 1, 1, 1)
+        return torch.addcmul(shift * color_factor, x, contrast_factor * color_factor)
 
     def _blur_some(self, x: Tensor, generator: Generator) -> None:
         """Blur some of the images (N, 3, H, W) in place."""
@@ -248,13 +244,14 @@ class Augmentation:
         height, width = x.shape[2:]
         samples = torch.rand((len(x), 4), generator=generator).tolist()
         for index, (size, top, left, gray) in enumerate(samples):
-            if is_hidden[index]:
-                # from 30 % of the largest side up to all of it
-                fraction = (0.3 + 0.7 * size) * self.largest_cutout
-                side = max(1, int(fraction * min(height, width)))
-                row = int(top * (height - side))
-                column = int(left * (width - side))
-                x[index, :, row : row + side, column : column + side] = gray
+            if not is_hidden[index]:
+                continue
+            # from 30 % of the largest side up to all of it
+            fraction = (0.3 + 0.7 * size) * self.largest_cutout
+            side = max(1, int(fraction * min(height, width)))
+            row = int(top * (height - side))
+            column = int(left * (width - side))
+            x[index, :, row : row + side, column : column + side] = gray
 
 
 def _uniform(lower: float, upper: float, *shape: int, generator: Generator) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from functools import partial
 from typing import Any, ClassVar, Literal
 
 from pydantic import Field, JsonValue, model_validator
@@ -21,7 +22,7 @@ from advsearch.extend import (
 )
 
 STEPS = 40
-"""Of a search, as of an attack."""
+"""Default of the steps of a search, as of an attack."""
 ALL_OBJECTS = "all"
 """Value of `object` that stands for all bundled objects."""
 PLAIN_SCENES = 6
@@ -137,6 +138,7 @@ class HardenConfig(AttackConfig):
     @model_validator(mode="before")
     @classmethod
     def _apply_quick(cls, data: Any) -> Any:
+        """Fill in the defaults of `quick`; what is set stays."""
         return {**QUICK, **data} if data.get("quick") is True else data
 
     @property
@@ -313,14 +315,6 @@ ShareChanges = Mapping[str, tuple[Share | None, Share | None]]
 
 def make_harden_view(result: HardenResult) -> ShownResult:
     """Return the view of a hardening."""
-    shares = _share_changes(result)
-    chart: dict[str, Any] = {}
-    if shares:
-
-        def draw(axes: Any) -> None:
-            _draw_shares(axes, shares, result.model)
-
-        chart = {"draw": draw, "size": (6.4, 1.4 + 0.45 * len(shares))}
     facts = {
         "model": result.model,
         "searched with": result.search,
@@ -330,14 +324,7 @@ def make_harden_view(result: HardenResult) -> ShownResult:
         "pictures": result.pictures or "",
     }
     sections = [
-        ResultPart(
-            "Before and after",
-            heads=HEADS,
-            rows=[_share_cells(name, both) for name, both in shares.items()],
-            note=ROBUST_NOTE,
-            height=110 + 44 * len(shares),
-            **chart,
-        ),
+        _make_robustness_part(result),
         ResultPart.make_table(
             enumerate(result.rounds),
             ROUND_COLUMNS,
@@ -360,7 +347,29 @@ def make_harden_view(result: HardenResult) -> ShownResult:
     )
 
 
-def _share_changes(
+def _make_robustness_part(result: HardenResult) -> ResultPart:
+    """Return the table of fractions before and after, with a chart if it has rows."""
+    shares = _list_shares(result)
+    chart: dict[str, Any] = {}
+    if shares:
+        chart = {
+            "draw": partial(_draw_shares, shares=shares, model=result.model),
+            "size": (6.4, 1.4 + 0.45 * len(shares)),
+        }
+    return ResultPart(
+        "Before and after",
+        heads=HEADS,
+        rows=[
+            [name, *_share_cells(before), *_share_cells(after)]
+            for name, (before, after) in shares.items()
+        ],
+        note=ROBUST_NOTE,
+        height=110 + 44 * len(shares),
+        **chart,
+    )
+
+
+def _list_shares(
     result: HardenResult,
 ) -> dict[str, tuple[Share | None, Share | None]]:
     """Return the fractions of right images before and after, by what they are of."""
@@ -378,16 +387,11 @@ def _share_changes(
     return shares
 
 
-def _share_cells(name: str, both: tuple[Share | None, Share | None]) -> list[str]:
-    """Return the cells of a row under `HEADS`."""
-    cells = [name]
-    for share in both:
-        if share is None:
-            cells += ["", ""]
-        else:
-            interval = wording.format_interval(share.interval)
-            cells += [wording.percent(share.accuracy), interval]
-    return cells
+def _share_cells(share: Share | None) -> list[str]:
+    """Return a fraction and its interval as texts, empty ones if it is unknown."""
+    if share is None:
+        return ["", ""]
+    return [wording.percent(share.accuracy), wording.format_interval(share.interval)]
 
 
 def _draw_shares(axes: Any, shares: ShareChanges, model: str) -> None:
@@ -395,9 +399,9 @@ def _draw_shares(axes: Any, shares: ShareChanges, model: str) -> None:
     bars = {
         name: [
             None if share is None else (share.accuracy, share.interval)
-            for share in both
+            for share in before_and_after
         ]
-        for name, both in shares.items()
+        for name, before_and_after in shares.items()
     }
     figures.draw_fractions(axes, bars, ("before", "after"), (figures.RED, figures.BLUE))
     axes.set(xlabel="share that is right, with 95 % interval")

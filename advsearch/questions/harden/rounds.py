@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from functools import partial
 from typing import Any, ClassVar, NamedTuple
@@ -126,7 +126,7 @@ class Trainer(ABC):
 
     @abstractmethod
     def save_images(self, run: RunDirectory, number: int, new: Sequence[Any]) -> None:
-        """Write the images of a round's new items into `PICTURES` of the run."""
+        """Write the images of a round's new items into `IMAGE_DIRECTORY` of the run."""
 
     def count_steps(self, pool: Sequence[Any]) -> int:
         """Return the number of optimizer steps of a round."""
@@ -153,32 +153,36 @@ class Trainer(ABC):
         parameters = self.student.parameters()
         optimizer, schedule = self._make_optimizer(parameters, self.count_steps(pool))
         average = [parameter.detach().clone() for parameter in parameters]
-        n_steps = 0
+        # Gradients draw from the same generator, so an epoch is shuffled when it
+        # begins, and not before.
         rng = np.random.default_rng([seeds.stream(self.config.seed, "order"), number])
-        indices = self._list_uses(pool)
         with self.gradient_context(new) as compute_gradient:
-            for _ in range(self.config.epochs):
-                order = rng.permutation(indices)
-                for start in range(0, len(order), self.batch_size):
-                    batch = [
-                        pool[index] for index in order[start : start + self.batch_size]
-                    ]
-                    compute_gradient(batch, rng)
-                    nn.utils.clip_grad_norm_(parameters, MAX_GRADIENT_NORM)
-                    optimizer.step()
-                    schedule.step()
-                    n_steps += 1
-                    self._update_average(n_steps, average, parameters)
-                    tick()
+            for n_steps, batch in enumerate(self._iterate_batches(pool, rng), start=1):
+                compute_gradient(batch, rng)
+                nn.utils.clip_grad_norm_(parameters, MAX_GRADIENT_NORM)
+                optimizer.step()
+                schedule.step()
+                self._update_average(n_steps, average, parameters)
+                tick()
         _copy_average(average, parameters)
+
+    def _iterate_batches(
+        self, pool: Sequence[Any], rng: np.random.Generator
+    ) -> Iterator[list[Any]]:
+        """Yield the batches of all epochs, each epoch in another order."""
+        indices = self._list_uses(pool)
+        for _ in range(self.config.epochs):
+            order = rng.permutation(indices)
+            for start in range(0, len(order), self.batch_size):
+                batch_indices = order[start : start + self.batch_size]
+                yield [pool[index] for index in batch_indices]
 
     def _list_uses(self, pool: Sequence[Any]) -> list[int]:
         """Return the indices of the items of an epoch, each as often as it is used."""
-        return [
-            index
-            for index, item in enumerate(pool)
-            for _ in range(self.uses_per_epoch(item))
-        ]
+        indices = list[int]()
+        for index, item in enumerate(pool):
+            indices += [index] * self.uses_per_epoch(item)
+        return indices
 
     def _update_average(
         self, n_steps: int, average: Sequence[Tensor], parameters: Sequence[Tensor]
@@ -227,6 +231,21 @@ def _copy_average(average: Sequence[Tensor], parameters: Sequence[Tensor]) -> No
     with torch.no_grad():
         for mean, parameter in zip(average, parameters, strict=True):
             parameter.copy_(mean)
+
+
+def _interpolate(
+    original: Mapping[str, Tensor], trained: Mapping[str, Tensor], interpolation: float
+) -> dict[str, Tensor]:
+    """Return weights between the original (0) and the trained ones (1).
+
+    Those that are no floats, such as counters, are the trained ones.
+    """
+    interpolated = {
+        name: torch.lerp(original[name], weight, interpolation)
+        for name, weight in trained.items()
+        if weight.is_floating_point()
+    }
+    return {**trained, **interpolated}
 
 
 def adjust_warm_up(fraction: float, n_rates: int) -> float:
@@ -291,55 +310,78 @@ class Rounds:
     def execute(self) -> None:
         """Run the rounds that are left, and write the best weights.
 
-        Items of rounds that have ended are sampled again, since later rounds train on
-        them too. Afterwards the student has the best weights.
+        Afterwards the student has the best weights.
         """
-        trainer = self.trainer
-        config = self.config
-        network = trainer.student.network
-        if len(self.results) <= config.rounds:
-            pool = list(trainer.custom_items)
-            n_trained = 0  # items of the pool that an earlier round has used
-            title = "drawing scenes to choose weights by"
-            held_back = trainer.sample_items(
-                title, VALIDATION, range(self.n_validation_scenes)
-            )
-            if not self.results:
-                self.progress.stage("judging the model as it is")
-                self.store_round(
-                    0, [], trainer.score(held_back), n_trained=0, interpolation=0.0
-                )
-            for number in range(1, config.rounds + 1):
-                network.load_state_dict(self.read_weights(number - 1))
-                scene_numbers = range(
-                    (number - 1) * config.scenes, number * config.scenes
-                )
-                title = f"round {number}: drawing scenes"
-                new_items = trainer.sample_items(title, TRAINING, scene_numbers)
-                pool += new_items
-                if number < len(self.results):
-                    continue  # it ended before this run was stopped
-                self.progress.stage(
-                    f"round {number}: training", trainer.count_steps(pool)
-                )
-                with workbench.all_for_torch():
-                    # Earlier items are as hard as their training left them.
-                    trainer.round(
-                        number,
-                        pool,
-                        new=pool[n_trained:],
-                        tick=lambda: self.progress.advance(1),
-                    )
-                    self.progress.stage(
-                        f"round {number}: choosing weights",
-                        len(INTERPOLATIONS),
-                        at_most=True,
-                    )
-                    score, interpolation = self.select_interpolation(held_back)
-                n_trained = len(pool)
-                self.store_round(number, new_items, score, n_trained, interpolation)
+        is_done = len(self.results) > self.config.rounds
+        if not is_done:
+            self._run_rounds()
+        network = self.trainer.student.network
         network.load_state_dict(self.read_weights(self.best))
         self.write_weights(WEIGHTS_FILE)
+
+    def _run_rounds(self) -> None:
+        """Run the rounds that are left; round 0 evaluates the original model.
+
+        Items of rounds that have ended are sampled again, since later rounds train on
+        them too.
+        """
+        trainer = self.trainer
+        n_scenes = self.config.scenes
+        held_back = trainer.sample_items(
+            "drawing scenes to choose weights by",
+            VALIDATION,
+            range(self.n_validation_scenes),
+        )
+        if not self.results:
+            self.progress.stage("judging the model as it is")
+            original_score = trainer.score(held_back)
+            self.store_round(0, [], original_score, n_trained=0, interpolation=0.0)
+        pool = list(trainer.custom_items)
+        n_used = 0  # items of the pool that an earlier round of this session has used
+        for number in range(1, self.config.rounds + 1):
+            trainer.student.network.load_state_dict(self.read_weights(number - 1))
+            new_items = trainer.sample_items(
+                f"round {number}: drawing scenes",
+                TRAINING,
+                range((number - 1) * n_scenes, number * n_scenes),
+            )
+            pool += new_items
+            is_done_before = number < len(self.results)  # in an earlier session
+            if is_done_before:
+                continue
+            score, interpolation = self._train(number, pool, n_used, held_back)
+            n_used = len(pool)
+            self.store_round(number, new_items, score, len(pool), interpolation)
+
+    def _train(
+        self, number: int, pool: Sequence[Any], n_used: int, held_back: Sequence[Any]
+    ) -> tuple[Score, float]:
+        """Train the student, and load the best interpolation of weights into it.
+
+        Args:
+            number: number of the round.
+            pool: items that it is trained on.
+            n_used: the first items of the pool, which earlier rounds have used: they
+                are as hard as their training left them.
+            held_back: items of the validation.
+
+        Returns:
+            As `select_interpolation`.
+        """
+        self.progress.stage(f"round {number}: training", self.trainer.count_steps(pool))
+        with workbench.all_for_torch():
+            self.trainer.round(
+                number,
+                pool,
+                new=pool[n_used:],
+                tick=lambda: self.progress.advance(1),
+            )
+            self.progress.stage(
+                f"round {number}: choosing weights",
+                len(INTERPOLATIONS),
+                at_most=True,
+            )
+            return self.select_interpolation(held_back)
 
     def select_interpolation(self, held_back: Sequence[Any]) -> tuple[Score, float]:
         """Load the best mixture of original and trained weights into the student.
@@ -362,35 +404,23 @@ class Rounds:
         trained = {
             name: weight.clone() for name, weight in network.state_dict().items()
         }
-
-        def load_interpolated(interpolation: float) -> None:
-            """Load weights between both; those that are no floats are the trained
-            ones.
-            """
-            interpolated = {
-                name: torch.lerp(original[name], weight, interpolation)
-                for name, weight in trained.items()
-                if weight.is_floating_point()
-            }
-            network.load_state_dict({**trained, **interpolated})
-
         scores = dict[float, Score]()  # by interpolation
-        robust_of_allowed = dict[float, float]()  # likewise
+        allowed_scores = dict[float, Score]()  # those with enough clean accuracy
         for interpolation in INTERPOLATIONS:
-            load_interpolated(interpolation)
+            network.load_state_dict(_interpolate(original, trained, interpolation))
             score = self.trainer.score(held_back)
             scores[interpolation] = score
             self.progress.advance(1, worst=score.robust)
             if self.is_allowed(score.clean):
-                robust_of_allowed[interpolation] = score.robust
-            robust = list(robust_of_allowed.values())
+                allowed_scores[interpolation] = score
+            robust = [allowed_score.robust for allowed_score in allowed_scores.values()]
             if robust and robust[-1] < max(robust):
                 break
-        if robust_of_allowed:
-            best = max(robust_of_allowed, key=robust_of_allowed.__getitem__)
+        if allowed_scores:
+            best = max(allowed_scores, key=lambda key: allowed_scores[key].robust)
         else:
-            best = max(scores, key=lambda interpolation: scores[interpolation].clean)
-        load_interpolated(best)
+            best = max(scores, key=lambda key: scores[key].clean)
+        network.load_state_dict(_interpolate(original, trained, best))
         return scores[best], best
 
     def store_round(
@@ -414,12 +444,19 @@ class Rounds:
         self.trainer.save_images(self.run, number, new_items)
         self.results.append(
             TrainingRound(
-                lessons=n_trained, part=interpolation, **score._asdict(), kept=False
+                lessons=n_trained,
+                part=interpolation,
+                clean=score.clean,
+                robust=score.robust,
+                kept=False,
             )
         )
-        fields = [training_round.model_dump() for training_round in self.results]
-        self.run.store.write_note(ROUNDS_NOTE, json.dumps(fields))
-        clean, worst = map(wording.percent, score)
+        stored_results = [
+            training_round.model_dump() for training_round in self.results
+        ]
+        self.run.store.write_note(ROUNDS_NOTE, json.dumps(stored_results))
+        clean = wording.percent(score.clean)
+        worst = wording.percent(score.robust)
         self.progress.message(
             f"round {number}: {clean} of plain pictures right, {worst} of the worst"
         )

@@ -112,6 +112,7 @@ class SceneJobs:
         self.progress.stage(title, len(jobs), hint=hint)
         index_of_job = {id(job): index for index, job in enumerate(jobs)}
         executor = self.executor or workbench.InProcess(self)
+        # each job is a batch by itself
         for batch in executor.compute([job] for job in jobs):
             (job,) = batch.items
             (value,) = batch.require_value(f"harden, scene {job.keywords['number']}")
@@ -188,31 +189,31 @@ class SceneJobs:
     def evaluate_plain_images(
         self, *, number: int, weights: bytes
     ) -> dict[str, list[Any]]:
-        """Evaluate the model on plain images of a held-out scene.
+        """Evaluate the original and the hardened model on plain held-out images.
+
+        Args:
+            number: number of the scene.
+            weights: weights of the hardened model, safetensors.
 
         Returns:
             Under "before" and "after" whether each image is right, with the original
-            and with the given weights; under "outcomes before" and "outcomes after"
+            and with the hardened model; under "outcomes before" and "outcomes after"
             what becomes of the object in those that are not.
         """
         split = self.splits[HELD_OUT]
-        results_by_name = dict[str, list[Any]]()
-        problem, _ = self.make_problem(split, number, tuple(self.config.controls)[:1])
+        # A problem needs a control; the images are of its start, so any will do.
+        any_control = tuple(self.config.controls)[:1]
+        problem, _ = self.make_problem(split, number, any_control)
+        models = {"before": self.model, "after": self.with_weights(weights)}
+        evaluations = dict[str, list[Any]]()
         for view in range(CLEAN_VIEWS):
             seed = seeds.stream(split.seed, "plain", number * CLEAN_VIEWS + view)
-            image = problem.picture(problem.domain.start, seed, CLEAN_SPP)[None]
-            truth = problem.find_truth(
-                problem.add_conditions(problem.domain.start, seed)
-            )
-            models = {"before": self.model, "after": self.with_weights(weights)}
-            for when, model in models.items():
-                with torch.no_grad():
-                    evaluation = problem.task.judge(model(image), truth)[0]
-                results_by_name.setdefault(when, []).append(evaluation.right)
+            for when, evaluation in _evaluate_start(problem, seed, models).items():
+                evaluations.setdefault(when, []).append(evaluation.right)
                 if not evaluation.right and evaluation.outcome is not None:
-                    outcomes = results_by_name.setdefault(f"outcomes {when}", [])
+                    outcomes = evaluations.setdefault(f"outcomes {when}", [])
                     outcomes.append(evaluation.outcome.value)
-        return results_by_name
+        return evaluations
 
     def with_weights(self, weights: bytes) -> Model:
         """Return the model with other weights, safetensors."""
@@ -245,24 +246,27 @@ class SceneJobs:
             if all(self._has_matrix(other, name) for other in self.linear_controls)
         )
 
-    def _has_matrix(self, *controls: str) -> bool:
-        """Return whether a matrix of light transport gives the images of the first
-        control.
+    def _has_matrix(self, control: str, varying_control: str | None = None) -> bool:
+        """Return whether a matrix of light transport gives the images of a control.
 
-        The other controls vary at random meanwhile. It is False if they cannot do so.
+        Args:
+            control: the control that is searched.
+            varying_control: a control that varies at random meanwhile; False if it
+                cannot do so.
 
         Raises:
-            InputError: the first control alone cannot be searched in a training scene.
+            InputError: the control alone cannot be searched in a training scene.
         """
+        varying_controls = () if varying_control is None else (varying_control,)
         try:
             problem, _ = self.make_problem(
-                self.splits[TRAINING], 0, controls[:1], controls[1:]
+                self.splits[TRAINING], 0, (control,), varying_controls
             )
             return problem.is_linear
         except InputError:
-            if len(controls) > 1:
-                return False
-            raise
+            if varying_control is None:
+                raise
+            return False
 
     @cached_property
     def _held_out_fingerprints(self) -> frozenset[str]:
@@ -288,7 +292,7 @@ class SceneJobs:
             split: the split.
             number: number of the scene.
             controls: controls that are searched.
-            varying_controls: varying controls that vary at random.
+            varying_controls: controls of the run that vary at random meanwhile.
 
         Raises:
             InputError: its object is held out.
@@ -298,16 +302,15 @@ class SceneJobs:
         )
         if split.name != HELD_OUT:
             check_not_held_out(scene.description.object, self._held_out_fingerprints)
-        # the kind of "light:key" and of "camera.azimuth"
-        kinds = {
-            control.partition(":")[0].partition(".")[0]
-            for control in (*controls, *varying_controls)
+        used_kinds = {_get_kind(control) for control in (*controls, *varying_controls)}
+        random_ranges = {
+            kind: ranges
+            for kind, ranges in RANDOM_RANGES.items()
+            if kind not in used_kinds
         }
-        over = {
-            kind: ranges for kind, ranges in RANDOM_RANGES.items() if kind not in kinds
-        }
-        over |= {control: self.config.controls[control] for control in varying_controls}
-        config = self.make_attack_config(controls, name, over=over)
+        for control in varying_controls:
+            random_ranges[control] = self.config.controls[control]
+        config = self.make_attack_config(controls, name, over=random_ranges)
         problem = workbench.make_problem_on(
             config, scene, self.model, differentiated=False
         )
@@ -324,22 +327,10 @@ class SceneJobs:
             changes: changes to the settings.
         """
         searched = {control: self.config.controls[control] for control in controls}
-        # A setting of the run that some of these controls take has their values; it is
-        # None if none of them takes it.
-        changed: dict[str, Any] = {}
-        for control, ranges in searched.items():
-            control_settings = workbench.select_run_settings(
-                self.config, control, ranges
-            )
-            set_values = {
-                setting: value
-                for setting, value in control_settings.items()
-                if value is not None
-            }
-            unset = dict.fromkeys(control_settings)
-            changed = settings.merge_mappings({**unset, **changed}, set_values)
-        changed |= {
+        changed = {
+            **self._select_run_settings(searched),
             "object": name,
+            # The scene is loaded already: these would change it again.
             "environment": None,
             "set_": {},
             "exposure": 0.0,
@@ -354,6 +345,48 @@ class SceneJobs:
             workers=None,
             cluster=None,
         )
+
+    def _select_run_settings(
+        self, searched: Mapping[str, Mapping[str, object]]
+    ) -> dict[str, Any]:
+        """Return the settings of the run that the searched controls take.
+
+        A setting that none of them takes is None.
+
+        Args:
+            searched: settings of the searched controls by their names.
+        """
+        selected: dict[str, Any] = {}
+        for control, control_settings in searched.items():
+            run_settings = workbench.select_run_settings(
+                self.config, control, control_settings
+            )
+            used_settings = {
+                name: value for name, value in run_settings.items() if value is not None
+            }
+            all_unset = dict.fromkeys(run_settings)
+            selected = settings.merge_mappings({**all_unset, **selected}, used_settings)
+        return selected
+
+
+def _evaluate_start(
+    problem: Problem, seed: int, models: Mapping[str, Model]
+) -> dict[str, Any]:
+    """Return the evaluation of each model's prediction of the plain scene, by name.
+
+    Args:
+        problem: problem of the scene.
+        seed: seed of the conditions and the noise.
+        models: models by name; all see the same image.
+    """
+    start = problem.domain.start
+    image = problem.picture(start, seed, CLEAN_SPP)[None]
+    truth = problem.find_truth(problem.add_conditions(start, seed))
+    with torch.no_grad():
+        return {
+            name: problem.task.judge(model(image), truth)[0]
+            for name, model in models.items()
+        }
 
 
 def load_scene_work(config_fields: Mapping[str, Any]) -> SceneJobs:
@@ -379,11 +412,11 @@ def attack_scene(config: AttackConfig, scene: workbench.Scene, model: Model) -> 
         raise KeyboardInterrupt
     if summary.ending in ("found", "already wrong"):
         return summary.ending
-    control = summary.clean.control
-    if control is None:
+    clean_trials = summary.clean.control
+    if clean_trials is None:
         return "unsteady"
-    n_needed = workbench.WORST_CASE.count_needed(control.trials)
-    return ROBUST if control.correct >= n_needed else "unsteady"
+    n_needed = workbench.WORST_CASE.count_needed(clean_trials.trials)
+    return ROBUST if clean_trials.correct >= n_needed else "unsteady"
 
 
 # ---- the split
@@ -430,7 +463,7 @@ class SceneSplit:
             number: number of the scene, from 0.
             fixed_settings: parameters with fixed values.
         """
-        name = self.objects[number % len(self.objects)]
+        name = self._get_object_name(number)
         rng = self.make_generator(number)
         asset = OBJECTS[name].generate(rng) if name in OBJECTS else Path(name)
         environment = self.environments[int(rng.integers(len(self.environments)))]
@@ -438,17 +471,19 @@ class SceneSplit:
         scene = workbench.load_scene(asset, environment, settings=scene_settings)
         description = scene.description
         if self.varied and description.environment is not None:
-            light = change_white_light(
-                vary_environment(description.environment, rng), rng
-            )
+            light = vary_environment(description.environment, rng)
+            light = change_white_light(light, rng)
             description = replace(description, environment=light)
         if description.object.label is None:
             label = Path(name).stem.replace("-", " ").replace("_", " ")
             labelled_object = replace(description.object, label=label)
             description = replace(description, object=labelled_object)
-        if description is not scene.description:
-            scene = workbench.Scene(description)
-        return name, scene
+        is_changed = description is not scene.description
+        return name, workbench.Scene(description) if is_changed else scene
+
+    def _get_object_name(self, number: int) -> str:
+        """Return the name of the object of a scene: the objects take turns."""
+        return self.objects[number % len(self.objects)]
 
     def make_generator(self, number: int) -> np.random.Generator:
         """Return the random generator of a scene."""
@@ -459,18 +494,25 @@ class SceneSplit:
     def generate_objects(self, count: int) -> Iterator[assets.ObjectAsset]:
         """Yield the objects of the first `count` scenes, those in files only once."""
         for number in range(count):
-            name = self.objects[number % len(self.objects)]
+            name = self._get_object_name(number)
+            is_first_time = number == self.objects.index(name)
             if name in OBJECTS:
                 yield OBJECTS[name].generate(self.make_generator(number))
-            elif number == self.objects.index(name):
-                yield self.load_scene(number)[1].description.object
+            elif is_first_time:
+                _, scene = self.load_scene(number)
+                yield scene.description.object
+
+
+def _get_kind(control: str) -> str:
+    """Return the kind of a control: "light" of "light:key", "camera" of "camera.fov"."""
+    return control.partition(":")[0].partition(".")[0]
 
 
 def _sample_scene_settings(rng: np.random.Generator) -> dict[str, float]:
     """Sample the color of the ground, and the parameters in `SCENE_RANGES`."""
-    ground = np.clip(
-        rng.uniform(*GROUND_BRIGHTNESS_RANGE) + rng.normal(0.0, 0.05, 3), 0.02, 0.98
-    )
+    brightness = rng.uniform(*GROUND_BRIGHTNESS_RANGE)
+    tint = rng.normal(0.0, 0.05, 3)
+    ground = np.clip(brightness + tint, 0.02, 0.98)
     scene_settings = {
         parameter: rng.uniform(*bounds) for parameter, bounds in SCENE_RANGES.items()
     }
@@ -486,18 +528,8 @@ def make_splits(config: HardenConfig, model: Model) -> dict[str, SceneSplit]:
         InputError: the model has a class for no object, or an object in a file has no
             held-out instance.
     """
-    objects = tuple(OBJECTS) if config.object == ALL_OBJECTS else config.objects
-    known = tuple(
-        name
-        for name in objects
-        if name not in OBJECTS or _has_class(model, OBJECTS[name].label)
-    )
-    if not known:
-        raise InputError(
-            f"object: model {model.name} has a class for none of "
-            f"{', '.join(objects)}; name others"
-        )
-    files = [name for name in known if name not in OBJECTS]
+    objects = _select_objects(config, model)
+    files = [name for name in objects if name not in OBJECTS]
     if files and config.held_out is None:
         raise InputError(
             f"held_out: {', '.join(files)} has no other instances; name objects of its "
@@ -507,14 +539,15 @@ def make_splits(config: HardenConfig, model: Model) -> dict[str, SceneSplit]:
     splits = {
         name: SceneSplit(
             name,
-            known,
+            objects,
             training_environments,
             seeds.stream(config.seed, name),
             varied=True,
         )
         for name in (TRAINING, FURTHER, VALIDATION)
     }
-    held_out_objects = known
+    # Without objects of its own, the held-out part has other instances of the same.
+    held_out_objects = objects
     if config.held_out is not None:
         held_out_objects = settings.split_names(config.held_out)
     splits[HELD_OUT] = SceneSplit(
@@ -526,7 +559,30 @@ def make_splits(config: HardenConfig, model: Model) -> dict[str, SceneSplit]:
     return splits
 
 
+def _select_objects(config: HardenConfig, model: Model) -> tuple[str, ...]:
+    """Return the objects of the training that the model has a class for.
+
+    Of objects in files that is not known here.
+
+    Raises:
+        InputError: there are none.
+    """
+    objects = tuple(OBJECTS) if config.object == ALL_OBJECTS else config.objects
+    known = tuple(
+        name
+        for name in objects
+        if name not in OBJECTS or _has_class(model, OBJECTS[name].label)
+    )
+    if not known:
+        raise InputError(
+            f"object: model {model.name} has a class for none of "
+            f"{', '.join(objects)}; name others"
+        )
+    return known
+
+
 def _has_class(model: Model, label: str) -> bool:
+    """Return whether a model has a class for a label."""
     try:
         return bool(model.label_set(label).indices)
     except InputError:
@@ -550,8 +606,8 @@ def compute_fingerprint(asset: assets.ObjectAsset) -> str:
 def check_disjoint(held_out: SceneSplit, training_splits: Sequence[SceneSplit]) -> None:
     """Check that nothing is measured that is trained on.
 
-    Of each bundled object only the first instance is compared here; all others, which
-    take minutes, when they are sampled.
+    Only the first instance of each object is compared here. All others are compared
+    when they are sampled, as generating them takes minutes.
 
     Args:
         held_out: the held-out part of the split.
@@ -569,12 +625,13 @@ def check_disjoint(held_out: SceneSplit, training_splits: Sequence[SceneSplit]) 
             f"held_out_environment: {', '.join(common)} is an environment "
             "of the training too; name others"
         )
-    measured = set(
-        map(compute_fingerprint, held_out.generate_objects(len(held_out.objects)))
-    )
+    held_out_fingerprints = {
+        compute_fingerprint(asset)
+        for asset in held_out.generate_objects(len(held_out.objects))
+    }
     for split in training_splits:
         for asset in split.generate_objects(len(split.objects)):
-            check_not_held_out(asset, measured)
+            check_not_held_out(asset, held_out_fingerprints)
 
 
 def check_not_held_out(

@@ -107,32 +107,22 @@ class ClassifierTrainer(Trainer):
     def sample_items(
         self, title: str, split: str, scene_numbers: range
     ) -> list[Lesson]:
-        """Make lessons of the scenes of a split with these numbers.
+        """Make lessons of scenes.
 
         A scene has lessons for each control with a matrix of light transport, and
         lessons for all other controls together, which are rendered. In the training
-        there is more:
+        there are more, of further scenes: a new scene teaches more than one more view.
 
-        - a fourth of the scenes have one texture for all views, and in half of them
-          the rendered controls vary by chance (`sample_scene_options`);
-        - each rendered scene has a plain lesson too, where the predictions of the
-          original model count;
-        - further scenes are rendered: a new scene teaches more than one more view.
+        Args:
+            title: title of the stage that the progress reports.
+            split: split that the scenes belong to.
+            scene_numbers: numbers of the scenes.
         """
         jobs = self._matrix_jobs(split, scene_numbers)
-        rendered = self.work.rendered_controls
-        if rendered:
-            n_views = 1
-            n_plain = 1
-            if split != TRAINING:
-                n_views = self.n_views[1]
-                n_plain = 0
-            jobs += [
-                _make_job(split, number, rendered, views=n_views, plain=n_plain)
-                for number in scene_numbers
-            ]
+        jobs += self._rendered_jobs(split, scene_numbers)
         if split == TRAINING:
             jobs += self._further_jobs(scene_numbers)
+        # They end in any order.
         lessons_of_job = dict(self.work.run_jobs(title, jobs))
         sampled_lessons: list[Lesson] = []
         for index in range(len(jobs)):
@@ -147,32 +137,55 @@ class ClassifierTrainer(Trainer):
 
         Args:
             split: name of the split.
-            scene_numbers: scene numbers of its scenes.
+            scene_numbers: numbers of its scenes.
         """
-        is_training = split == TRAINING
-        n_views = self.n_views[0] if is_training else self.n_views[1]
+        training_views, validation_views = self.n_views
         jobs = list[Job]()
-        for control in self.work.linear_controls:
-            for number in scene_numbers:
-                shares_texture = False
-                varies_others = False
-                if is_training:
-                    shares_texture, varies_others = self.sample_scene_options(
-                        control, number
-                    )
-                varying_controls = self.work.random_controls if varies_others else ()
-                jobs.append(
-                    _make_job(
-                        split,
-                        number,
-                        (control,),
-                        views=n_views,
-                        plain=1,
-                        shared=shares_texture,
-                        varying_controls=varying_controls,
-                    )
+        for control, number in itertools.product(
+            self.work.linear_controls, scene_numbers
+        ):
+            n_views = validation_views
+            shares_texture = False
+            varies_others = False
+            if split == TRAINING:
+                n_views = training_views
+                shares_texture, varies_others = self.sample_scene_options(
+                    control, number
                 )
+            jobs.append(
+                _make_job(
+                    split,
+                    number,
+                    (control,),
+                    views=n_views,
+                    plain=1,
+                    shared=shares_texture,
+                    varying_controls=(
+                        self.work.random_controls if varies_others else ()
+                    ),
+                )
+            )
         return jobs
+
+    def _rendered_jobs(self, split: str, scene_numbers: range) -> list[Job]:
+        """Return the jobs that make lessons by rendering, one for each scene.
+
+        All controls without a matrix of light transport change together. In the
+        training a scene has one such view, and a plain one in which the predictions of
+        the original model count.
+        """
+        controls = self.work.rendered_controls
+        if not controls:
+            return []
+        n_views = 1
+        n_plain = 1
+        if split != TRAINING:
+            _, n_views = self.n_views
+            n_plain = 0
+        return [
+            _make_job(split, number, controls, views=n_views, plain=n_plain)
+            for number in scene_numbers
+        ]
 
     def _further_jobs(self, scene_numbers: range) -> list[Job]:
         """Return the jobs of the further scenes of the training, of one view each.
@@ -181,13 +194,15 @@ class ClassifierTrainer(Trainer):
         """
         first = self.n_further_scenes * scene_numbers[0]
         end = self.n_further_scenes * (scene_numbers[-1] + 1)
-        controls = self.work.linear_controls[:1]
-        n_views = 0
-        n_plain = 1
         if self.work.rendered_controls:
             controls = self.work.rendered_controls
             n_views = 1
             n_plain = 0
+        else:
+            # A scene needs a control, which a plain view does not change.
+            controls = self.work.linear_controls[:1]
+            n_views = 0
+            n_plain = 1
         return [
             _make_job(FURTHER, number, controls, views=n_views, plain=n_plain)
             for number in range(first, end)
@@ -197,16 +212,21 @@ class ClassifierTrainer(Trainer):
         """Return whether the views of a scene share a texture, and whether other
         controls vary.
 
-        Both are random, not every fourth or second scene: objects take turns, so the
-            same ones would always be chosen.
+        Both are random. If it were every fourth scene, for example, it would always be
+        those of the same objects, as objects take turns.
+
+        Args:
+            control: control whose images a matrix of light transport gives.
+            number: number of the scene.
         """
         seed = seeds.stream(self.config.seed, f"views of {control}", number)
-        shared_draw, varied_draw = np.random.default_rng(seed).random(2)
-        shares_texture = bool(shared_draw < SHARED_TEXTURE_PROBABILITY)
-        varies_others = bool(varied_draw < RANDOM_CONTROLS_PROBABILITY)
+        shared_sample, varied_sample = np.random.default_rng(seed).random(2)
+        shares_texture = bool(shared_sample < SHARED_TEXTURE_PROBABILITY)
+        varies_others = bool(varied_sample < RANDOM_CONTROLS_PROBABILITY)
         return shares_texture, varies_others
 
     def uses_per_epoch(self, item: Lesson) -> int:
+        """Return how often an epoch uses a lesson, more often with a texture."""
         if isinstance(item, TextureLesson):
             return self.config.texture_uses_per_epoch
         return 1
@@ -217,12 +237,22 @@ class ClassifierTrainer(Trainer):
         lessons.search_worse_images(new, self.student.model, N_FIRST_STEPS)
         with open_single_threaded_pool() as pool:
             gradients = GradientComputer(self.student, self.work.model, pool)
-            yield lambda batch, rng: gradients.compute(
-                batch, self.next_examples(), int(rng.integers(2**62))
-            )
+
+            def compute_gradient(
+                batch: Sequence[Lesson], rng: np.random.Generator
+            ) -> None:
+                """Compute the gradient of a batch, and of one of further examples."""
+                examples = self.next_examples()
+                seed = int(rng.integers(2**62))  # fits an int64
+                gradients.compute(batch, examples, seed)
+
+            yield compute_gradient
 
     def next_examples(self) -> tuple[Tensor, Tensor] | None:
-        """Return the next batch of further examples; None if there are none."""
+        """Return the next batch of further examples; None if there are none.
+
+        They begin again when they end.
+        """
         if self.beside is None:
             return None
         batch = next(self._example_batches, None)
@@ -278,26 +308,26 @@ def _make_job(
 
 
 def _accuracy(
-    model: Model, chosen: Sequence[Lesson], image_of: Callable[[Lesson], Tensor]
+    model: Model, selected: Sequence[Lesson], get_image: Callable[[Lesson], Tensor]
 ) -> float:
     """Return the fraction of lessons whose images a model gets right.
 
     Args:
         model: returns logits.
-        chosen: lessons, at least one.
-        image_of: returns the image (H, W, 3) of a lesson.
+        selected: lessons, at least one.
+        get_image: returns the image (H, W, 3) of a lesson.
     """
     n_right = 0
     with torch.no_grad():
-        for start in range(0, len(chosen), lessons.BATCH_SIZE):
-            batch = chosen[start : start + lessons.BATCH_SIZE]
-            logits = model(torch.stack([image_of(lesson) for lesson in batch]))
+        for start in range(0, len(selected), lessons.BATCH_SIZE):
+            batch = selected[start : start + lessons.BATCH_SIZE]
+            logits = model(torch.stack([get_image(lesson) for lesson in batch]))
             predicted = logits.argmax(dim=1).tolist()
             n_right += sum(
                 index in lesson.right_classes
                 for index, lesson in zip(predicted, batch, strict=True)
             )
-    return n_right / len(chosen)
+    return n_right / len(selected)
 
 
 class GradientComputer:
@@ -339,43 +369,22 @@ class GradientComputer:
         """
         # Textures come first, so that both passes have the same parts.
         batch = sorted(batch, key=lambda lesson: not isinstance(lesson, TextureLesson))
-        # so that the loss is a mean over plain images plus one over worst images
+        self._ascend_textures(batch, seed)
+
+        # The loss is a mean over plain images plus one over worst images.
         plain_weight = 1.0 / len(batch)
         worst_weight = 1.0 / max(1, len(select_hard_lessons(batch)))
 
-        def texture_gradients(
-            part: Sequence[TextureLesson], twin: Trainable, seed: int
-        ) -> Sequence[Tensor]:
-            """Return the gradient (d,) of the loss by the texture of each lesson."""
-            return lessons.compute_texture_gradients(
-                part, twin.evaluation_logits, lambda images: _augment(images, seed)
-            )
-
-        def weight_gradients(
+        def compute_part_gradient(
             part: Sequence[Lesson], twin: Trainable, seed: int
         ) -> Sequence[Tensor | None]:
             """Return the gradient of the loss of a part by each parameter."""
             loss = self._loss(twin, part, plain_weight, worst_weight, seed)
             return torch.autograd.grad(loss, twin.parameters(), allow_unused=True)
 
-        def all_texture_gradients(
-            texture_lessons: Sequence[TextureLesson],
-        ) -> list[Tensor]:
-            """Return the gradients of all lessons, part by part on the threads."""
-            parts = self._map_parts(texture_gradients, texture_lessons, seed)
-            return list(itertools.chain.from_iterable(parts))
-
-        lessons.ascend_textures(batch, all_texture_gradients)
-        gradients = self._map_parts(weight_gradients, batch, seed)
+        gradients = self._map_parts(compute_part_gradient, batch, seed)
         if further_batch is not None:
-            images, labels = further_batch
-            logits = self._student.logits(images)
-            loss = negative_log_likelihood(
-                logits, [(int(label),) for label in labels]
-            ).mean()
-            gradients.append(
-                torch.autograd.grad(loss, self._student.parameters(), allow_unused=True)
-            )
+            gradients.append(self._compute_further_gradient(*further_batch))
         for parameter, *part_gradients in zip(
             self._student.parameters(), *gradients, strict=True
         ):
@@ -383,25 +392,63 @@ class GradientComputer:
             used = [gradient for gradient in part_gradients if gradient is not None]
             parameter.grad = torch.stack(used).sum(dim=0) if used else None
 
+    def _ascend_textures(self, batch: Sequence[Lesson], seed: int) -> None:
+        """Take a step of the search for worse textures, on augmented images."""
+
+        def compute_part_gradients(
+            part: Sequence[TextureLesson], twin: Trainable, seed: int
+        ) -> Sequence[Tensor]:
+            """Return the gradient (d,) of the loss by the texture of each lesson."""
+            return lessons.compute_texture_gradients(
+                part, twin.evaluation_logits, lambda images: _augment(images, seed)
+            )
+
+        def compute_gradients(
+            texture_lessons: Sequence[TextureLesson],
+        ) -> list[Tensor]:
+            """Return the gradients of all lessons, part by part on the threads."""
+            parts = self._map_parts(compute_part_gradients, texture_lessons, seed)
+            return list(itertools.chain.from_iterable(parts))
+
+        lessons.ascend_textures(batch, compute_gradients)
+
+    def _compute_further_gradient(
+        self, images: Tensor, labels: Tensor
+    ) -> Sequence[Tensor | None]:
+        """Return the gradient of the mean loss of further images by each parameter.
+
+        Args:
+            images: (N, H, W, 3).
+            labels: class indices (N,).
+        """
+        right_classes = [(int(label),) for label in labels]
+        logits = self._student.logits(images)
+        loss = negative_log_likelihood(logits, right_classes).mean()
+        return torch.autograd.grad(loss, self._student.parameters(), allow_unused=True)
+
     def _map_parts(
         self,
         function: Callable[..., Sequence[Any]],
-        chosen: Sequence[Lesson],
+        selected: Sequence[Lesson],
         seed: int,
     ) -> list[Sequence[Any]]:
-        """Apply a function to parts of lessons on the threads, and return its results
-        in order.
+        """Apply a function to parts of lessons on the threads; return its results in
+        order.
 
-        It is called with the part, a copy of the network for this part alone, and a
-        seed that depends on the number of the part.
+        Args:
+            function: is called with the part, a copy of the network for this part
+                alone, and a seed that depends on the index of the part.
+            selected: the lessons.
+            seed: seed of the first part.
         """
         parts = [
-            chosen[start : start + LESSONS_PER_PART]
-            for start in range(0, len(chosen), LESSONS_PER_PART)
+            selected[start : start + LESSONS_PER_PART]
+            for start in range(0, len(selected), LESSONS_PER_PART)
         ]
         n_missing = len(parts) - len(self._twins)
         self._twins += [self._student.make_twin() for _ in range(n_missing)]
-        return list(self._pool.map(function, parts, self._twins, itertools.count(seed)))
+        part_seeds = itertools.count(seed)
+        return list(self._pool.map(function, parts, self._twins, part_seeds))
 
     def _loss(
         self,
@@ -413,43 +460,42 @@ class GradientComputer:
     ) -> Tensor:
         """Return the loss of a part of a batch.
 
-        Worst textures are augmented as the search for them saw them: otherwise they are
-        no longer the worst. At times all rendered images are mixed with each other
-        (mixup, Zhang et al. 2018, arXiv 1710.09412), as no more of them will come; a
-        texture is another one each time. The original model's predictions count only
-        for plain scenes: where a control changed, it is right without being sure.
+        At times all rendered images are mixed with each other (mixup, Zhang et al.
+        2018, arXiv 1710.09412), since they stay the same; a texture is another one each
+        time.
 
         Args:
             student: the network.
             part: the lessons, textures first.
-            plain_weight: plain weight of each plain image.
-            worst_weight: worst weight of each worst image.
+            plain_weight: weight of each plain image.
+            worst_weight: weight of each worst image.
             seed: seed of the augmentation and the mixing.
         """
         # of each image: first all plain ones, then the worst ones
         lesson_of_image: list[Lesson] = [*part, *select_hard_lessons(part)]
-        right = [lesson.right_classes for lesson in lesson_of_image]
-        images = _augment_images(part, select_hard_lessons(part), seed)
-
+        right_classes = [lesson.right_classes for lesson in lesson_of_image]
+        images = _augment_images(part, seed)
         mixed, partners, partner_weight = _mix_images(images, lesson_of_image, seed)
-
         logits = student.logits(images)
-        losses = negative_log_likelihood(logits, right)
+        losses = negative_log_likelihood(logits, right_classes)
         if mixed:
+            # A mixed image has the classes of both images, weighted as its pixels are.
             partner_losses = negative_log_likelihood(
-                logits[mixed], [right[index] for index in partners]
+                logits[mixed], [right_classes[index] for index in partners]
             )
             losses[mixed] = torch.lerp(losses[mixed], partner_losses, partner_weight)
         loss = (
             plain_weight * losses[: len(part)].sum()
             + worst_weight * losses[len(part) :].sum()
         )
-        unrendered = _find_unrendered(part)
-        if unrendered:
+        # Plain images of scenes that are not rendered twice: where a control changed,
+        # the original model is right without being sure.
+        unchanged = _find_unrendered(part)
+        if unchanged:
             divergence = self._divergence_from_original(
-                images[unrendered],
-                logits[unrendered],
-                [right[index] for index in unrendered],
+                images[unchanged],
+                logits[unchanged],
+                [right_classes[index] for index in unchanged],
             )
             loss = loss + plain_weight * ORIGINAL_MODEL_WEIGHT * divergence
         return loss
@@ -515,28 +561,31 @@ def _find_unrendered(part: Sequence[Lesson]) -> list[int]:
     ]
 
 
-def _augment_images(
-    part: Sequence[Lesson], hard_lessons: Sequence[Lesson], seed: int
-) -> Tensor:
+def _augment_images(part: Sequence[Lesson], seed: int) -> Tensor:
     """Return the plain images of lessons, then the worst ones, augmented (N, H, W, 3).
 
-    Plain images, worst textures and worst renders are augmented separately, so that
-    worst textures are changed as in the search for them.
+    Plain images, worst textures and worst renders are augmented separately: so worst
+    textures change as they did in the search, without which they would no longer be
+    the worst.
+
+    Args:
+        part: the lessons, textures first.
+        seed: seed of the augmentation.
     """
-    groups = [
-        [lesson.plain_image for lesson in part],
-        [
-            lesson.worst_image
-            for lesson in hard_lessons
-            if isinstance(lesson, TextureLesson)
-        ],
-        [
-            lesson.worst_image
-            for lesson in hard_lessons
-            if not isinstance(lesson, TextureLesson)
-        ],
+    plain_images = [lesson.plain_image for lesson in part]
+    worst_textures = [
+        lesson.worst_image for lesson in part if isinstance(lesson, TextureLesson)
     ]
-    return torch.cat([_augment(torch.stack(group), seed) for group in groups if group])
+    worst_renders = [
+        lesson.worst_image for lesson in part if isinstance(lesson, RenderedLesson)
+    ]
+    return torch.cat(
+        [
+            _augment(torch.stack(group), seed)
+            for group in (plain_images, worst_textures, worst_renders)
+            if group
+        ]
+    )
 
 
 def _augment(images: Tensor, seed: int) -> Tensor:

@@ -25,6 +25,7 @@ from advsearch.extend import (
     AttackConfig,
     InputError,
     Model,
+    Problem,
     RunDirectory,
     Store,
     SweepConfig,
@@ -137,25 +138,26 @@ def _count_outcomes(table: pd.DataFrame) -> dict[str, int]:
     wrong_wrong, the rendering first.
     """
     counts = table.groupby(["right", "correct"]).size()
-    word_of = {True: "right", False: "wrong"}
+    outcomes = {"right": True, "wrong": False}
     return {
-        f"{word_of[rendered]}_{word_of[photographed]}": int(
-            counts.get((rendered, photographed), 0)
+        f"{rendering}_{photograph}": int(
+            counts.get((is_rendering_right, is_photograph_right), 0)
         )
-        for rendered in word_of
-        for photographed in word_of
+        for rendering, is_rendering_right in outcomes.items()
+        for photograph, is_photograph_right in outcomes.items()
     }
 
 
 def _summarize_rendering(
     name: str, model: str, photos: pd.DataFrame
 ) -> PhotographedRendering:
-    """Summarise the photographs of one rendering, as one model predicts them.
+    """Summarize the photographs of one rendering, as one model predicts them.
 
     Args:
         name: name of the rendering.
-        model: its name.
-        photos: photos from `_read_photos`; the last one states what the rendering is.
+        model: name of the model.
+        photos: their rows of `_read_photos`; the last one states what the model
+            predicts of the rendering.
     """
     n_photos = len(photos)
     n_agreeing = int(photos["agrees"].sum())
@@ -185,15 +187,16 @@ def find_photographs(path: Path, task: workbench.AnyTask) -> list[Path]:
     photographs = [
         file for file in files if file.suffix.lower() in SUFFIXES and file.is_file()
     ]
-    loose = [file for file in photographs if not ALIGNED_NAME.fullmatch(file.stem)]
-    if loose:
-        task_object = workbench.make_task(task)
-        if task_object and _needs_position(task_object):
-            raise InputError(
-                f"{loose[0].name}: the task asks where the object is, and only a "
-                "rendering says that; name the file rendering-NUMBER.jpg by the "
-                "rendering that it was aligned with, or take it out"
-            )
+    unaligned = [file for file in photographs if not ALIGNED_NAME.fullmatch(file.stem)]
+    if not unaligned:
+        return photographs
+    loaded_task = workbench.make_task(task)
+    if loaded_task and _needs_position(loaded_task):
+        raise InputError(
+            f"{unaligned[0].name}: the task asks where the object is, and only a "
+            "rendering says that; name the file rendering-NUMBER.jpg by the "
+            "rendering that it was aligned with, or take it out"
+        )
     return photographs
 
 
@@ -276,42 +279,61 @@ class Photographs:
     def _add(self, run: Path, rendering: str | None, data: bytes, source: str) -> None:
         """Evaluate a photograph by all models of a run, and store it.
 
-        It is cut to the size of the rendering, or else of the model's images. Without a
-        rendering only the predictions are stored.
-
         Args:
             run: the directory of the run.
             rendering: name of the rendering that it was aligned with, if any.
             data: the image file.
             source: name of the file that it came from; empty if a browser sent it.
         """
-        file = None
-        cut_photo = b""
-        if rendering is not None:
-            file = result.find_rendering(run, rendering)
-            with Image.open(file, formats=("PNG", "JPEG")) as image:
-                # A bad photograph is rejected before a scene is loaded.
-                cut_photo = result.sanitize_photo(data, image.size)
+        if rendering is None:
+            self._add_loose(run, data, source)
+        else:
+            self._add_aligned(run, rendering, data, source)
+
+    def _add_loose(self, run: Path, data: bytes, source: str) -> None:
+        """Evaluate a photograph without a rendering; only predictions are stored.
+
+        It is cut to the size of each model's images. Arguments as for `_add`.
+        """
         with RunDirectory.resume(run) as resumed_run:
-            kind = PHOTO if rendering else LOOSE_PHOTO
-            number = resumed_run.store.get_last_step(kind) + 1
-            photo = dict[str, JsonValue](source=source)
+            number = resumed_run.store.get_last_step(LOOSE_PHOTO) + 1
             rows = []
             for evaluator in self._load_evaluators(run):
-                values: Mapping[str, workbench.Value] = {}
-                if file is None or rendering is None:
-                    cut_photo = result.sanitize_photo(data, evaluator.size[::-1])
-                else:
-                    right, label, values = evaluator.evaluate_rendering(
-                        resumed_run.store, rendering, file
-                    )
-                    photo |= {"rendering": rendering, "right": right, "label": label}
-                    photo["file"] = f"{rendering}-{number:04d}.jpg"
-                row = workbench.Row(kind, number, values=values)
-                row = _add_prediction(row, evaluator, rendering, cut_photo)
-                payload = {"photo": {**photo}, "answer": row.payload}
-                rows.append(replace(row, payload=payload))
-            _write_photo(run, file, photo, cut_photo)
+                cut_photo = result.sanitize_photo(data, evaluator.size[::-1])
+                row = workbench.Row(LOOSE_PHOTO, number, values={})
+                photo: dict[str, JsonValue] = {"source": source}
+                rows.append(_add_prediction(row, evaluator, None, cut_photo, photo))
+            resumed_run.append_rows(*rows)
+
+    def _add_aligned(self, run: Path, rendering: str, data: bytes, source: str) -> None:
+        """Evaluate a photograph that was aligned with a rendering, and store both.
+
+        It is cut to the size of the rendering. Arguments as for `_add`.
+        """
+        rendering_file = result.find_rendering(run, rendering)
+        with Image.open(rendering_file, formats=("PNG", "JPEG")) as image:
+            # A bad photograph is rejected before a scene is loaded.
+            cut_photo = result.sanitize_photo(data, image.size)
+        with RunDirectory.resume(run) as resumed_run:
+            number = resumed_run.store.get_last_step(PHOTO) + 1
+            file_name = f"{rendering}-{number:04d}.jpg"
+            rows = []
+            for evaluator in self._load_evaluators(run):
+                is_right, label, values = evaluator.evaluate_rendering(
+                    resumed_run.store, rendering, rendering_file
+                )
+                photo: dict[str, JsonValue] = {
+                    "source": source,
+                    "rendering": rendering,
+                    "right": is_right,
+                    "label": label,
+                    "file": file_name,
+                }
+                row = workbench.Row(PHOTO, number, values=values)
+                rows.append(
+                    _add_prediction(row, evaluator, rendering, cut_photo, photo)
+                )
+            writing.write_bytes(run / directory.PHOTOGRAPHS / file_name, cut_photo)
             resumed_run.append_rows(*rows)
 
 
@@ -320,6 +342,7 @@ def _add_prediction(
     evaluator: _PhotoEvaluator,
     rendering: str | None,
     cut_photo: bytes,
+    photo: Mapping[str, JsonValue],
 ) -> workbench.Row:
     """Return a row with a model's prediction on a photograph.
 
@@ -328,6 +351,7 @@ def _add_prediction(
         evaluator: evaluator of the model, whose name is added to the values.
         rendering: name of the rendering that the photograph was aligned with, if any.
         cut_photo: the image file.
+        photo: what is stored of the photograph, beside the prediction.
     """
     # A sweep over several objects stores which one it was.
     object_name = None
@@ -336,16 +360,8 @@ def _add_prediction(
     model_value: workbench.Value = {"value": evaluator.model.name, "unit": ""}
     row = replace(row, values={**row.values, "model": model_value})
     judgement = evaluator.evaluate(rendering, object_name, cut_photo)
-    return workbench.add_judgement(row, judgement)
-
-
-def _write_photo(
-    run: Path, file: Path | None, photo: Mapping[str, JsonValue], cut_photo: bytes
-) -> None:
-    """Write a photograph into the folder of a run if it belongs to a rendering."""
-    if file is not None:
-        path = run / directory.PHOTOGRAPHS / str(photo["file"])
-        writing.write_bytes(path, cut_photo)
+    row = workbench.add_judgement(row, judgement)
+    return replace(row, payload={"photo": dict(photo), "answer": row.payload})
 
 
 @dataclass(frozen=True)
@@ -375,14 +391,17 @@ class _PhotoEvaluator:
         """Evaluate an image file at the size of the run's renderings.
 
         It is resized in 8 bits with Lanczos' filter, which averages where it shrinks.
+
+        Args:
+            rendering, object_name: as for `find_truth`.
+            data: the image file.
         """
         with Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "WEBP")) as image:
             resized = image.convert("RGB").resize(
                 self.size[::-1], Image.Resampling.LANCZOS
             )
-        pixels = torch.from_numpy(
-            np.asarray(resized, dtype=np.float32) / np.float32(255.0)
-        )
+        levels = np.asarray(resized, dtype=np.float32)
+        pixels = torch.from_numpy(levels / np.float32(255.0))
         with torch.no_grad():
             output = self.model(pixels)
             truth = self.find_truth(rendering, object_name)
@@ -398,10 +417,14 @@ class _PhotoEvaluator:
         Raises:
             InputError: the results have no row of a sweep's rendering.
         """
-        if rendering.isdigit():
-            row = store.read_row("sweep", int(rendering) * self.n_models + self.index)
+        is_of_sweep = rendering.isdigit()
+        if is_of_sweep:
+            # Each image has a row for each model.
+            step = int(rendering) * self.n_models + self.index
+            row = store.read_row("sweep", step)
             if row is not None:
                 return bool(row.correct), row.label or "", row.values
+        # Only an attack stores a rendering as PNG: a sweep has small JPEGs.
         if file.suffix != ".png":
             raise InputError(
                 f"rendering: the results have no row for {file.stem}; it "
@@ -456,11 +479,11 @@ def _find_sweep_truth(
 
     Args:
         sweep: the loaded scenes (`SceneLoader`).
-        model_index: model index of the model.
+        model_index: index of the model.
         image_number: number of the image as text; None for a photograph that was
             aligned with none.
-        object_name: object name of the object; None, or one that the sweep does not
-            have, for its first one, which is the only one then.
+        object_name: name of the object. The first object is taken for None, and for a
+            name that the sweep does not have; it is the only one then.
 
     Raises:
         InputError: the sweep has no such image.
@@ -468,11 +491,9 @@ def _find_sweep_truth(
     job = sweep.job
     task = job.tasks[model_index]
     if image_number is None or not _needs_position(task):
-        named_scene = next(
-            (scene for scene in job.scenes if scene.object == object_name),
-            job.scenes[0],
-        )
-        return task.truth(job.make_facts(named_scene, {}))
+        first_scene = job.scenes[0]
+        scenes = (scene for scene in job.scenes if scene.object == object_name)
+        return task.truth(job.make_facts(next(scenes, first_scene), {}))
     number = int(image_number)
     if number >= job.images_per_scene * len(job.scenes):
         raise InputError(
@@ -487,30 +508,6 @@ def _find_sweep_truth(
 def _load_attack_evaluators(run: Path, config: AttackConfig) -> list[_PhotoEvaluator]:
     """Load the models of an attack, with the ground truth of its images."""
     problem, _ = workbench.problem_from_config(workbench.with_evaluation_only(config))
-
-    def find_truth(task: Task, rendering: str | None, _: str | None) -> workbench.Truth:
-        """Return the ground truth of the clean or adversarial scene, or of a trial.
-
-        Renderings are named "clean", "adversarial" or "verification-NUMBER"; a trial
-        has the conditions of its seed, the others those that the scene comes with. The
-        clean scene stands for a photograph without a rendering, and for a task that
-        does not depend on the configuration.
-        """
-        u = problem.domain.start
-        is_adversarial = rendering not in (None, "clean")
-        if is_adversarial and _needs_position(task):
-            u = workbench.read_stored_configuration(run, problem)
-        _, _, trial = (rendering or "").rpartition("verification-")
-        seed = None
-        if trial.isdigit():
-            seed = seeds.stream(problem.seed, "verification", int(trial))
-        configuration = problem.add_conditions(u, seed)
-        facts = problem.make_facts(
-            lambda: problem.space.describe(configuration),
-            lambda: problem.renderer.surfaces(configuration),
-        )
-        return task.truth(facts)
-
     models: list[tuple[Model, Task]] = [(problem.model, problem.task)]
     if isinstance(problem.task, workbench.EnsembleTask):
         models = list(zip(problem.task.models, problem.task.tasks, strict=True))
@@ -519,9 +516,41 @@ def _load_attack_evaluators(run: Path, config: AttackConfig) -> list[_PhotoEvalu
             model=model,
             task=task,
             size=config.resolution or model.input_size,
-            find_truth=partial(find_truth, task),
+            find_truth=partial(_find_attack_truth, run, problem, task),
             index=index,
             n_models=len(models),
         )
         for index, (model, task) in enumerate(models)
     ]
+
+
+def _find_attack_truth(
+    run: Path, problem: Problem, task: Task, rendering: str | None, _object: str | None
+) -> workbench.Truth:
+    """Return the ground truth of the clean or adversarial scene, or of a trial.
+
+    Args:
+        run: the directory of the attack.
+        problem: problem of the attack.
+        task: task of a model.
+        rendering: "clean", "adversarial" or "verification-NUMBER", which is a trial of
+            the adversarial scene; None for a photograph without a rendering, which has
+            the truth of the clean scene.
+        _object: not used, as an attack has one object.
+    """
+    u = problem.domain.start
+    is_adversarial = rendering not in (None, "clean")
+    # Otherwise the clean scene has the same truth.
+    if is_adversarial and _needs_position(task):
+        u = workbench.read_stored_configuration(run, problem)
+    # A trial has the conditions of its seed, others those that the scene comes with.
+    _, _, trial_number = (rendering or "").rpartition("verification-")
+    seed = None
+    if trial_number.isdigit():
+        seed = seeds.stream(problem.seed, "verification", int(trial_number))
+    configuration = problem.add_conditions(u, seed)
+    facts = problem.make_facts(
+        lambda: problem.space.describe(configuration),
+        lambda: problem.renderer.surfaces(configuration),
+    )
+    return task.truth(facts)

@@ -53,8 +53,14 @@ class PhotographPages:
     def make_page(
         self, run: Path, name: str, key: str, other_device_url: str | None
     ) -> str:
-        """Return the page of a run's photographs; arguments as for
-        `make_align_page`.
+        """Return the page on which photographs of a run are taken, as HTML.
+
+        Args:
+            run: the directory of the run.
+            name: name of the run.
+            key: key that the server expects with a photograph.
+            other_device_url: address by which another device opens the page; None if
+                none can.
         """
         return make_align_page(
             name,

@@ -83,6 +83,8 @@ MAX_PIXELS = 50_000_000
 """Limit of a photograph as it is sent; the largest phones take 50 million."""
 MAX_SIZE = 1024
 """Longer side, in pixels, of a photograph that is stored."""
+N_NAMED_RENDERINGS = 8
+"""Renderings that the page names, beside the last one."""
 JPEG_QUALITY = 95
 """Of its JPEG file, 1 to 95."""
 _NAME = re.compile(r"[0-9]{1,12}|clean|adversarial|verification-[0-9]{2}")
@@ -97,7 +99,8 @@ def find_rendering(run: Path, name: str) -> Path:
     """
     file = None
     if _NAME.fullmatch(name):
-        if name.isdigit():
+        is_of_sweep = name.isdigit()
+        if is_of_sweep:
             file = markup.find_thumbnail(run, int(name))
         else:
             file = run / directory.IMAGES / f"{name}.png"
@@ -110,8 +113,11 @@ def find_rendering(run: Path, name: str) -> Path:
 
 
 def list_renderings(run: Path) -> tuple[str, ...]:
-    """Return the names of a run's renderings; empty if it stored none."""
-    stored_images = markup.find_thumbnails(run)
+    """Return the names of a run's renderings; empty if it stored none.
+
+    Those of an attack are in alphabetical order, but "adversarial" comes first.
+    """
+    stored_images = markup.find_thumbnails(run)  # of a sweep
     if stored_images is not None:
         return tuple(map(str, stored_images.numbers))
     names = [
@@ -150,6 +156,21 @@ def sanitize_photo(data: bytes, shape: tuple[int, int]) -> bytes:
             f"photo: expected at most {markup.MAX_BODY_BYTES >> 20} MB, got "
             "more; send a smaller one"
         )
+    photo = _decode_photo(data)
+    scale = min(MAX_SIZE, max(photo.size)) / max(shape)
+    width, height = (max(1, round(length * scale)) for length in shape)
+    cut_photo = ImageOps.fit(photo, (width, height), Image.Resampling.LANCZOS)
+    buffer = io.BytesIO()
+    cut_photo.save(buffer, "JPEG", quality=JPEG_QUALITY)
+    return buffer.getvalue()
+
+
+def _decode_photo(data: bytes) -> Image.Image:
+    """Decode a photograph, upright and in RGB.
+
+    Raises:
+        InputError: it has too many pixels, or is no image of a known format.
+    """
     try:
         with Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "WEBP")) as image:
             if image.width * image.height > MAX_PIXELS:
@@ -159,7 +180,7 @@ def sanitize_photo(data: bytes, shape: tuple[int, int]) -> bytes:
                 )
             # A JPEG is decoded at about the size that is needed.
             image.draft("RGB", (2 * MAX_SIZE, 2 * MAX_SIZE))
-            upright = ImageOps.exif_transpose(image).convert("RGB")
+            return ImageOps.exif_transpose(image).convert("RGB")
     except (Image.DecompressionBombError, Image.DecompressionBombWarning):
         raise InputError(
             f"photo: expected at most {MAX_PIXELS:,} pixels, got far more"
@@ -169,12 +190,6 @@ def sanitize_photo(data: bytes, shape: tuple[int, int]) -> bytes:
             "photo: expected a picture in JPEG, PNG or WebP, got "
             "something else or a part"
         ) from None
-    scale = min(MAX_SIZE, max(upright.size)) / max(shape)
-    width, height = (max(1, round(length * scale)) for length in shape)
-    cut_photo = ImageOps.fit(upright, (width, height), Image.Resampling.LANCZOS)
-    buffer = io.BytesIO()
-    cut_photo.save(buffer, "JPEG", quality=JPEG_QUALITY)
-    return buffer.getvalue()
 
 
 # ---- the page
@@ -212,7 +227,8 @@ def make_align_page(
     data = []
     scripts: tuple[str, ...] = ()
     if renderings:
-        page_data = {"key": key, "names": list(renderings[:1])}
+        first_rendering = list(renderings[:1])
+        page_data = {"key": key, "names": first_rendering}
         data = [markup.make_data_script(page_data, "photographing")]
         scripts = ("make.js", "align.js")
     return markup.make_document(
@@ -230,27 +246,27 @@ def _align_section(renderings: Sequence[str]) -> markup.Html:
         return markup.make_element(
             "p", reason, markup.make_element("code", "keep_pictures=all"), "."
         )
-    names = ", ".join(renderings[:8])
-    if len(renderings) > 8:
+    # the first ones, and the last one
+    names = ", ".join(renderings[:N_NAMED_RENDERINGS])
+    if len(renderings) > N_NAMED_RENDERINGS:
         names += f", ... {renderings[-1]}"
     instructions = (
         "Lay a rendering over what the camera sees, move the real object until both "
         "agree, and take a photograph."
     )
+    names_element = markup.make_element(
+        "p",
+        f"Renderings of this run ({len(renderings)}): {names}.",
+        class_="soft",
+        id="renderings",
+    )
+    no_script = markup.make_element(
+        "p", "The camera needs JavaScript, which is switched off."
+    )
     content = markup.join_html(
         markup.make_element("p", instructions),
-        markup.make_element(
-            "p",
-            f"Renderings of this run ({len(renderings)}): {names}.",
-            class_="soft",
-            id="renderings",
-        ),
-        markup.make_element(
-            "noscript",
-            markup.make_element(
-                "p", "The camera needs JavaScript, which is switched off."
-            ),
-        ),
+        names_element,
+        markup.make_element("noscript", no_script),
     )
     return markup.make_element("div", content, id="align")
 
@@ -307,10 +323,9 @@ def make_agreement_table(table: PhotoAgreement) -> markup.Html:
 def _rendering_table(renderings: Sequence[PhotographedRendering]) -> markup.Html:
     """Return the table of agreement by rendering, with models if there are several."""
     has_models = len({rendering.model for rendering in renderings}) > 1
-    model_head = ["model"] if has_models else []
     heads = [
         "rendering",
-        *model_head,
+        *(["model"] if has_models else []),
         "in the rendering",
         "in photographs",
         "agree",
@@ -318,27 +333,14 @@ def _rendering_table(renderings: Sequence[PhotographedRendering]) -> markup.Html
     ]
     rows = []
     for rendering in renderings:
-        links = [
-            markup.join_html(
-                markup.make_element(
-                    "a", label or "nothing", href=f"photos/{markup.quote_name(file)}"
-                ),
-                " ",
-            )
-            for label, file in zip(rendering.labels, rendering.files, strict=True)
-        ]
         outcome = "right" if rendering.rendering_right else "wrong"
-        model_cell = [rendering.model] if has_models else []
-        n_photos = rendering.photos
         rows.append(
             [
                 rendering.rendering,
-                *model_cell,
+                *([rendering.model] if has_models else []),
                 f"{outcome}: {rendering.label}",
-                markup.join_html(
-                    f"{rendering.photos_right} of {n_photos} right: ", *links
-                ),
-                f"{rendering.agreeing} of {n_photos}",
+                _photographs_cell(rendering),
+                f"{rendering.agreeing} of {rendering.photos}",
                 wording.format_interval(rendering.interval),
             ]
         )
@@ -347,3 +349,18 @@ def _rendering_table(renderings: Sequence[PhotographedRendering]) -> markup.Html
         for rendering in renderings
     ]
     return markup.make_table(heads, rows, addresses)
+
+
+def _photographs_cell(rendering: PhotographedRendering) -> markup.Html:
+    """Return in how many photographs the model is right, with a link to each.
+
+    The text of a link is what the model predicts of the photograph.
+    """
+    links = []
+    for label, file in zip(rendering.labels, rendering.files, strict=True):
+        address = f"photos/{markup.quote_name(file)}"
+        link = markup.make_element("a", label or "nothing", href=address)
+        links.append(markup.join_html(link, " "))
+    return markup.join_html(
+        f"{rendering.photos_right} of {rendering.photos} right: ", *links
+    )

@@ -89,6 +89,10 @@ class MeasuredRounds:
         highest = max(seconds_per_cost.values(), default=0.0)
         return setting.cost * seconds_per_cost.get(setting.line, highest)
 
+    def fits(self, setting: SampleSetting, seconds_left: float) -> bool:
+        """Return whether a new setting fits into the remaining time."""
+        return self.estimate_needed_seconds(setting, seconds_left) <= seconds_left
+
     def estimate_needed_seconds(
         self, setting: SampleSetting, seconds_left: float
     ) -> float:
@@ -141,7 +145,7 @@ def measure_in_rounds(
     measured = MeasuredRounds()
 
     def measure_once(setting: SampleSetting) -> None:
-        """Measure a setting with the next seed of its own, and store time and result."""
+        """Measure a setting with its next seed, and store the result and its time."""
         measurements = measured.results.setdefault(setting, [])
         start = budget.clock()
         stream = f"precision {'/'.join(setting.line)}/{setting.spp}"
@@ -150,14 +154,9 @@ def measure_in_rounds(
         measured.wall_seconds.setdefault(setting, []).append(budget.clock() - start)
         on_done(setting)
 
-    def fits(setting: SampleSetting) -> bool:
-        """Return whether a new setting fits into the remaining time."""
-        needed = measured.estimate_needed_seconds(setting, budget.seconds_left)
-        return needed <= budget.seconds_left
-
     for setting in sorted(settings, key=lambda setting: setting.cost):
         is_first = not measured.results
-        if is_first or fits(setting):
+        if is_first or measured.fits(setting, budget.seconds_left):
             for _ in range(COLD_CALLS):
                 measure_once(setting)
         else:
@@ -246,7 +245,8 @@ SAMPLE_COUNTS = {
     "independent": (4, 8, 16, 32, 64, 128, 256),
     "orthogonal": (4, 25, 121, 289),
 }
-"""Sample counts by sampler, which accepts them exactly; others have (4, 16, 64, 256).
+OTHER_SAMPLE_COUNTS = (4, 16, 64, 256)
+"""Sample counts by sampler, which accepts them exactly, and those of all others.
 
 All but the independent sampler compile a kernel for each count.
 """
@@ -296,21 +296,9 @@ class PictureBench:
             )
             for line in {*self._lines, REFERENCE_SAMPLER, REFERENCE_SAMPLER + OIDN}
         }
-        self.settings = list[SampleSetting]()
-        for line in self._lines:
-            # The cost decides the order: other lines come later, as if they were
-            # slower.
-            cost_factor = 1.0 if line in PREFERRED_LINES else OTHER_LINES_COST
-            for count in SAMPLE_COUNTS.get(line, (4, 16, 64, 256)):
-                self.settings.append(
-                    SampleSetting(
-                        quantity="picture",
-                        estimator=line,
-                        spp=count,
-                        cost=count * cost_factor,
-                        family=get_denoiser(line),
-                    )
-                )
+        self.settings = [
+            setting for line in self._lines for setting in list_line_settings(line)
+        ]
 
     def compute_references(
         self, budget: TimeBudget, seed: int, on_done: Callable[[], None]
@@ -330,39 +318,50 @@ class PictureBench:
         Returns:
             A row of the result for each reference.
         """
-        families = list(dict.fromkeys(map(get_denoiser, self._lines)))
+        # "none" comes first, since samplers without a denoiser do
+        denoisers = list(dict.fromkeys(map(get_denoiser, self._lines)))
         rows = []
-        for index, family in enumerate(families):
-            # an even fraction of what is left, since a family may have left time over
-            family_budget = budget.take_fraction(1.0 / (len(families) - index))
-            line = REFERENCE_SAMPLER
-            if family == "oidn":
-                line += OIDN
-            first_seed = 0
-            spp = choose_part_samples(
-                partial(self._render_radiance, line, first_seed),
-                family_budget.seconds_left,
+        for index, denoiser in enumerate(denoisers):
+            # an even fraction of what is left, since an earlier one may have left time
+            n_left = len(denoisers) - index
+            rows += self._compute_references_of(
+                denoiser, budget.take_fraction(1.0 / n_left), seed, on_done
             )
-            radiances = take_reference_parts(
-                partial(self._render_radiance, line, spp=spp),
-                family_budget,
-                on_done,
-                seed,
-            )
-            parts = [flatten(radiance) for radiance in radiances]
+        return rows
+
+    def _compute_references_of(
+        self,
+        denoiser: str,
+        budget: TimeBudget,
+        seed: int,
+        on_done: Callable[[], None],
+    ) -> list[PrecisionReference]:
+        """Render and store the references of lines with a denoiser, as above."""
+        line = REFERENCE_SAMPLER
+        if denoiser == "oidn":
+            line += OIDN
+        first_seed = 0
+        spp = choose_part_samples(
+            partial(self._render_radiance, line, first_seed), budget.seconds_left
+        )
+        radiances = take_reference_parts(
+            partial(self._render_radiance, line, spp=spp), budget, on_done, seed
+        )
+        parts = [flatten(radiance) for radiance in radiances]
+        rows = []
+        if denoiser == "none":
             image = estimate_reference(
                 parts, lambda mean: flatten(self._display_mean(mean))
             )
-            margin = estimate_reference(
-                parts, lambda mean: np.array([self._margin(self._display_mean(mean))])
-            )
-            self._references["margin", family] = margin
-            # that without denoiser, which comes first, is the reference of all images
-            undenoised = self._references.get(("picture", "none"), image)
-            self._references["picture", family] = undenoised
-            if family == "none":
-                rows.append(_make_row("picture", line, image, spp))
-            rows.append(_make_row("margin", line, margin, spp))
+            self._references["picture", "none"] = image
+            rows.append(_make_row("picture", line, image, spp))
+        # Denoised images, too, are compared with the one without denoiser.
+        self._references["picture", denoiser] = self._references["picture", "none"]
+        margin = estimate_reference(
+            parts, lambda mean: np.array([self._margin(self._display_mean(mean))])
+        )
+        self._references["margin", denoiser] = margin
+        rows.append(_make_row("margin", line, margin, spp))
         return rows
 
     def _display_mean(self, mean: Float64Array) -> Tensor:
@@ -370,8 +369,8 @@ class PictureBench:
         size = (*self._formation.resolution, 3)
         return self._display(torch.from_numpy(mean).to(torch.float32).reshape(size))
 
-    def reference_error(self, setting: SampleSetting, quantity: str) -> float:
-        """Return the error of the reference of a quantity."""
+    def get_reference_error(self, setting: SampleSetting, quantity: str) -> float:
+        """Return the relative error of the reference of a quantity."""
         return self._references[quantity, setting.family].error
 
     def measure(self, setting: SampleSetting, seed: int) -> dict[str, Numbers]:
@@ -406,6 +405,22 @@ class PictureBench:
             )
 
 
+def list_line_settings(line: str) -> list[SampleSetting]:
+    """Return the settings of a line of pictures: one for each sample count."""
+    # The cost decides the order: other lines come later, as if they were slower.
+    cost_factor = 1.0 if line in PREFERRED_LINES else OTHER_LINES_COST
+    return [
+        SampleSetting(
+            quantity="picture",
+            estimator=line,
+            spp=count,
+            cost=count * cost_factor,
+            family=get_denoiser(line),
+        )
+        for count in SAMPLE_COUNTS.get(line, OTHER_SAMPLE_COUNTS)
+    ]
+
+
 def get_denoiser(line: str) -> str:
     """Return the denoiser of a line."""
     return "oidn" if line.endswith(OIDN) else "none"
@@ -433,10 +448,12 @@ class GradientPart:
 
     @property
     def size(self) -> int:
+        """The number of coordinates."""
         return sum(group.size for group in self.groups)
 
     @property
     def group_names(self) -> set[str]:
+        """The names of the groups, by which a gradient plan is restricted to them."""
         return {group.name for group in self.groups}
 
     def select(self, gradient: Tensor) -> Float64Array:
@@ -455,33 +472,33 @@ def list_gradient_parts(
 ) -> list[GradientPart]:
     """Return the parts of a space with the estimators that are valid for them.
 
-    A part is the groups of one control that the same estimators can differentiate. If a
-    control has several parts, their names list the parameters.
+    A part is the groups of one control that the same estimators can differentiate.
 
     Args:
         groups: groups of all coordinates.
         linear: whether the loss is linear; then differences of the loss ("secant")
             equal those of the picture, and are left out.
     """
-    sets = gradients.planning.list_comparable_sets(
-        group for group in groups if group.valid
-    )
-    controls = [members[0].control for members, _ in sets]
+    differentiable_groups = [group for group in groups if group.valid]
+    comparable_sets = gradients.planning.list_comparable_sets(differentiable_groups)
+    controls = [part_groups[0].control for part_groups, _ in comparable_sets]
     parts = []
-    for members, candidates in sets:
-        name = members[0].control
-        if controls.count(name) > 1:
-            parameters = ",".join(group.parameter for group in members)
-            if len(parameters) > MAX_NAME_LETTERS:
-                parameters = f"{members[0].parameter},... ({len(members)})"
-            name = f"{name}.{parameters}"
-        estimators = tuple(
-            estimator
-            for estimator in candidates
-            if not (linear and estimator == "secant")
-        )
-        parts.append(GradientPart(name, members, estimators))
+    for part_groups, estimators in comparable_sets:
+        name = part_groups[0].control
+        if controls.count(name) > 1:  # a control of several parts
+            name = f"{name}.{_join_parameters(part_groups)}"
+        if linear:
+            estimators = tuple(item for item in estimators if item != "secant")
+        parts.append(GradientPart(name, part_groups, estimators))
     return parts
+
+
+def _join_parameters(groups: Sequence[gradients.Group]) -> str:
+    """Join the parameters of groups by commas; of a long list, name only the first."""
+    parameters = ",".join(group.parameter for group in groups)
+    if len(parameters) > MAX_NAME_LETTERS:
+        return f"{groups[0].parameter},... ({len(groups)})"
+    return parameters
 
 
 class GradientBench:
@@ -521,52 +538,44 @@ class GradientBench:
             adjoints = [name for name in part.estimators if name in ADJOINT_COST]
             self._reference_estimator = (*adjoints, *part.estimators)[0]
         self.reference: ReferenceValue | None = None
-        self.settings = list[SampleSetting]()
-        for name in part.estimators:
-            # in renders: the image itself, and those of its gradient
-            cost = 1.0 + ADJOINT_COST.get(name, part.count_renders(name))
-            for count in SAMPLE_COUNTS["independent"]:
-                self.settings.append(
-                    SampleSetting(
-                        quantity="gradient",
-                        estimator=name,
-                        spp=count,
-                        cost=count * cost,
-                        control=part.name,
-                    )
-                )
+        self.settings = [
+            self.make_setting(estimator, count)
+            for estimator in part.estimators
+            for count in SAMPLE_COUNTS["independent"]
+        ]
+
+    def make_setting(self, estimator: str, spp: int) -> SampleSetting:
+        """Return the setting of an estimator with a number of samples per pixel."""
+        gradient_renders = ADJOINT_COST.get(
+            estimator, self.part.count_renders(estimator)
+        )
+        renders = 1.0 + gradient_renders  # one of the image itself
+        return SampleSetting(
+            quantity="gradient",
+            estimator=estimator,
+            spp=spp,
+            cost=spp * renders,
+            control=self.part.name,
+        )
 
     def compute_references(
         self, budget: TimeBudget, seed: int, on_done: Callable[[], None]
     ) -> list[PrecisionReference]:
         """Compute the reference within a budget.
 
-        By differences, its bias is taken as a quarter of the mean disagreement between
-        the derivatives at two steps.
+        Args:
+            budget: time that it may take.
+            seed: seed of its parts.
+            on_done: called after each part.
+
+        Returns:
+            The one row of the reference in the result.
         """
         if self._by_differences:
-            compute = partial(self._compute_derivatives, self._list_probes())
-            spp = choose_part_samples(
-                partial(compute, 0), budget.seconds_left, parts=3, counts=(16, 64, 256)
-            )
-            parts = take_reference_parts(
-                partial(compute, spp=spp), budget, on_done, seed
-            )
-            derivatives = [derivative for derivative, _ in parts]
-            # Extrapolation to a step of 0 removes most of what two steps disagree by: a
-            # quarter is taken as what is left.
-            disagreements = [disagreement for _, disagreement in parts]
-            bias = float(np.linalg.norm(np.mean(disagreements, axis=0))) / 4.0
-            self.reference = estimate_reference(derivatives, bias=bias)
+            compute = self._compute_reference_by_differences
         else:
-            compute = partial(
-                self._compute_gradient, self._exact, self._reference_estimator
-            )
-            spp = choose_part_samples(partial(compute, 0), budget.seconds_left)
-            gradients_of_parts = take_reference_parts(
-                partial(compute, spp=spp), budget, on_done, seed
-            )
-            self.reference = estimate_reference(gradients_of_parts)
+            compute = self._compute_reference_by_estimator
+        self.reference, spp = compute(budget, seed, on_done)
         return [
             _make_row(
                 "gradient",
@@ -576,6 +585,42 @@ class GradientBench:
                 control=self.part.name,
             )
         ]
+
+    def _compute_reference_by_differences(
+        self, budget: TimeBudget, seed: int, on_done: Callable[[], None]
+    ) -> tuple[ReferenceValue, int]:
+        """Compute the reference by differences at two steps along each coordinate.
+
+        Returns:
+            The reference, and the samples per pixel of each of its parts.
+        """
+        compute = partial(self._compute_derivatives, self._list_probes())
+        first_seed = 0
+        spp = choose_part_samples(
+            partial(compute, first_seed),
+            budget.seconds_left,
+            parts=3,
+            counts=(16, 64, 256),
+        )
+        parts = take_reference_parts(partial(compute, spp=spp), budget, on_done, seed)
+        derivatives = [derivative for derivative, _ in parts]
+        # Extrapolation to a step of 0 removes most of what two steps disagree by: a
+        # quarter is taken as what is left.
+        disagreements = [disagreement for _, disagreement in parts]
+        bias = float(np.linalg.norm(np.mean(disagreements, axis=0))) / 4.0
+        return estimate_reference(derivatives, bias=bias), spp
+
+    def _compute_reference_by_estimator(
+        self, budget: TimeBudget, seed: int, on_done: Callable[[], None]
+    ) -> tuple[ReferenceValue, int]:
+        """Compute the reference as the mean gradient of an estimator, as above."""
+        compute = partial(
+            self._compute_gradient, self._exact, self._reference_estimator
+        )
+        first_seed = 0
+        spp = choose_part_samples(partial(compute, first_seed), budget.seconds_left)
+        parts = take_reference_parts(partial(compute, spp=spp), budget, on_done, seed)
+        return estimate_reference(parts), spp
 
     def _list_probes(self) -> list[gradients.Probe]:
         """Return a probe along each coordinate of the part."""
@@ -618,8 +663,11 @@ class GradientBench:
         table: Float64Array = np.array(pairs, dtype=np.float64).T
         return table
 
-    def reference_error(self, setting: SampleSetting, quantity: str) -> float:
-        """Return the error of the reference."""
+    def get_reference_error(self, setting: SampleSetting, quantity: str) -> float:
+        """Return the relative error of the reference; 0 before it is computed.
+
+        There is one reference for all settings.
+        """
         return self.reference.error if self.reference else 0.0
 
     def measure(self, setting: SampleSetting, seed: int) -> dict[str, Numbers]:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 
@@ -28,6 +28,7 @@ from advsearch.questions.precision.benches import (
     OIDN,
     GradientBench,
     GradientPart,
+    MeasuredRounds,
     PictureBench,
     TimeBudget,
     list_gradient_parts,
@@ -38,6 +39,7 @@ from advsearch.questions.precision.result import (
     PrecisionConfig,
     PrecisionPoint,
     PrecisionResult,
+    PrecisionSlope,
     Recommended,
     Sitting,
     draw_figures,
@@ -77,70 +79,86 @@ def measure_precision(context: RunContext[PrecisionConfig]) -> PrecisionResult:
     start_time = time.perf_counter()
     hint = f"then {config.seconds:g} seconds of measurements; `seconds` sets them"
     context.progress.stage(workbench.LOADING, hint=hint)
-    run = context.run
     problem, remarks = workbench.problem_from_config(config)
     for remark in remarks:
         context.progress.message(remark)
     measurer = QuantityMeasurer(config, problem, context.progress)
     measurements = context.open_measurements()
     setup_seconds = time.perf_counter() - start_time
+    result = measurements.collect(
+        measurer.measure_sittings(
+            # a stored sitting is read; only others are measured
+            lambda name, measure: measurements.get_row(name, Sitting, measure)
+        ),
+        lambda sittings: _make_result(context, measurer, sittings, setup_seconds),
+    )
+    paths = _write_figures(context.run, result)
+    return result.model_copy(update={"figures": [str(path) for path in paths]})
 
-    def measure_sittings() -> Iterator[Sitting]:
-        """Yield each sitting; time that one leaves is shared among those after it."""
-        seconds_left = config.seconds
-        fractions = [fraction for _, fraction, _ in measurer.sittings]
-        for number, (name, fraction, measure) in enumerate(measurer.sittings):
-            fraction_left = math.fsum(fractions[number:])
-            budget = TimeBudget(seconds_left * fraction / fraction_left)
-            # A stored sitting is read; `measure` is called only for others.
-            sitting = measurements.get_row(name, Sitting, partial(measure, budget))
-            seconds_left = max(0.0, seconds_left - sitting.took)
-            yield sitting
 
-    def make_result(sittings: list[Sitting]) -> PrecisionResult:
-        """Return the result of the sittings that are finished."""
+def _make_result(
+    context: RunContext[PrecisionConfig],
+    measurer: QuantityMeasurer,
+    sittings: Sequence[Sitting],
+    setup_seconds: float,
+) -> PrecisionResult:
+    """Return the result of the sittings that are finished, without figures yet."""
+    config = context.config
+    problem = measurer.problem
 
-        def join(name: str) -> list[Any]:
-            """Return the rows of this name of all sittings."""
-            return [row for sitting in sittings for row in getattr(sitting, name)]
+    def join(name: str) -> list[Any]:
+        """Join the lists that this field has in all sittings."""
+        return [row for sitting in sittings for row in getattr(sitting, name)]
 
-        points = join("points")
-        warnings = join("warnings")
-        slopes = []
-        for line in group_by_line(points).values():
-            slope = fit_line(line, measurer.may_be_steeper(line[0]))
-            if slope is not None:
-                slopes.append(slope)
-                warnings += filter(None, [describe_disagreement(slope, line)])
-        return context.result(
-            PrecisionResult,
-            model=problem.model.name,
-            environment=problem.environment,
-            depth=problem.renderer.scene.max_depth,
-            loss=config.loss,
-            spp=problem.spp,
+    points = join("points")
+    slopes, disagreements = _fit_slopes(points, measurer.may_be_steeper)
+    return context.result(
+        PrecisionResult,
+        model=problem.model.name,
+        environment=problem.environment,
+        depth=problem.renderer.scene.max_depth,
+        loss=config.loss,
+        spp=problem.spp,
+        goal=config.error,
+        image_formation=results.Formation.of(problem.renderer.formation),
+        machine=Machine(**context.machine, threads=count_threads()),
+        points=points,
+        slopes=slopes,
+        references=join("references"),
+        left_out=join("left_out"),
+        warnings=[*join("warnings"), *disagreements, *list_cautions(points)],
+        recommendations=recommend_settings(
+            points,
+            confirmations=join("again"),
             goal=config.error,
-            image_formation=results.Formation.of(problem.renderer.formation),
-            machine=Machine(**context.machine, threads=count_threads()),
-            points=points,
-            slopes=slopes,
-            references=join("references"),
-            left_out=join("left_out"),
-            warnings=[*warnings, *list_cautions(points)],
-            recommendations=recommend_settings(
-                points,
-                confirmations=join("again"),
-                goal=config.error,
-                round_up=measurer.round_up,
-                or_steeper=measurer.may_be_steeper,
-            ),
-            figures=[],
-            seconds={"budget": config.seconds, "setup": setup_seconds},
-        )
+            round_up=measurer.round_up,
+            or_steeper=measurer.may_be_steeper,
+        ),
+        figures=[],
+        seconds={"budget": config.seconds, "setup": setup_seconds},
+    )
 
-    result = measurements.collect(measure_sittings(), make_result)
-    written = _write_figures(run, result)
-    return result.model_copy(update={"figures": [str(path) for path in written]})
+
+def _fit_slopes(
+    points: Sequence[PrecisionPoint],
+    may_be_steeper: Callable[[PrecisionPoint], bool | None],
+) -> tuple[list[PrecisionSlope], list[str]]:
+    """Fit a line to the points of each estimator that has enough of them.
+
+    Returns:
+        The lines, and a sentence for each that disagrees with theory.
+    """
+    slopes = []
+    disagreements = []
+    for estimator_points in group_by_line(points).values():
+        slope = fit_line(estimator_points, may_be_steeper(estimator_points[0]))
+        if slope is None:
+            continue
+        slopes.append(slope)
+        disagreement = describe_disagreement(slope, estimator_points)
+        if disagreement:
+            disagreements.append(disagreement)
+    return slopes, disagreements
 
 
 def _write_figures(run: RunDirectory, result: PrecisionResult) -> list[Path]:
@@ -151,6 +169,20 @@ def _write_figures(run: RunDirectory, result: PrecisionResult) -> list[Path]:
     ]
 
 
+class PlannedSitting(NamedTuple):
+    """A quantity that is to be measured without a break.
+
+    Attributes:
+        name: name under which its measurements are stored.
+        fraction: its fraction of the time.
+        measure: measures it within a budget.
+    """
+
+    name: str
+    fraction: float
+    measure: Callable[[TimeBudget], Sitting]
+
+
 class QuantityMeasurer:
     """The quantities that can be measured.
 
@@ -158,15 +190,15 @@ class QuantityMeasurer:
     smooth loss, so that theory knows how their error falls.
 
     Attributes:
-        sittings: the name of each quantity, its fraction of the time, and the function
-            that measures it within a budget.
+        problem: the attack whose scene, controls and model are measured.
+        sittings: the quantities, in the order in which they are measured.
     """
 
     def __init__(
         self, config: PrecisionConfig, problem: Problem, progress: Progress
     ) -> None:
         self._config = config
-        self._problem = problem
+        self.problem = problem
         self._progress = progress
         self._seed = seeds.stream(config.seed, "precision")
         self._is_linear = config.loss == "linear"
@@ -181,29 +213,54 @@ class QuantityMeasurer:
             self._loss = gradients.make_smooth_loss(
                 self._renderer.formation.resolution, config.seed
             )
+        self.sittings = self._plan_sittings()
 
-        # name, fraction of the time, and the function that measures it
-        self.sittings: list[tuple[str, float, Callable[[TimeBudget], Sitting]]] = []
-        if "image" in config.measured_quantities:
-            self.sittings.append(
-                ("image", TIME_FRACTIONS["image"], self._measure_image)
-            )
-        if "gradient" in config.measured_quantities:
+    def _plan_sittings(self) -> list[PlannedSitting]:
+        """Plan the sittings: the image first, then the gradient of each control.
+
+        Raises:
+            InputError: if gradients are wanted and no control has one.
+        """
+        quantities = self._config.measured_quantities
+        sittings = []
+        if "image" in quantities:
+            fraction = TIME_FRACTIONS["image"]
+            sittings.append(PlannedSitting("image", fraction, self._measure_image))
+        if "gradient" in quantities:
             parts = list_gradient_parts(
                 self._renderer.plan.groups, linear=self._is_linear
             )
             if not parts:
-                names = ",".join(config.controls)
+                names = ",".join(self._config.controls)
                 raise InputError(
                     f"`controls` {names}: has no derivative; leave "
                     "gradient out of `quantities`"
                 )
             fraction = TIME_FRACTIONS["gradient"] / len(parts)
             for part in parts:
+                name = f"gradient of {part.name}"
                 measure_part = partial(self._measure_gradient, part)
-                self.sittings.append(
-                    (f"gradient of {part.name}", fraction, measure_part)
-                )
+                sittings.append(PlannedSitting(name, fraction, measure_part))
+        return sittings
+
+    def measure_sittings(
+        self, read_or_measure: Callable[[str, Callable[[], Sitting]], Sitting]
+    ) -> Iterator[Sitting]:
+        """Yield each sitting; time that one leaves is shared among those after it.
+
+        Args:
+            read_or_measure: returns the stored sitting of a name, or calls the function
+                that measures it.
+        """
+        seconds_left = self._config.seconds
+        for number, planned in enumerate(self.sittings):
+            fraction_left = math.fsum(
+                later.fraction for later in self.sittings[number:]
+            )
+            budget = TimeBudget(seconds_left * planned.fraction / fraction_left)
+            sitting = read_or_measure(planned.name, partial(planned.measure, budget))
+            seconds_left = max(0.0, seconds_left - sitting.took)
+            yield sitting
 
     def round_up(self, point: PrecisionPoint, samples: float) -> int:
         """Return the next number of samples that a setting accepts.
@@ -233,7 +290,7 @@ class QuantityMeasurer:
 
     def _measure_image(self, budget: TimeBudget) -> Sitting:
         """Measure pictures and the model's margin on them."""
-        problem = self._problem
+        problem = self.problem
         u = problem.add_conditions(problem.domain.start)
 
         def margin(image: torch.Tensor) -> float:
@@ -263,18 +320,19 @@ class QuantityMeasurer:
             goal=self._config.error,
             round_up=self.round_up,
             or_steeper=self.may_be_steeper,
-        )[0]  # a gradient is one quantity
-        remark = None
+        )[0]  # one for each quantity, and the gradient is the only one
+        warnings = []
         if budget.seconds_left > 0.0:
-            remark = bench.check_bias(self._seed)
-        again = self._confirm(title, bench, recommended, budget)
-        warnings = [remark] if remark else []
-        took = time.perf_counter() - start_time
+            bias_warning = bench.check_bias(self._seed)
+            if bias_warning:
+                warnings.append(bias_warning)
+        confirmations = self._measure_again(title, bench, recommended, budget)
+        seconds = time.perf_counter() - start_time
         return sitting.model_copy(
-            update={"again": again, "warnings": warnings, "took": took}
+            update={"again": confirmations, "warnings": warnings, "took": seconds}
         )
 
-    def _confirm(
+    def _measure_again(
         self,
         title: str,
         bench: GradientBench,
@@ -288,37 +346,24 @@ class QuantityMeasurer:
         """
         if recommended.estimator is None or recommended.spp is None:
             return []
-        # a measured setting, with another sample count
-        similar = next(
-            setting
-            for setting in bench.settings
-            if setting.estimator == recommended.estimator
-        )
-        cost_per_sample = similar.cost / similar.spp
-        setting = replace(
-            similar, spp=recommended.spp, cost=cost_per_sample * recommended.spp
-        )
+        setting = bench.make_setting(recommended.estimator, recommended.spp)
         advance = self._begin_stage(
             f"{title}: {recommended.estimator} with {recommended.spp} samples again",
             budget,
         )
-        seed = seeds.stream(self._seed, "confirm")
         measured = measure_in_rounds(
             [setting],
             bench.measure,
             budget,
             rounds=MAX_CONFIRMATIONS,
-            seed=seed,
+            seed=seeds.stream(self._seed, "confirm"),
             on_done=lambda _: advance(),
         )
         samples = [numbers["gradient"] for numbers in measured.results[setting]]
         if len(samples) < MIN_CONFIRMATIONS:
             return []
-        return [
-            summarize_samples(
-                setting, samples, bench.reference_error(setting, "gradient")
-            )
-        ]
+        reference_error = bench.get_reference_error(setting, "gradient")
+        return [summarize_samples(setting, samples, reference_error)]
 
     def _measure_settings(
         self, title: str, bench: PictureBench | GradientBench, budget: TimeBudget
@@ -342,23 +387,10 @@ class QuantityMeasurer:
             seed=self._seed,
             on_done=lambda setting: advance(now=setting.estimator, samples=setting.spp),
         )
-        points = []
-        for setting, samples in measured.results.items():
-            # A sample has numbers for each quantity, such as "picture" and "margin".
-            for quantity in samples[0]:
-                numbers = [sample[quantity] for sample in samples]
-                points.append(
-                    summarize_samples(
-                        replace(setting, quantity=quantity),
-                        numbers,
-                        bench.reference_error(setting, quantity),
-                    )
-                )
-        left_out = _describe_skipped(title, measured)
         return Sitting(
-            points=points,
+            points=_summarize_settings(bench, measured),
             references=references,
-            left_out=left_out,
+            left_out=_describe_skipped(title, measured),
             took=time.perf_counter() - start_time,
         )
 
@@ -383,16 +415,32 @@ class QuantityMeasurer:
         return advance
 
 
-def _describe_skipped(title: str, measured: Any) -> list[str]:
+def _summarize_settings(
+    bench: PictureBench | GradientBench, measured: MeasuredRounds
+) -> list[PrecisionPoint]:
+    """Return a point for each measured setting and quantity.
+
+    A measurement has numbers for each quantity, such as "picture" and "margin".
+    """
+    points = []
+    for setting, samples in measured.results.items():
+        for quantity in samples[0]:
+            numbers = [sample[quantity] for sample in samples]
+            reference_error = bench.get_reference_error(setting, quantity)
+            quantity_setting = replace(setting, quantity=quantity)
+            points.append(summarize_samples(quantity_setting, numbers, reference_error))
+    return points
+
+
+def _describe_skipped(title: str, measured: MeasuredRounds) -> list[str]:
     """Describe which settings were not measured: a line for each estimator."""
-    skipped_counts: dict[str, list[str]] = {}
+    counts_by_estimator: dict[str, list[str]] = {}
     for setting in measured.skipped:
-        skipped_counts.setdefault(f"{title} by {setting.estimator}", []).append(
-            str(setting.spp)
-        )
+        counts = counts_by_estimator.setdefault(setting.estimator, [])
+        counts.append(str(setting.spp))
     return [
-        f"{line}: {', '.join(counts)} samples"
-        for line, counts in skipped_counts.items()
+        f"{title} by {estimator}: {', '.join(counts)} samples"
+        for estimator, counts in counts_by_estimator.items()
     ]
 
 
@@ -403,14 +451,13 @@ def group_by_line(
 
     The points of a group are in ascending order of samples.
     """
-    lines: dict[tuple[str, ...], list[PrecisionPoint]] = {}
+    groups: dict[tuple[str, ...], list[PrecisionPoint]] = {}
     for point in points:
-        lines.setdefault(
-            (point.quantity, point.control, point.family, point.estimator), []
-        ).append(point)
-    return {
-        key: sorted(line, key=lambda point: point.spp) for key, line in lines.items()
-    }
+        key = (point.quantity, point.control, point.family, point.estimator)
+        groups.setdefault(key, []).append(point)
+    for group in groups.values():
+        group.sort(key=lambda point: point.spp)
+    return groups
 
 
 def recommend_settings(
@@ -433,23 +480,28 @@ def recommend_settings(
         or_steeper: function of a point, whether its error may fall faster than that of
             independent samples; see `fit_line`.
     """
-    candidates: dict[tuple[str, ...], list[Recommended]] = {}
-    for (quantity, control, family, _), line in group_by_line(points).items():
-        quantity_candidates = candidates.setdefault((quantity, control, family), [])
-        candidate = recommend_count(line, goal, round_up, or_steeper(line[0]))
+    # one candidate for each estimator, by quantity, control and family
+    candidates: dict[tuple[str, str, str], list[Recommended]] = {}
+    for line in group_by_line(points).values():
+        first = line[0]
+        key = (first.quantity, first.control, first.family)
+        comparable = candidates.setdefault(key, [])
+        candidate = recommend_count(line, goal, round_up, or_steeper(first))
         if candidate:
-            quantity_candidates.append(candidate)
+            comparable.append(candidate)
     recommended = []
-    for (quantity, control, family), quantity_candidates in candidates.items():
+    for (quantity, control, family), comparable in candidates.items():
         best = min(
-            quantity_candidates,
-            key=lambda row: row.seconds or 0.0,
+            comparable,
+            # Every candidate has seconds, though the field may be empty.
+            key=lambda candidate: candidate.seconds or 0.0,
             default=Recommended(quantity=quantity, control=control),
         )
-        for point in confirmations:
-            is_same = (point.control, point.estimator) == (best.control, best.estimator)
-            if is_same and quantity == "gradient":
-                best = confirm_recommendation(best, point, round_up)
+        if quantity == "gradient":
+            for point in confirmations:
+                measured = (point.control, point.estimator)
+                if measured == (best.control, best.estimator):
+                    best = confirm_recommendation(best, point, round_up)
         recommended.append(best.model_copy(update={"family": family}))
     return recommended
 

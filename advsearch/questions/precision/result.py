@@ -90,21 +90,23 @@ class PrecisionConfig(DerivativeConfig):
     @field_validator("quantities", "samplers", mode="before")
     @classmethod
     def _names_from_list(cls, value: Any) -> Any:
-        return (
-            ",".join(str(part) for part in value)
-            if isinstance(value, (list, tuple))
-            else value
-        )
+        """Join a list of names by commas, which is how a string states them."""
+        if isinstance(value, (list, tuple)):
+            return ",".join(str(part) for part in value)
+        return value
 
     @field_validator("quantities", "samplers")
     @classmethod
-    def _several(cls, value: str, info: Any) -> str:
-        """Refuse lists with nothing in them, with something twice, and with names that
-        are not known.
+    def _check_names(cls, value: str, info: Any) -> str:
+        """Refuse an empty list, duplicates, and names that are not known.
+
+        Raises:
+            ValueError: for each of these.
         """
         names = settings.split_names(value)
         known = QUANTITIES if info.field_name == "quantities" else SAMPLERS
-        if not "".join(names).strip() or not set(names) <= set(known):
+        is_empty = not "".join(names).strip()
+        if is_empty or not set(names) <= set(known):
             raise ValueError("nothing, or unknown names")
         settings.check_no_duplicates(names, info.field_name)
         return value
@@ -292,48 +294,50 @@ REFERENCE_COLUMNS: Mapping[str, views.Column] = {
 
 def make_view(result: PrecisionResult) -> ShownResult:
     """Lay out a result: recommendations, errors, slopes and references."""
+    headline = make_headline(result)
+    if result.is_unfinished:
+        headline = f"It was stopped: only a part was measured. {headline}"
     machine = result.machine
     threads = " and ".join(
         f"{count} of {name}" for name, count in machine.threads.items()
     )
-    stopped = (
-        "It was stopped: only a part was measured. " if result.is_unfinished else ""
-    )
-    return ShownResult(
-        stopped + make_headline(result),
-        [
-            ResultPart(
-                "Recommended",
-                [
-                    describe_recommendation(found, result.goal)
-                    for found in result.recommendations
-                ],
-            ),
-            ResultPart(text=[READING_NOTE], only="text"),
-            *(
-                _make_error_table(quantity, result.points)
-                for quantity in ("picture", "margin", "gradient")
-            ),
-            ResultPart.make_table(
-                result.slopes,
-                SLOPE_COLUMNS,
-                title="Slopes: logarithm of the error against that of samples",
-            ),
-            ResultPart.make_table(
-                result.references,
-                REFERENCE_COLUMNS,
-                title="References, with their own errors",
-                note=READING_NOTE,
-            ),
-            ResultPart("Not measured, the time was up", result.left_out),
-        ],
-        {
-            "model": result.model,
-            "machine": f"{machine.cpu}, {machine.cores} cores, threads: {threads}",
-            "loss": result.loss,
-            "figures": ", ".join(result.figures),
-        },
-    )
+    context = {
+        "model": result.model,
+        "machine": f"{machine.cpu}, {machine.cores} cores, threads: {threads}",
+        "loss": result.loss,
+        "figures": ", ".join(result.figures),
+    }
+    return ShownResult(headline, _make_parts(result), context)
+
+
+def _make_parts(result: PrecisionResult) -> list[ResultPart]:
+    """Return the lists and tables of a result, in the order in which they are shown."""
+    recommendations = [
+        describe_recommendation(recommendation, result.goal)
+        for recommendation in result.recommendations
+    ]
+    error_tables = [
+        _make_error_table(quantity, result.points)
+        for quantity in ("picture", "margin", "gradient")
+    ]
+    return [
+        ResultPart("Recommended", recommendations),
+        # A page has this note at the table of references instead.
+        ResultPart(text=[READING_NOTE], only="text"),
+        *error_tables,
+        ResultPart.make_table(
+            result.slopes,
+            SLOPE_COLUMNS,
+            title="Slopes: logarithm of the error against that of samples",
+        ),
+        ResultPart.make_table(
+            result.references,
+            REFERENCE_COLUMNS,
+            title="References, with their own errors",
+            note=READING_NOTE,
+        ),
+        ResultPart("Not measured, the time was up", result.left_out),
+    ]
 
 
 def make_headline(result: PrecisionResult) -> str:
@@ -500,6 +504,7 @@ def _make_caption(result: PrecisionResult) -> str:
         thread = "thread" if count == 1 else "threads"
         thread_counts.append(f"{count} {name} {thread}")
     threads = ", ".join(thread_counts)
+    # Times of warm-up calls don't count: of few repeats, the last one is left.
     max_repeats = max(point.repeats for point in result.points)
     seconds = f"of the last of {max_repeats} repeats at most"
     if max_repeats > WARM_UP_CALLS + 1:
@@ -521,18 +526,28 @@ def _make_caption(result: PrecisionResult) -> str:
 def _draw_errors(
     axes: Any, points: Sequence[PrecisionPoint], result: PrecisionResult
 ) -> None:
-    """Draw the error of each estimator against seconds, with theory and the goal."""
+    """Draw the error of each estimator against seconds, with theory and the goal.
+
+    Args:
+        axes: axes of matplotlib.
+        points: points of one quantity, and of one control if it is a gradient.
+        result: result that they are part of, with the slopes and the goal.
+    """
+    quantity = points[0].quantity
+    control = points[0].control
     slopes = {
-        (slope.quantity, slope.control, slope.estimator): slope
+        slope.estimator: slope
         for slope in result.slopes
+        if (slope.quantity, slope.control) == (quantity, control)
     }
-    for number, name in enumerate(dict.fromkeys(point.estimator for point in points)):
+    estimators = dict.fromkeys(point.estimator for point in points)
+    for number, estimator in enumerate(estimators):
         line = sorted(
-            (point for point in points if point.estimator == name),
+            (point for point in points if point.estimator == estimator),
             key=lambda point: point.spp,
         )
-        slope = slopes.get((line[0].quantity, line[0].control, name))
-        _draw_line(axes, line, number, _make_label(name, slope))
+        label = _make_label(estimator, slopes.get(estimator))
+        _draw_line(axes, line, number, label)
     axes.set(
         xscale="log",
         yscale="log",
@@ -625,8 +640,8 @@ def _draw_line(
     color = COLORS[number % len(COLORS)]
     marker = MARKERS[number % len(MARKERS)]
     axes.plot(
-        [p.seconds for p in line],
-        [PERCENT * p.rms for p in line],
+        [point.seconds for point in line],
+        [PERCENT * point.rms for point in line],
         color=color,
         linewidth=1.0,
         alpha=0.55,
@@ -653,7 +668,7 @@ def _draw_point(axes: Any, point: PrecisionPoint, color: str, marker: str) -> No
     x = point.seconds
     y = PERCENT * point.rms
     lower, upper = (PERCENT * bound for bound in point.interval or (math.nan, math.nan))
-    # Neither a missing interval (NaN) nor a very wide one is drawn.
+    # Neither a missing interval (NaN) nor one of over four times the error is drawn.
     if upper < 4.0 * y:
         axes.plot([x, x], [lower, upper], color=color, linewidth=0.8, alpha=0.6)
     axes.plot(

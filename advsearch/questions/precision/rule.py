@@ -191,22 +191,16 @@ def summarize_samples(
     """
     squares = [numbers["error"] ** 2 for numbers in samples]
     mean_square = statistics.fmean(squares)
-    is_heavy = is_heavy_tailed(samples)
-    exceeds_floor = mean_square > (MIN_ERROR_RATIO * reference_error) ** 2
-    is_known = exceeds_floor and math.isfinite(mean_square) and mean_square > 0.0
+    exceeds_reference = mean_square > (MIN_ERROR_RATIO * reference_error) ** 2
+    is_known = exceeds_reference and math.isfinite(mean_square) and mean_square > 0.0
     error = math.sqrt(mean_square)
     if is_known:
         error = math.sqrt(mean_square - reference_error**2)
+    is_heavy = is_heavy_tailed(samples)
     interval = None
     if is_known and not is_heavy and len(squares) > 1:
-        # standard error of the mean square
-        standard_error = statistics.stdev(squares) / math.sqrt(len(squares))
-        factor = _interval_factor(standard_error, mean_square, len(squares))
+        factor = _interval_factor(squares, mean_square)
         interval = (error / factor, error * factor)
-    cosines = [numbers["cosine"] for numbers in samples if "cosine" in numbers]
-    cosine = None
-    if cosines and setting.quantity == "gradient":
-        cosine = statistics.fmean(cosines)
     fields: dict[str, object] = {
         "repeats": len(samples),
         "status": "ok" if is_known else "reference unusable",
@@ -214,7 +208,7 @@ def summarize_samples(
         "interval": interval,
         "reference_error": reference_error,
         "heavy_tailed": is_heavy,
-        "cosine": cosine,
+        "cosine": _average_cosine(samples) if setting.quantity == "gradient" else None,
     }
     for name in ("seconds", "wall_seconds"):
         if name in samples[0]:
@@ -222,20 +216,31 @@ def summarize_samples(
     return PrecisionPoint.of({**vars(setting), **fields})
 
 
-def _interval_factor(deviation: float, mean_square: float, count: int) -> float:
+def _average_cosine(samples: Sequence[Numbers]) -> float | None:
+    """Return the mean cosine of the measurements that have one; None without any."""
+    cosines = [numbers["cosine"] for numbers in samples if "cosine" in numbers]
+    return statistics.fmean(cosines) if cosines else None
+
+
+# upper limit of the logarithm of an interval's factor, so that exp does not overflow
+MAX_LOG_FACTOR = 50.0
+
+
+def _interval_factor(squares: Sequence[float], mean_square: float) -> float:
     """Return the factor between a root mean square and either bound of its interval.
 
     The interval is symmetric on a logarithmic scale: the root mean square is divided by
     the factor for the lower bound, and multiplied for the upper one.
 
     Args:
-        deviation: standard error of the mean square.
-        mean_square: mean square of the errors.
-        count: count of errors.
+        squares: squares of at least two measured errors.
+        mean_square: their mean.
     """
-    quantile = float(stdtrit(count - 1, (1.0 + CONFIDENCE) / 2.0))
-    # 0.5: the logarithm of a root is half as wide; 50: so that exp does not overflow.
-    return math.exp(min(50.0, quantile * (0.5 * deviation / mean_square)))
+    standard_error = statistics.stdev(squares) / math.sqrt(len(squares))
+    quantile = float(stdtrit(len(squares) - 1, (1.0 + CONFIDENCE) / 2.0))
+    # The relative error of a root is half of that of its square.
+    relative_deviation = 0.5 * standard_error / mean_square
+    return math.exp(min(MAX_LOG_FACTOR, quantile * relative_deviation))
 
 
 def is_heavy_tailed(samples: Sequence[Numbers]) -> bool:
@@ -320,14 +325,13 @@ def _agrees_with_theory(
     """
     if or_steeper is None:
         return None
-    difference = slope - MONTE_CARLO_SLOPE  # negative if steeper
+    deviation = slope - MONTE_CARLO_SLOPE  # negative if steeper, and so never too large
     if not or_steeper:
-        difference = abs(difference)
-    if difference <= SLOPE_TOLERANCE:
+        deviation = abs(deviation)
+    if deviation <= SLOPE_TOLERANCE:
         return True
-    if difference <= half_width:  # noise may be the reason
-        return None
-    return False
+    is_within_noise = deviation <= half_width
+    return None if is_within_noise else False
 
 
 def describe_disagreement(
@@ -408,16 +412,16 @@ def recommend_count(
         return None
     ordered = sorted(points, key=lambda point: point.spp)
     line = fit_line(ordered)
-    explaining_line = line if line and _explains_points(line, ordered) else None
-    if explaining_line:
-        count, basis = _solve_line(explaining_line, ordered, goal)
+    is_explained = line is not None and _explains_points(line, ordered)
+    if line and is_explained:
+        count, basis = _solve_line(line, ordered, goal)
     else:
         count, basis = _interpolate_count(ordered, goal, line, or_steeper)
     if count is None:
         return None
     spp = round_up(ordered[0], count)
-    if explaining_line:
-        error = _error_on_line(explaining_line, spp)
+    if line and is_explained:
+        error = _error_on_line(line, spp)
     else:
         error = _interpolate_error(ordered, spp, line)
     seconds = [point.seconds for point in ordered]
@@ -427,6 +431,7 @@ def recommend_count(
         goal=goal,
         estimator=ordered[0].estimator,
         spp=spp,
+        # beyond the last point, time is proportional to samples: slope 1
         seconds=_interpolate_value(ordered, spp, seconds, slope=1.0),
         error=error,
         basis=basis,
@@ -434,6 +439,7 @@ def recommend_count(
 
 
 def _error_on_line(line: PrecisionSlope, spp: float) -> float:
+    """Return the relative error that a fitted line has at a number of samples."""
     return math.exp(line.offset + line.slope * math.log(spp))
 
 
@@ -515,13 +521,15 @@ def confirm_recommendation(
         round_up: returns a sample count that the estimator accepts.
     """
     assert recommendation.goal is not None and recommendation.spp is not None
-    needed_factor = max(1.0, (point.rms / recommendation.goal) ** 2)
-    spp = round_up(point, recommendation.spp * min(MAX_EXTRAPOLATION, needed_factor))
-    factor = spp / recommendation.spp
+    needed_growth = max(1.0, (point.rms / recommendation.goal) ** 2)
+    needed_spp = recommendation.spp * min(MAX_EXTRAPOLATION, needed_growth)
+    spp = round_up(point, needed_spp)
+    # The count is rounded up: it may have grown by a little more than is needed.
+    growth = spp / recommendation.spp
     update = {
         "spp": spp,
-        "seconds": point.seconds * factor,
-        "error": point.rms / math.sqrt(factor),
+        "seconds": point.seconds * growth,
+        "error": point.rms / math.sqrt(growth),
         "basis": "confirmed",
         "repeats": point.repeats,
     }
@@ -548,16 +556,14 @@ def _interpolate_count(
         The samples, None if nothing is known of so many; and whether they are
         "measured", "interpolated" or "extrapolated".
     """
-    if ordered[-1].rms > goal:
+    indices_above = [index for index, point in enumerate(ordered) if point.rms > goal]
+    if not indices_above:
+        return float(ordered[0].spp), "measured"
+    last_above = indices_above[-1]
+    if last_above == len(ordered) - 1:
         return _extrapolate_count(ordered, goal, line, or_steeper), "extrapolated"
-    n_until_goal = 0  # points up to the last one above the goal
-    for number, point in enumerate(ordered, start=1):
-        if point.rms > goal:
-            n_until_goal = number
-    below = ordered[n_until_goal]
-    if n_until_goal == 0:
-        return float(below.spp), "measured"
-    above = ordered[n_until_goal - 1]
+    above = ordered[last_above]
+    below = ordered[last_above + 1]
     # part of the way from `above` to `below`, in logarithms
     fraction = math.log(above.rms / goal) / math.log(above.rms / below.rms)
     return above.spp * (below.spp / above.spp) ** fraction, "interpolated"

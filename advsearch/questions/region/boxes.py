@@ -19,12 +19,12 @@ MAX_PROBED = 400
 planes and noise have taken.
 """
 MIN_STEP = 1e-3  # a face does not move by less
-# fraction of the distance between the centre and an exception at which a face lies that
+# fraction of the distance between the center and an exception at which a face lies that
 # excludes it
 PULLED_IN = 0.98
 
 IsSame = Callable[[Tensor, int], bool]
-"""(u, number) -> whether the prediction at u is that of the centre; number numbers its
+"""(u, number) -> whether the prediction at u is that of the center; number numbers its
 seed.
 """
 
@@ -36,7 +36,7 @@ class GrownBox:
     Attributes:
         center: the point that it grew around (d,).
         low, high: its corners (d,).
-        same: how many of the final samples had the centre's prediction.
+        same: how many of the final samples had the center's prediction.
         samples: the final samples.
         renders: images in all.
     """
@@ -50,7 +50,7 @@ class GrownBox:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """The 95 % interval of the share of the box with the centre's prediction.
+        """The 95 % interval of the share of the box with the center's prediction.
 
         It holds for all `ATTEMPTS` together, since the last box is the one that passed
         (Bonferroni).
@@ -76,7 +76,7 @@ def grow_box(
     """Grow a box around a point, then check it with samples that nothing was fitted to.
 
     Each face in turn tries to move out by a fraction of its distance to the bound. The
-    slab that it would win is probed at random points; if all have the centre's
+    slab that it would win is probed at random points; if all have the center's
     prediction, it moves. The fraction is 1/2 at first, and halved when no face can move
     any more. Growing ends after `MAX_PROBED` images for each parameter at the latest.
 
@@ -85,18 +85,19 @@ def grow_box(
     at most; the last check counts whatever it shows.
 
     Args:
-        is_same: whether a point has the prediction of the centre.
+        is_same: whether a point has the prediction of the center.
         center: center in [0, 1] (d,).
         seed: seed of the random points.
         samples: samples of each check.
         on_check: called at the beginning of each check.
 
     Raises:
-        InputError: there are no samples, or the centre lies outside the unit box.
+        InputError: there are no samples, or the center lies outside the unit box.
     """
     if samples < 1:
         raise InputError(f"samples: expected at least 1, got {samples}")
-    if not bool(((center >= 0.0) & (center <= 1.0)).all()):
+    is_inside = bool(((center >= 0.0) & (center <= 1.0)).all())
+    if not is_inside:
         raise InputError(
             "the centre of a region has to lie inside the ranges of its parameters"
         )
@@ -107,7 +108,8 @@ def grow_box(
         on_check()
         exceptions = box.sample_exceptions(samples)
         n_exceptions = len(exceptions)
-        if n_exceptions == 0 or attempt == ATTEMPTS - 1:
+        is_last = attempt == ATTEMPTS - 1
+        if n_exceptions == 0 or is_last:
             break
         for point in exceptions:
             box.exclude(point)
@@ -139,14 +141,15 @@ class GrowingBox:
         self.n_evaluated = 0
 
     def grow(self) -> None:
-        """Move faces out while the slabs that they win have the centre's prediction."""
+        """Move faces out while the slabs that they win have the center's prediction."""
         n_faces = 2 * len(self._center)
         # A round of all faces begins only if it fits into the limit of images.
-        last_round = MAX_PROBED * len(self._center) - n_faces * PROBES
+        max_before_round = MAX_PROBED * len(self._center) - n_faces * PROBES
         fraction = 0.5
         for _ in range(LEVELS):
             has_moved = True
-            while has_moved and self.n_evaluated <= last_round:
+            while has_moved and self.n_evaluated <= max_before_round:
+                # all faces are pushed, whether or not others have moved
                 moves = [self._push(face, fraction) for face in range(n_faces)]
                 has_moved = any(moves)
             fraction /= 2.0
@@ -157,15 +160,16 @@ class GrowingBox:
         return points[[not self._evaluate(point) for point in points]]
 
     def exclude(self, point: Tensor) -> None:
-        """Move a face in, so that a point lies outside and the centre stays inside.
+        """Move a face in, so that a point lies outside and the center stays inside.
 
         It is the face that cuts off the least of the box. Points outside change
         nothing.
 
         Args:
-            point: (d,) with another prediction than the centre.
+            point: (d,) with another prediction than the center.
         """
-        if not bool(((point >= self.low) & (point <= self.high)).all()):
+        is_inside = bool(((point >= self.low) & (point <= self.high)).all())
+        if not is_inside:
             return
         width = (self.high - self.low).clamp_min(1e-12)  # not divided by 0
         # the fraction of the box that a face cuts off, of each axis (d,)
@@ -174,7 +178,7 @@ class GrowingBox:
             (self.high - point) / width,
             (point - self.low) / width,
         )
-        # No face can exclude the point along an axis where it is at the centre, which
+        # No face can exclude the point along an axis where it is at the center, which
         # stays inside.
         lost_fraction = torch.where(point == self._center, torch.inf, lost_fraction)
         axis = int(lost_fraction.argmin())
@@ -183,7 +187,7 @@ class GrowingBox:
         face[axis] = torch.lerp(self._center[axis], point[axis], PULLED_IN)
 
     def _push(self, face: int, fraction: float) -> bool:
-        """Move a face out if the slab that it wins has the centre's prediction.
+        """Move a face out if the slab that it wins has the center's prediction.
 
         It tries a fraction of the distance to the bound, or all of it if little is
         left. The slab is probed at random points, one of which is moved to the outer
@@ -199,13 +203,8 @@ class GrowingBox:
         """
         axis, is_upper = divmod(face, 2)
         distance = float(1.0 - self.high[axis]) if is_upper else float(self.low[axis])
-        if distance <= 0.0:
-            return False
-        # A fraction of so little would soon be less than a step, and the bound never
-        # reached.
-        is_close = distance < 4.0 * MIN_STEP
-        step = distance if is_close else fraction * distance
-        if step < MIN_STEP and not is_close:
+        step = _choose_step(distance, fraction)
+        if step is None:
             return False
         slab_low = self.low.clone()
         slab_high = self.high.clone()
@@ -226,9 +225,10 @@ class GrowingBox:
         return True
 
     def _evaluate(self, u: Tensor) -> bool:
-        """Return whether a point has the centre's prediction, and count it."""
+        """Return whether a point has the center's prediction, and count it."""
+        number = self.n_evaluated
         self.n_evaluated += 1
-        return self._is_same(u, self.n_evaluated - 1)
+        return self._is_same(u, number)
 
     def _sample(self, low: Tensor, high: Tensor, count: int) -> Tensor:
         """Return points (count, d) uniform in a box, other ones at every call."""
@@ -236,6 +236,23 @@ class GrowingBox:
             seeds.stream(self._seed, "region", self._n_draws)
         )
         self._n_draws += 1
-        return torch.lerp(
-            low, high, torch.rand(count, len(self._center), generator=generator)
-        )
+        unit_points = torch.rand(count, len(self._center), generator=generator)
+        return torch.lerp(low, high, unit_points)
+
+
+def _choose_step(distance: float, fraction: float) -> float | None:
+    """Return how far a face tries to move; None if it is at its bound or too near.
+
+    Args:
+        distance: distance from the face to the bound.
+        fraction: fraction of it that the face tries.
+    """
+    if distance <= 0.0:
+        return None
+    # A fraction of so little would soon be less than a step, and the bound never
+    # reached.
+    is_close = distance < 4.0 * MIN_STEP
+    if is_close:
+        return distance
+    step = fraction * distance
+    return step if step >= MIN_STEP else None

@@ -33,7 +33,7 @@ from advsearch.questions.region.result import (
 )
 
 MAX_PARAMETERS = 8  # in which a box is grown
-CENTRE_TRIALS = 20
+CENTER_TRIALS = 20  # renders of the center, which give its verdict
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,21 +43,21 @@ class VariedParameters:
     Attributes:
         names: names of the parameters.
         coordinates: their indices in u (k,).
-        centre: the configuration around which the box grows (d,).
+        center: the configuration around which the box grows (d,).
     """
 
     names: tuple[str, ...]
     coordinates: Tensor
-    centre: Tensor
+    center: Tensor
 
     @property
     def start(self) -> Tensor:
-        """Their coordinates at the centre (k,), in [0, 1]."""
-        return self.centre[self.coordinates]
+        """Their coordinates at the center (k,), in [0, 1]."""
+        return self.center[self.coordinates]
 
     def with_values(self, values: Tensor) -> Tensor:
-        """Return the centre (d,) with other coordinates (k,) of these parameters."""
-        u = self.centre.clone()
+        """Return the center (d,) with other coordinates (k,) of these parameters."""
+        u = self.center.clone()
         u[self.coordinates] = values
         return u
 
@@ -65,20 +65,13 @@ class VariedParameters:
 def find_region(context: RunContext[RegionConfig]) -> RegionResult:
     """Load the problem, grow and check the box, and draw the map.
 
-    Around an adversarial configuration, the controls have the budget of its attack.
     After an interrupt the result has no box.
     """
     config = context.config
     stages = context.stages
     stages.begin("setup", workbench.LOADING)
-    budget: dict[str, object] = {}
-    if config.around is not None:  # its centre has to lie within
-        attack_config = AttackConfig.from_yaml(
-            directory.find_run(config.around) / directory.CONFIG
-        )
-        budget = {"epsilon": attack_config.epsilon, "norm": attack_config.norm}
     problem, warnings = workbench.problem_from_config(
-        AttackConfig.from_config(config, **budget)
+        AttackConfig.from_config(config, **_read_budget(config))
     )
     for text in warnings:
         stages.progress.message(text)
@@ -89,10 +82,6 @@ def find_region(context: RunContext[RegionConfig]) -> RegionResult:
     with context.until_interrupted():
         grown = RegionSearch(context, verifier, varied).run()
     stages.end()
-    findings = verifier.state
-    transport = None
-    if findings.predictor or findings.predictor_refusal:
-        transport = findings.transport_summary
     return context.result(
         RegionResult,
         **vars(grown),
@@ -103,79 +92,115 @@ def find_region(context: RunContext[RegionConfig]) -> RegionResult:
         image_formation=problem.renderer.formation,
         clean={"moved": problem.space.adjusted_defaults},
         warnings=warnings,
-        transport=transport,
+        transport=_get_transport_summary(verifier),
         renders=count_renders(verifier),
         seconds={**stages.seconds, "total": stages.total},
     )
 
 
+def _read_budget(config: RegionConfig) -> dict[str, object]:
+    """Return the budget of the attack around whose scene the box grows.
+
+    The adversarial configuration has to lie within the ranges of the controls. Empty
+    around another configuration.
+    """
+    if config.around is None:
+        return {}
+    attack_config = AttackConfig.from_yaml(
+        directory.find_run(config.around) / directory.CONFIG
+    )
+    return {"epsilon": attack_config.epsilon, "norm": attack_config.norm}
+
+
+def _get_transport_summary(verifier: workbench.Verifier) -> Any:
+    """Return how images from new viewpoints were predicted, or why they were not.
+
+    None if no camera moves.
+    """
+    state = verifier.state
+    was_tried = state.predictor or state.predictor_refusal
+    return state.transport_summary if was_tried else None
+
+
 def count_renders(verifier: workbench.Verifier) -> dict[str, int]:
     """Return how many images were rendered, and how many predicted, if any."""
-    findings = verifier.state
-    renders = {"verification": findings.verification_renders}
-    if findings.predictor is not None:
-        renders["verification"] += findings.predictor.n_traced
-    if findings.n_predicted_trials:
-        renders["products"] = findings.n_predicted_trials
+    state = verifier.state
+    renders = {"verification": state.verification_renders}
+    if state.predictor is not None:
+        renders["verification"] += state.predictor.n_traced
+    if state.n_predicted_trials:
+        renders["products"] = state.n_predicted_trials
     return renders
 
 
 def find_varied(problem: Problem, config: RegionConfig) -> VariedParameters:
-    """Find the parameters in which the box grows, and its centre.
+    """Find the parameters in which the box grows, and its center.
 
-    These are those of `vary`, or all that are searched but discrete choices. A vector
-    has a parameter for each component, ``NAME.INDEX``.
+    They are those of `vary`, or all that are searched but discrete choices.
 
     Raises:
         UnknownNameError: `vary` names a parameter that the controls do not search.
         InputError: there are too few or too many, or `around` is a run over other
             controls.
     """
-    coordinate_of: dict[str, int] = {}  # index in u by name
-    for group in problem.space.groups:
-        if group.options:
-            continue
-        for index in range(group.size):
-            name = f"{group.name}.{index}" if group.size > 1 else group.name
-            coordinate_of[name] = group.begin + index
-    names = tuple(coordinate_of)
+    coordinate_by_name = _list_coordinates(problem)
+    names = tuple(coordinate_by_name)
     if config.vary is not None:
         names = settings.split_names(config.vary)
     for name in names:
-        if name not in coordinate_of:
-            raise errors.UnknownNameError("parameter in `vary`", name, coordinate_of)
+        if name not in coordinate_by_name:
+            raise errors.UnknownNameError(
+                "parameter in `vary`", name, coordinate_by_name
+            )
     if not 1 <= len(names) <= MAX_PARAMETERS:
         raise InputError(
             f"vary: expected 1 to {MAX_PARAMETERS} parameters, got {len(names)}; "
-            f"name some of {', '.join(coordinate_of)}"
+            f"name some of {', '.join(coordinate_by_name)}"
         )
     if config.map and len(names) != 2:
         raise InputError(
             f"map: expected two parameters in `vary`, got {len(names)}: "
             f"{', '.join(names)}"
         )
-    coordinates = torch.tensor([coordinate_of[name] for name in names])
-    return VariedParameters(names, coordinates, read_centre(problem, config))
+    coordinates = torch.tensor([coordinate_by_name[name] for name in names])
+    return VariedParameters(names, coordinates, read_center(problem, config))
 
 
-def read_centre(problem: Problem, config: RegionConfig) -> Tensor:
+def _list_coordinates(problem: Problem) -> dict[str, int]:
+    """Return the index in u of each searched parameter that is no discrete choice.
+
+    A vector has a parameter for each component, ``NAME.INDEX``.
+    """
+    coordinate_by_name: dict[str, int] = {}
+    for group in problem.space.groups:
+        is_choice = bool(group.options)
+        if is_choice:
+            continue
+        for index in range(group.size):
+            name = f"{group.name}.{index}" if group.size > 1 else group.name
+            coordinate_by_name[name] = group.begin + index
+    return coordinate_by_name
+
+
+def read_center(problem: Problem, config: RegionConfig) -> Tensor:
     """Return the configuration (d,) around which the box grows.
 
     It is the scene's own, or the adversarial one of a run.
+
+    Raises:
+        InputError: that run is over other controls.
     """
-    centre: Tensor = problem.domain.start.clone()
+    start: Tensor = problem.domain.start.clone()
     if config.around is None:
-        return centre
+        return start
     values = torch.from_numpy(
         workbench.read_configuration(directory.find_run(config.around))
     )
-    if values.shape != centre.shape:
+    if values.shape != start.shape:
         raise InputError(
             f"`around` {config.around}: expected a run over the same controls, whose "
-            "configuration has "
-            f"{problem.domain.dim} numbers, got one with {len(values)}; leave "
-            "`controls` out so that the run's own "
-            "are taken"
+            f"configuration has {problem.domain.dim} numbers, got one with "
+            f"{len(values)}; leave `controls` out so that the run's own are taken"
         )
     return problem.domain.project(values)
 
@@ -194,52 +219,57 @@ class RegionSearch:
         self._verifier = verifier
         self._varied = varied
         self._is_checking = False  # whether the box has grown
-        self._centre_verdict = False  # whether the model is wrong at the centre
+        self._is_wrong_at_center = False
 
     def run(self) -> GrownRegion:
-        """Find the verdict at the centre, grow the box, and draw the map."""
+        """Find the verdict at the center, grow the box, and draw the map."""
         config = self._config
         verifier = self._verifier
         varied = self._varied
-        verifier.choose_spp({"centre": varied.centre})
-        self._centre_verdict = find_verdict(verifier, varied.centre)
+        verifier.choose_spp({"centre": varied.center})
+        self._is_wrong_at_center = find_verdict(verifier, varied.center)
         if config.specialise:
             n_images = boxes.USUAL_PROBED * len(varied.names) + config.map**2
             workbench.prepare_surface_light(
-                verifier, varied.centre, varied.coordinates, n_images
+                verifier, varied.center, varied.coordinates, n_images
             )
-
-        spp = verifier.state.spp
-        hint = (
-            f"pictures of {spp} samples a pixel; fewer parameters in `vary` or "
-            "`verify_spp` shorten it"
-        )
-        limit = boxes.MAX_PROBED * len(varied.names)
-        verifier.stages.begin(
-            "search", "growing the box", limit, hint=hint, at_most=True
-        )
-        seed = seeds.stream(config.seed, "region")
-        grown = boxes.grow_box(
-            self._is_same,
-            varied.start,
-            seed=seed,
-            samples=config.samples,
-            on_check=self._begin_check,
-        )
+        grown = self._grow_box()
         sides = describe_box(verifier.problem, grown, varied)
         margin_map = None
         if config.map:
             margin_map = draw_map(verifier, config.map, varied, sides, self._run)
         return GrownRegion(
-            verdict="wrong" if self._centre_verdict else "right",
+            verdict="wrong" if self._is_wrong_at_center else "right",
             box=sides,
             same=grown.same,
             samples=grown.samples,
             rate=grown.same / grown.samples,
             interval=grown.interval,
             volume=grown.volume,
-            spp=spp,
+            spp=verifier.state.spp,
             map=margin_map,
+        )
+
+    def _grow_box(self) -> boxes.GrownBox:
+        """Grow the box and check it."""
+        n_parameters = len(self._varied.names)
+        hint = (
+            f"pictures of {self._verifier.state.spp} samples a pixel; fewer parameters "
+            "in `vary` or `verify_spp` shorten it"
+        )
+        self._verifier.stages.begin(
+            "search",
+            "growing the box",
+            boxes.MAX_PROBED * n_parameters,
+            hint=hint,
+            at_most=True,
+        )
+        return boxes.grow_box(
+            self._is_same,
+            self._varied.start,
+            seed=seeds.stream(self._config.seed, "region"),
+            samples=self._config.samples,
+            on_check=self._begin_check,
         )
 
     def _begin_check(self) -> None:
@@ -256,61 +286,61 @@ class RegionSearch:
         self._verifier.stages.begin("search", title, limit, hint=hint, at_most=True)
 
     def _is_same(self, values: Tensor, number: int) -> bool:
-        """Return whether the verdict at coordinates (k,) is that of the centre.
+        """Return whether the verdict at coordinates (k,) is that of the center.
 
         An image without the object, or with a prediction that is not a number, has no
-        verdict, and so not that of the centre. Images of the check are rendered, never
-        predicted.
+        verdict, and so not that of the center.
 
         Args:
             values: values of the parameters that vary.
             number: number of the point, which seeds its noise.
         """
+        # Images of the check are rendered, never predicted.
         predictor = None if self._is_checking else self._verifier.state.predictor
         u = self._varied.with_values(values)
         (trial,) = self._verifier.try_configurations(
             "region", {number: u}, has_success=False, predictor=predictor
         )
-        is_counted = not trial.prediction.is_out_of_view and not trial.is_non_finite
-        return is_counted and trial.success == self._centre_verdict
+        has_verdict = not trial.prediction.is_out_of_view and not trial.is_non_finite
+        is_wrong = trial.success
+        return has_verdict and is_wrong == self._is_wrong_at_center
 
 
-def find_verdict(verifier: workbench.Verifier, centre: Tensor) -> bool:
-    """Return whether the model is wrong at the centre.
+def find_verdict(verifier: workbench.Verifier, center: Tensor) -> bool:
+    """Return whether the model is wrong at the center.
 
     Raises:
         InputError: that depends on the noise, or predictions are not numbers, or the
             object is not in the image.
     """
-    verifier.stages.begin("verification", "looking at the centre", CENTRE_TRIALS)
+    verifier.stages.begin("verification", "looking at the centre", CENTER_TRIALS)
+    same_configurations = dict.fromkeys(range(CENTER_TRIALS), center)
     trials = list(
-        verifier.try_configurations(
-            "centre", dict.fromkeys(range(CENTRE_TRIALS), centre), has_success=False
-        )
+        verifier.try_configurations("centre", same_configurations, has_success=False)
     )
     n_hidden = sum(trial.prediction.is_out_of_view for trial in trials)
     if n_hidden:
         raise InputError(
-            f"the object is not to be seen in {n_hidden} of {CENTRE_TRIALS} trials at "
-            "the centre, so there is no "
-            "verdict; choose another centre"
+            f"the object is not to be seen in {n_hidden} of {CENTER_TRIALS} trials at "
+            "the centre, so there is no verdict; choose another centre"
         )
-    n_without_number = sum(trial.is_non_finite for trial in trials)
-    if n_without_number:
+    n_non_finite = sum(trial.is_non_finite for trial in trials)
+    if n_non_finite:
         raise InputError(
-            f"the model's prediction is not a number in {n_without_number} of "
-            f"{CENTRE_TRIALS} trials at the centre, "
-            "so there is no verdict; choose another centre, or mend the model"
+            f"the model's prediction is not a number in {n_non_finite} of "
+            f"{CENTER_TRIALS} trials at the centre, so there is no verdict; choose "
+            "another centre, or mend the model"
         )
     n_wrong = sum(trial.success for trial in trials)
-    verdict = verifier.problem.rule.decide(n_wrong, CENTRE_TRIALS)
-    if verdict is None:
+    # None if both right and wrong are too frequent for a verdict
+    is_wrong = verifier.problem.rule.decide(n_wrong, CENTER_TRIALS)
+    if is_wrong is None:
         raise InputError(
-            f"the model is wrong in {n_wrong} of {CENTRE_TRIALS} trials at the centre, "
-            "so its verdict there depends on "
-            "the noise; choose another centre, or more samples with `verify_spp`"
+            f"the model is wrong in {n_wrong} of {CENTER_TRIALS} trials at the centre, "
+            "so its verdict there depends on the noise; choose another centre, or more "
+            "samples with `verify_spp`"
         )
-    return verdict
+    return is_wrong
 
 
 def describe_box(
@@ -328,7 +358,7 @@ def describe_box(
     """
     low_values = problem.describe(varied.with_values(grown.low))
     high_values = problem.describe(varied.with_values(grown.high))
-    centre_values = problem.describe(varied.with_values(grown.center))
+    center_values = problem.describe(varied.with_values(grown.center))
     sides = []
     for index, name in enumerate(varied.names):
         described_name = name
@@ -341,7 +371,7 @@ def describe_box(
                 unit=str(low_values[described_name].get("unit", "")),
                 low=read_component(low_values[described_name], component),
                 high=read_component(high_values[described_name], component),
-                centre=read_component(centre_values[described_name], component),
+                centre=read_component(center_values[described_name], component),
             )
         else:
             side = BoxSide(
@@ -356,7 +386,12 @@ def describe_box(
 
 
 def read_component(described: Mapping[str, Any], component: str = "") -> float:
-    """Return the described value of a parameter, or one of its components."""
+    """Return the described value of a parameter, or one of its components.
+
+    Args:
+        described: has the number or the vector under "value".
+        component: index of a component as text; empty for a number.
+    """
     value = described["value"]
     return float(value[int(component)] if component else value)
 
@@ -377,25 +412,7 @@ def draw_map(
         box: its sides.
         run: where the figure is saved.
     """
-    hint = (
-        f"{size * size} pictures of {verifier.state.spp} samples a pixel; `map` "
-        "or `verify_spp` shorten it"
-    )
-    verifier.stages.begin("map", "drawing the map", size * size, hint=hint)
-    grid = torch.linspace(0.0, 1.0, size) if size > 1 else torch.tensor([0.5])
-
-    def find_configuration(number: int) -> Tensor:
-        """Return the configuration (d,) of a point, row by row from the lowest."""
-        row, column = divmod(number, size)
-        return varied.with_values(torch.stack([grid[column], grid[row]]))
-
-    predictor = verifier.state.predictor
-    trials = verifier.try_in_batches(
-        "map", size * size, find_configuration, has_success=False, predictor=predictor
-    )
-    # The score is how wrong a prediction is.
-    margins = [-trial.score for trial in trials]
-    rows = [margins[begin : begin + size] for begin in range(0, len(margins), size)]
+    rows = _measure_margins(verifier, size, varied)
     x_range, y_range = find_ranges(verifier.problem, varied, box)
 
     def draw(axes: Any) -> None:
@@ -407,6 +424,39 @@ def draw_map(
     return MarginMap(axes=(x_range, y_range), margins=rows)
 
 
+def _measure_margins(
+    verifier: workbench.Verifier, size: int, varied: VariedParameters
+) -> list[list[float]]:
+    """Return the margin on a grid over two parameters, row by row from the lowest.
+
+    Args:
+        verifier: verifier that evaluates the points.
+        size: points along each axis.
+        varied: the parameters; the first changes along a row.
+    """
+    hint = (
+        f"{size * size} pictures of {verifier.state.spp} samples a pixel; `map` "
+        "or `verify_spp` shorten it"
+    )
+    verifier.stages.begin("map", "drawing the map", size * size, hint=hint)
+    grid = torch.linspace(0.0, 1.0, size) if size > 1 else torch.tensor([0.5])
+
+    def find_configuration(number: int) -> Tensor:
+        """Return the configuration (d,) of a point."""
+        row, column = divmod(number, size)
+        return varied.with_values(torch.stack([grid[column], grid[row]]))
+
+    trials = verifier.try_in_batches(
+        "map",
+        size * size,
+        find_configuration,
+        has_success=False,
+        predictor=verifier.state.predictor,
+    )
+    margins = [-trial.score for trial in trials]  # a score is a negative margin
+    return [margins[begin : begin + size] for begin in range(0, len(margins), size)]
+
+
 def find_ranges(
     problem: Problem, varied: VariedParameters, box: Sequence[BoxSide]
 ) -> list[AxisRange]:
@@ -415,6 +465,7 @@ def find_ranges(
     high_values = problem.describe(varied.with_values(torch.full((2,), 1.0)))
     ranges = []
     for side in box:
+        # a fraction of the range, if no control describes the parameter
         low = 0.0
         high = 1.0
         if side.name in low_values:
@@ -433,12 +484,13 @@ def draw_margins(
     y_title = figures.format_axis_title(y_range.name, y_range.unit)
     figures.draw_heat_map(axes, rows, extent, figures.MARGIN, x_title, y_title)
     margins = [margin for row in rows for margin in row]
-    if min(margins) < 0.0 < max(margins):
+    has_both_verdicts = min(margins) < 0.0 < max(margins)
+    if has_both_verdicts:
         axes.contour(rows, levels=[0.0], extent=extent, colors="black", linewidths=1.0)
 
 
 def draw_outline(axes: Any, x_side: BoxSide, y_side: BoxSide) -> None:
-    """Draw the outline of the box and its centre on matplotlib axes."""
+    """Draw the outline of the box and its center on matplotlib axes."""
     x_corners = [x_side.low, x_side.high, x_side.high, x_side.low, x_side.low]
     y_corners = [y_side.low, y_side.low, y_side.high, y_side.high, y_side.low]
     axes.plot(x_corners, y_corners, color="black", linestyle="--", label="region")

@@ -156,7 +156,11 @@ def same_render(
     spp: int,
     change: ImageChange | None = None,
 ) -> ReplayCondition:
-    """Return a condition that takes the run's renders and may change the image."""
+    """Return a condition that uses the run's images as they are, or changes them.
+
+    With the samples of the run's verification they are not rendered again for it: all
+    such conditions have the same `light` and `source`.
+    """
     return ReplayCondition(
         name,
         description,
@@ -255,13 +259,12 @@ def apply_sensor(
     """Return an image (H, W, 3) as a camera's sensor records it.
 
     Args:
-        sensor_values: sensor values of the control `sensor`; all other parameters are
-            0.
+        sensor_values: values of parameters of the control `sensor`; all others are 0.
         image: sRGB in [0, 1].
         seed: seed of the sensor's noise.
     """
     control = workbench.CONTROLS["sensor"]()
-    control.chosen["seed"] = seed
+    control.chosen["seed"] = seed  # the setting of its noise
     parameters = {
         parameter.name: torch.tensor(sensor_values.get(parameter.name, 0.0))
         for parameter in control.parameters
@@ -294,8 +297,8 @@ def model_condition(
 ) -> ReplayCondition:
     """Return the condition under which another model predicts the scene.
 
-    If that takes the same images as the run's own model, it gets the run's renders,
-    which are shared by their key (`RUN_LIGHT`); else it has renders of its own.
+    If that takes the same images as the run's own model, it uses the run's images; else
+    it has renders of its own.
 
     Args:
         problem: problem of the run.
@@ -303,17 +306,18 @@ def model_condition(
         name: name of the other model.
         spp: samples per pixel.
     """
-    shared_key = name
-    if other_problem.renderer.formation == problem.renderer.formation:
-        shared_key = RUN_LIGHT
+    light: Hashable = name
+    takes_same_images = other_problem.renderer.formation == problem.renderer.formation
+    if takes_same_images:
+        light = RUN_LIGHT
         other_problem = replace(other_problem, renderer=problem.renderer)
+
+    def make_problem() -> Problem:
+        """Return a copy of the problem, as each condition has its own."""
+        return replace(other_problem)
+
     return ReplayCondition(
-        "model",
-        name,
-        make_problem=partial(replace, other_problem),  # a copy
-        spp=spp,
-        light=shared_key,
-        source=shared_key,
+        "model", name, make_problem=make_problem, spp=spp, light=light, source=light
     )
 
 
@@ -328,17 +332,20 @@ def photograph_conditions(
         parts: parts of the attack.
         folder: folder of photographs.
         spp: samples per pixel.
-        threads: other settings of the problems.
+        threads: the setting `threads` of the problems; empty to leave it.
     """
-    others, used = workbench.move_to_photographs(parts, folder)
-    if len(used) == 1:
-        used = {}
-    for method, parts_by_name in ((PHOTOGRAPH, others), (SEARCHED_PHOTOGRAPH, used)):
-        for name, moved in parts_by_name.items():
+    other_photographs, used_photographs = workbench.move_to_photographs(parts, folder)
+    if len(used_photographs) == 1:
+        used_photographs = {}
+    for method, parts_by_name in (
+        (PHOTOGRAPH, other_photographs),
+        (SEARCHED_PHOTOGRAPH, used_photographs),
+    ):
+        for name, moved_parts in parts_by_name.items():
             yield ReplayCondition(
                 method,
                 name,
-                make_problem=partial(_make_photograph_problem, moved, threads),
+                make_problem=partial(_make_photograph_problem, moved_parts, threads),
                 spp=spp,
             )
 
@@ -370,9 +377,9 @@ def replay(
         attack: one that was kept and has ended: its result, or name or folder of its
             run.
     """
+    run: str | Path | AttackResult = attack
     parts = None
     python_only = list[settings.PythonOnly]()
-    run = attack
     if isinstance(attack, AttackResult):
         if attack.run is None:
             raise InputError(
@@ -380,11 +387,7 @@ def replay(
                 "was not; give it a `run`"
             )
         run = attack.run
-        python_only = [
-            part
-            for part in directory.read_python_only(Path(run))
-            if part.role not in workbench.ROLES_IN_SEARCH
-        ]
+        python_only = _read_python_only_parts(Path(run))
         if attack.parts is not None:
             parts = attack.parts()
     config = workbench.make_config(ReplayConfig, attack=run, **options)
@@ -394,6 +397,21 @@ def replay(
         config, progress=workbench.as_progress(progress), parts=parts
     )
     return result
+
+
+def _read_python_only_parts(run: Path) -> list[settings.PythonOnly]:
+    """Read what an attack was called with that only Python can pass.
+
+    A command cannot repeat a replay of it. What only the search used is left out.
+
+    Args:
+        run: directory of the attack.
+    """
+    return [
+        part
+        for part in directory.read_python_only(run)
+        if part.role not in workbench.ROLES_IN_SEARCH
+    ]
 
 
 def run_replay(
@@ -416,12 +434,7 @@ def run_replay(
     config = context.config
     context.progress.stage(workbench.LOADING)
     attack_directory = directory.find_run(config.attack)
-    attack = workbench.load_attack_summary(attack_directory)
-    if attack.adversarial is None:
-        raise InputError(
-            f"{attack_directory}: ended with {attack.ending!r}, so that there is no "
-            "adversarial configuration to render again"
-        )
+    attack = _load_attack(attack_directory)
     settings.check_no_duplicates((RUN_MODEL, *config.models), "model")
     parts = parts or workbench.load_parts_of_run(attack_directory)
     threads = {} if config.threads is None else {"threads": config.threads}
@@ -443,9 +456,7 @@ def run_replay(
     with context.until_interrupted():
         for batch in batch_by_light(conditions, spp):
             table.fill(batch)
-    rows = [
-        table.rows[condition] for condition in conditions if condition in table.rows
-    ]
+    rows = table.list_rows(conditions)
     return context.result(
         ReplayResult,
         answer=str(attack_directory),
@@ -464,13 +475,29 @@ def run_replay(
     )
 
 
+def _load_attack(attack_directory: Path) -> workbench.AttackSummary:
+    """Load the summary of an attack.
+
+    Raises:
+        InputError: the attack has no adversarial configuration.
+        FileFormatError: the run did not end, or is not an attack.
+    """
+    attack = workbench.load_attack_summary(attack_directory)
+    if attack.adversarial is None:
+        raise InputError(
+            f"{attack_directory}: ended with {attack.ending!r}, so that there is no "
+            "adversarial configuration to render again"
+        )
+    return attack
+
+
 def verification_spp(attack: workbench.AttackSummary) -> int:
     """Return the samples per pixel that an attack was verified with."""
     if attack.sample_count:
         return attack.sample_count.spp
     if attack.verified:
         return attack.verified.spp
-    return DEFAULT_SPP
+    return DEFAULT_SPP  # it was not verified
 
 
 def select_conditions(
@@ -507,15 +534,20 @@ def batch_by_light(
 ) -> list[list[ReplayCondition]]:
     """Put the conditions that share the run's renders into the first batch.
 
-    These have its light and its samples per pixel. Every other condition is a batch by
-    itself.
+    Every other condition is a batch by itself.
+
+    Args:
+        conditions: the conditions.
+        spp: samples per pixel of the run's verification.
     """
-    shared = [
-        condition
-        for condition in conditions
-        if condition.light == RUN_LIGHT and condition.spp == spp
-    ]
-    single = [[condition] for condition in conditions if condition not in shared]
+    shared = []
+    single = []
+    for condition in conditions:
+        uses_run_renders = condition.light == RUN_LIGHT and condition.spp == spp
+        if uses_run_renders:
+            shared.append(condition)
+        else:
+            single.append([condition])
     return [shared, *single]
 
 
@@ -553,12 +585,19 @@ class _Table:
             if condition.unavailable_reason
         ]
         if reasons:
+            # It is a batch by itself: conditions that share renders are available.
             self._add_not_done(conditions, reasons[0])
             return
         try:
             self._render(conditions)
         except BlenderError as error:
             self._add_not_done(conditions, str(error))
+
+    def list_rows(self, conditions: Sequence[ReplayCondition]) -> list[ReplayRow]:
+        """Return the rows in the order of conditions; an interrupted run lacks some."""
+        return [
+            self.rows[condition] for condition in conditions if condition in self.rows
+        ]
 
     def _add_not_done(self, conditions: Sequence[ReplayCondition], reason: str) -> None:
         """Add rows of conditions that were not rendered, with the reason."""
@@ -583,26 +622,28 @@ class _Table:
             2 * self.trials * len(conditions),
             hint="`trials` or `ways` shorten it",
         )
-        retrial_of = {condition: condition.to_retrial() for condition in conditions}
-        # each renderer once, though conditions share it
+        retrial_of_condition = {
+            condition: condition.to_retrial() for condition in conditions
+        }
+        # conditions may share a renderer, which counts once
         renderer_by_id = {
             id(retrial.problem.renderer): retrial.problem.renderer
-            for retrial in retrial_of.values()
+            for retrial in retrial_of_condition.values()
         }
         renderers = list(renderer_by_id.values())
         renders_before = sum(renderer.renders for renderer in renderers)
         try:
-            self._add_trials(retrial_of)
+            self._add_trials(retrial_of_condition)
         finally:
             renders_after = sum(renderer.renders for renderer in renderers)
             self.renders += renders_after - renders_before
 
     def _add_trials(
-        self, retrial_of: Mapping[ReplayCondition, workbench.RetrialCondition]
+        self, retrial_of_condition: Mapping[ReplayCondition, workbench.RetrialCondition]
     ) -> None:
         """Try the clean scene under all conditions, then the adversarial one."""
         retrials = workbench.Retrials(
-            list(retrial_of.values()),
+            list(retrial_of_condition.values()),
             self.run,
             self.progress,
             trials=self.trials,
@@ -612,9 +653,10 @@ class _Table:
             condition: workbench.make_control_group(
                 retrials.try_clean(retrial), retrial.spp
             )
-            for condition, retrial in retrial_of.items()
+            for condition, retrial in retrial_of_condition.items()
         }
-        for condition, retrial in retrial_of.items():
+        for condition, retrial in retrial_of_condition.items():
+            # "answer" is the kind of the stored rows
             verification = retrials.try_adversarial("answer", self.u, retrial)
             self.rows[condition] = ReplayRow(
                 way=condition.name,

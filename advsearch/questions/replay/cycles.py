@@ -208,6 +208,7 @@ class Cycles:
         max_depth: int,
         denoise: bool,
     ) -> None:
+        """Find Blender, and check the scene; no process is started yet."""
         try:
             self._command = workbench.find_blender(
                 "Blender's Cycles has to render it", "leave `ways=blender` out"
@@ -241,7 +242,7 @@ class Cycles:
             torch.equal(self._inputs[name], inputs[name]) for name in inputs
         )
         if self._process is None or not is_same_scene:
-            self._process = None
+            self._process = None  # which ends Blender before it starts again
             self._process = _Process(self._command, *self._export(inputs))
             self._inputs = {
                 name: value.detach().clone() for name, value in inputs.items()
@@ -282,13 +283,34 @@ class Cycles:
     ) -> dict[str, object]:
         """Return what `RENDER_SCRIPT` reads: image size, camera, lamps, environment.
 
-        Angles are in radians; the shift of the camera is a fraction of the longer side
-        of the image.
-
         Args:
             values: the scene's inputs; what is missing is as the scene has it.
             width, height: width and height of the image, pixels.
             has_environment: whether an environment map lights the scene.
+        """
+        scene = self._description
+        # Blender's environment maps begin a quarter of a turn from ours.
+        turn = math.pi / 2.0 - math.radians(scene.get_number("environment.rotation"))
+        return {
+            "width": width,
+            "height": height,
+            **self._make_camera_settings(values, width, height),
+            "lamps": _describe_lamps(scene, values),
+            "environment": has_environment,
+            "turn": turn,
+            "strength": 2.0 ** scene.get_number("environment.exposure"),
+            # A path of two segments has none: light, surface, camera.
+            "bounces": max(0, self._depth - 2),
+            "denoise": self._denoise,
+        }
+
+    def _make_camera_settings(
+        self, values: Mapping[str, Tensor], width: int, height: int
+    ) -> dict[str, object]:
+        """Return the camera for `RENDER_SCRIPT`.
+
+        Its angle is in radians; its shift is a fraction of the longer side of the
+        image, and upwards, while ours is a fraction of each side, and downwards.
         """
         scene = self._description
         to_world = values.get(
@@ -301,22 +323,11 @@ class Cycles:
         shift_x = float(values.get("camera.shift_x", torch.zeros(1))[0])
         shift_y = float(values.get("camera.shift_y", torch.zeros(1))[0])
         longer_side = max(width, height)
-        blender_settings: dict[str, object] = {
-            "width": width,
-            "height": height,
+        return {
             "camera": (to_world.double().numpy() @ TO_BLENDER_CAMERA).tolist(),
             "fov": math.radians(fov),
             "shift": [shift_x * width / longer_side, -shift_y * height / longer_side],
-            "lamps": _describe_lamps(scene, values),
-            "environment": has_environment,
-            "turn": math.pi / 2.0
-            - math.radians(scene.get_number("environment.rotation")),
-            "strength": 2.0 ** scene.get_number("environment.exposure"),
-            # A path of two segments has none: light, surface, camera.
-            "bounces": max(0, self._depth - 2),
-            "denoise": self._denoise,
         }
-        return blender_settings
 
 
 def _find_unsupported(description: SceneDescription) -> list[str]:
@@ -344,6 +355,10 @@ def _describe_lamps(
 
     Each has a "color", linear radiance or intensity; and either "ball", the matrix
     (4, 4) of a unit sphere, or None and "to_world", that of a point.
+
+    Args:
+        scene: the scene.
+        values: the scene's inputs; what is missing is as the scene has it.
     """
     lamps: list[dict[str, object]] = []
     for lamp in scene.lamps.values():
@@ -360,7 +375,8 @@ def _describe_lamps(
             position = values.get(f"{lamp.name}.position", torch.tensor(lamp.position))
             to_world[:3, 3] = position.numpy()
             color = values.get(f"{lamp.name}.intensity", torch.tensor(lamp.intensity))
-        if bool((color > 0.0).any()):
+        is_on = bool((color > 0.0).any())
+        if is_on:
             lamps.append(
                 {"ball": ball, "to_world": to_world.tolist(), "color": color.tolist()}
             )
@@ -396,16 +412,18 @@ def _make_ground(
     """
     photograph = scene.photograph
     if photograph is not None:
-        base = photograph.base_color if reflectance is None else reflectance
-        texture = color.linear_to_srgb(base.clamp(0.0, 1.0)).numpy()
+        base_color = photograph.base_color if reflectance is None else reflectance
+        texture = color.linear_to_srgb(base_color.clamp(0.0, 1.0)).numpy()
         return [assets.Shape("ground", photograph.mesh, texture, MATT)]
 
     half_size = np.float32(scene.get_number("ground.size") / 2.0)
-    if half_size <= 0.0 or workbench.is_paved(scene):
+    has_ground = half_size > 0.0 and not workbench.is_paved(scene)
+    if not has_ground:
         return []
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
     faces = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
     normals = np.tile(np.array([[0, 0, 1]], np.float32), (4, 1))
+    # from 0 to 1 where the corners are at -1 and 1
     texture_coordinates = corners[:, :2] * np.float32(0.5) + np.float32(0.5)
     mesh = assets.Mesh(corners * half_size, faces, normals, texture_coordinates)
     texture = np.full((1, 1, 3), scene.ground_color, np.float32)
@@ -417,7 +435,7 @@ class _Process:
 
     Args:
         program: the command that starts Blender with a script.
-        blender_settings: blender settings for `RENDER_SCRIPT`.
+        blender_settings: what `RENDER_SCRIPT` reads as JSON.
         meshes: the scene as glTF.
         radiance: radiance of the environment, linear (H, W, 3); None without.
 
@@ -434,22 +452,41 @@ class _Process:
     ) -> None:
         self._temporary = tempfile.TemporaryDirectory(prefix="advsearch-cycles-")
         self._directory = Path(self._temporary.name)
+        self._log = self._directory / "log.txt"
         self._n_images = 0
-        script = self._directory / "render.py"
+        self._write_scene(blender_settings, meshes, radiance)
+        self._process = self._start(program)
+        # Blender runs until this object is collected or Python exits.
+        weakref.finalize(self, _stop, self._process, self._temporary)
+
+    def _write_scene(
+        self,
+        blender_settings: dict[str, object],
+        meshes: bytes,
+        radiance: np.ndarray | None,
+    ) -> None:
+        """Write the files that the script reads, and the script itself."""
         settings_text = json.dumps(blender_settings)
         (self._directory / "scene.json").write_text(settings_text, "utf-8")
         (self._directory / "scene.glb").write_bytes(meshes)
-        script.write_text(RENDER_SCRIPT, "utf-8")
+        (self._directory / "render.py").write_text(RENDER_SCRIPT, "utf-8")
         if radiance is not None:
             with OpenEXR.File({}, {"RGB": np.ascontiguousarray(radiance)}) as image:
                 image.write(str(self._directory / "environment.exr"))
+
+    def _start(self, program: list[str]) -> subprocess.Popen[bytes]:
+        """Start Blender with the script.
+
+        Raises:
+            BlenderError: Blender can't be started.
+        """
+        script = self._directory / "render.py"
         # Blender takes the arguments after "--" as the script's; Python needs none.
         # "-I" marks a Python with the module bpy in place of the program Blender.
         separator = [] if "-I" in program else ["--"]
-        self._log = self._directory / "log.txt"
         with self._log.open("wb") as log:
             try:
-                self._process = subprocess.Popen(
+                return subprocess.Popen(
                     [*program, str(script), *separator, str(self._directory)],
                     cwd=self._directory,
                     env=workbench.make_environment(str(self._directory)),
@@ -461,13 +498,9 @@ class _Process:
                 raise BlenderError(
                     f"Blender can't be started ({error.strerror}); check {program[0]}"
                 ) from error
-        # Blender runs until this object is collected or Python exits.
-        weakref.finalize(self, _stop, self._process, self._temporary)
 
     def render(self, seed: int, spp: int) -> Tensor:
         """Render one image with its own noise, linear (H, W, 3).
-
-        Blender writes the file of the image under its final name when it is complete.
 
         Raises:
             BlenderError: Blender stopped, or took too long.
@@ -482,9 +515,11 @@ class _Process:
             self._process.stdin.flush()
         except OSError:
             pass  # Blender has stopped, which is reported below
+        # Blender writes the file under its final name when it is complete.
         while not path.is_file():
+            has_stopped = self._process.poll() is not None
             # It may have written the file just before it stopped.
-            if self._process.poll() is not None and not path.is_file():
+            if has_stopped and not path.is_file():
                 log = self._log.read_text("utf-8", "replace")
                 raise BlenderError(f"Blender stopped{workbench.get_last_line(log)}")
             if time.monotonic() > deadline:
@@ -493,7 +528,8 @@ class _Process:
                 )
             time.sleep(POLL_INTERVAL)
         with OpenEXR.File(str(path)) as image:
-            pixels = next(iter(image.channels().values())).pixels
+            channels = image.channels().values()
+            pixels = next(iter(channels)).pixels  # RGB, perhaps with alpha
             radiance = torch.from_numpy(np.array(pixels[..., :3], dtype=np.float32))
         path.unlink()
         return radiance

@@ -234,7 +234,7 @@ def count_transfer(
 
     Args:
         table: all rows.
-        method: the `way` of the rows that count.
+        method: `PHOTOGRAPH` or `SEARCHED_PHOTOGRAPH`, the `way` of the rows that count.
     """
     rows = [row for row in table if row.way == method and row.ending != NOT_DONE]
     if not rows:
@@ -305,49 +305,44 @@ def make_cells(row: ReplayRow) -> list[str]:
 
 
 def make_replay_claims(result: ReplayResult) -> Iterator[views.Claim]:
-    """Yield a claim for each condition."""
+    """Yield a claim for each condition, and one over the photographs."""
+    run_name = PurePath(result.answer).name
     for row in result.table:
-        name = f"the adversarial scene of {PurePath(result.answer).name}, {row.way}"
+        name = f"the adversarial scene of {run_name}, {row.way}"
         if row.way != row.condition:
             name += f": {row.condition}"
         yield views.Claim.from_case(name, row.ending, row.verified)
     transfer = result.transfer
-    if transfer is not None and transfer.rate is not None:
-        extent = results.Extent.from_count(
-            "photographs in which the clean scene is right and the adversarial one holds",
-            transfer.holding,
-            transfer.clean_right,
-            transfer.rate.interval,
-        )
-        yield views.Claim(
-            kind="measured", statement=describe_transfer(transfer), extent=extent
-        )
+    if transfer is None or transfer.rate is None:
+        return
+    extent = results.Extent.from_count(
+        "photographs in which the clean scene is right and the adversarial one holds",
+        transfer.holding,
+        transfer.clean_right,
+        transfer.rate.interval,
+    )
+    yield views.Claim(
+        kind="measured", statement=describe_transfer(transfer), extent=extent
+    )
 
 
 def summarize_replay(result: ReplayResult) -> str:
-    """Summarise in words under which conditions the adversarial scene holds."""
+    """Summarize in words under which conditions the adversarial scene holds."""
     if all(row.ending == NOT_DONE for row in result.table):
         return "Nothing was rendered again."
+    unchanged, *other_rows = result.table
     changed = [
         row
-        for row in result.table[1:]
+        for row in other_rows
         if row.ending != NOT_DONE and row.way not in (PHOTOGRAPH, SEARCHED_PHOTOGRAPH)
     ]
-    unchanged_status = result.table[0].ending  # the first row changes nothing
-    unchanged_text = "does not hold"
-    if unchanged_status == HOLDS:
-        unchanged_text = "holds"
-    elif unchanged_status == NOT_DONE:
-        unchanged_text = "was not rendered"
-    changed_text = "no change was rendered"
+    text = f"As verified, the adversarial scene {_describe_unchanged(unchanged)}"
+    has_photographs = result.transfer is not None or result.searched is not None
     if changed:
         n_holding = sum(row.ending == HOLDS for row in changed)
-        changed_text = (
-            f"changed, it holds under {n_holding} of {len(changed)} conditions"
-        )
-    text = f"As verified, the adversarial scene {unchanged_text}"
-    if changed or (result.transfer is None and result.searched is None):
-        text += f"; {changed_text}"
+        text += f"; changed, it holds under {n_holding} of {len(changed)} conditions"
+    elif not has_photographs:
+        text += "; no change was rendered"
     text += "."
     if result.transfer is not None:
         text += f" {describe_transfer(result.transfer)}"
@@ -358,3 +353,10 @@ def summarize_replay(result: ReplayResult) -> str:
         names = ", ".join(f"{row.way}: {row.condition}" for row in clean_wrong)
         text += f" The clean scene itself fails under {names}, where it says nothing."
     return text
+
+
+def _describe_unchanged(row: ReplayRow) -> str:
+    """Describe whether the scene holds under the condition that changes nothing."""
+    if row.ending == HOLDS:
+        return "holds"
+    return "was not rendered" if row.ending == NOT_DONE else "does not hold"

@@ -89,41 +89,60 @@ def make_empty_claim(reason: str) -> views.Claim:
     )
 
 
+# the interval of a fraction of which nothing is known
+UNKNOWN_FRACTION = (0.0, 1.0)
+
+
 def count_conditions(
     result: results.Result, photographs: Sequence[Any] | None = None
 ) -> list[ConditionShare]:
     """Count right predictions by each value of each axis of a sweep.
 
     Given the rows of photographs, count instead how many of them agree with the
-    rendering that they are aligned with: right in both or wrong in both.
+    rendering that they are aligned with: right in both or wrong in both. Values
+    without anything that was counted are left out; other results have no axes.
     """
+    if not is_sweep(result):
+        return []
     conditions = []
-    for row in result.axes if is_sweep(result) else ():
-        right = row.correct
-        total = row.configurations
-        # a single draw has no interval
-        interval: tuple[float, float] | None = row.interval or (0.0, 1.0)
-        if photographs is not None:
+    for row in result.axes:
+        if photographs is None:
+            right = row.correct
+            total = row.configurations
+            # a single draw has no interval
+            interval = row.interval or UNKNOWN_FRACTION
+        else:
             right, total = _count_agreeing(photographs, row.axis, row.value)
-            interval = None
+            interval = UNKNOWN_FRACTION
             if total:
                 interval = statistics.intervals.clopper_pearson(right, total)
-        if not total or interval is None:
-            continue
-        bounds = row.value if isinstance(row.value, tuple) else (row.value,)
-        value = " to ".join(map(wording.format_number, bounds))
-        unit = "" if row.unit == "1" else row.unit
-        conditions.append(
-            ConditionShare(
-                condition=f"{row.axis} {value} {unit}".strip(),
-                axis=row.axis,
-                value=value,
-                right=right,
-                total=total,
-                interval=interval,
-            )
-        )
+        if total:
+            conditions.append(_make_condition(row, right, total, interval))
     return conditions
+
+
+def _make_condition(
+    row: Any, right: int, total: int, interval: results.Interval
+) -> ConditionShare:
+    """Return how many are right where an axis has a value.
+
+    Args:
+        row: row of a sweep about that value of the axis.
+        right: how many are right, or agree.
+        total: how many were counted.
+        interval: 95 % interval of the fraction.
+    """
+    bounds = row.value if isinstance(row.value, tuple) else (row.value,)
+    value = " to ".join(map(wording.format_number, bounds))
+    unit = "" if row.unit == "1" else row.unit  # "1": a number without a unit
+    return ConditionShare(
+        condition=f"{row.axis} {value} {unit}".strip(),
+        axis=row.axis,
+        value=value,
+        right=right,
+        total=total,
+        interval=interval,
+    )
 
 
 def _count_agreeing(
@@ -177,14 +196,15 @@ def evaluate_criterion(criterion: float, interval: results.Interval) -> str:
 def find_selected_axes(result: results.Result) -> list[str]:
     """Return the axes of a sweep with several values that somebody chose.
 
-    They are not sampled, so that a fraction over them depends on the choice.
+    They are not sampled, so that a fraction over them depends on the choice. Models and
+    answers are no conditions, and are left out.
     """
-    counts = Counter[str]()
+    n_values = Counter[str]()
     if is_sweep(result):
-        counts.update(row.axis for row in result.axes if row.axis not in result.drawn)
+        n_values.update(row.axis for row in result.axes if row.axis not in result.drawn)
     return [
         axis
-        for axis, count in counts.items()
+        for axis, count in n_values.items()
         if count > 1 and axis not in ("model", "answer")
     ]
 
@@ -210,21 +230,13 @@ def describe_criterion(
     verdict_of_condition = {
         row.condition: evaluate_criterion(criterion, row.interval) for row in conditions
     }
-    lines = []
-    if selected_axes and conditions:
-        counts = Counter(verdict_of_condition.values())
-        lines.append(
-            f"At least {wording.percent(criterion)}, each condition by its own 95 % "
-            f"interval: met in {counts['met']}, "
-            f"not met in {counts['not met']} and open in {counts['open']} of "
-            f"{len(verdict_of_condition)}. There is no verdict over "
-            f"all: the values of {', '.join(selected_axes)} were chosen."
-        )
-    else:
-        lines += _criterion_of_claims(claims, criterion, selected_axes)
     listed_verdicts = ["not met"]
     if selected_axes:
         listed_verdicts.append("open")
+    if selected_axes and conditions:
+        lines = [_count_verdicts(verdict_of_condition, criterion, selected_axes)]
+    else:
+        lines = _criterion_of_claims(claims, criterion, selected_axes)
     for listed in listed_verdicts:
         names = [
             condition
@@ -234,6 +246,22 @@ def describe_criterion(
         if names:
             lines.append(f"{listed.capitalize()} where: {', '.join(names)}.")
     return lines
+
+
+def _count_verdicts(
+    verdict_of_condition: Mapping[str, str],
+    criterion: float,
+    selected_axes: Sequence[str],
+) -> str:
+    """Describe in how many conditions a criterion is met, not met, or open."""
+    counts = Counter(verdict_of_condition.values())
+    return (
+        f"At least {wording.percent(criterion)}, each condition by its own 95 % "
+        f"interval: met in {counts['met']}, "
+        f"not met in {counts['not met']} and open in {counts['open']} of "
+        f"{len(verdict_of_condition)}. There is no verdict over "
+        f"all: the values of {', '.join(selected_axes)} were chosen."
+    )
 
 
 def _criterion_of_claims(
@@ -249,17 +277,23 @@ def _criterion_of_claims(
     lines = []
     for claim in claims:
         extent = claim.extent
-        if extent is None:
-            continue
-        if "right" in extent.what or "held-out" in extent.what:
+        if extent is not None and _counts_right_predictions(extent):
+            verdict = evaluate_criterion(criterion, extent.interval)
             lines.append(
                 f"At least {wording.percent(criterion)}: "
-                f"{evaluate_criterion(criterion, extent.interval)} by {extent.count} "
-                "of "
-                f"{extent.total} {extent.what}, 95 % interval "
-                f"{wording.format_interval(extent.interval)}.{remark}"
+                f"{verdict} by {extent.count} of {extent.total} {extent.what}, "
+                f"95 % interval {wording.format_interval(extent.interval)}.{remark}"
             )
     return lines
+
+
+def _counts_right_predictions(extent: results.Extent) -> bool:
+    """Return whether an extent counts right predictions, by its words.
+
+    All claims about these have "right" in them, but for those of `harden`, which are
+    about "held-out scenes".
+    """
+    return "right" in extent.what or "held-out" in extent.what
 
 
 def read_exposure(path: str) -> dict[str, dict[str, float]]:
@@ -270,26 +304,31 @@ def read_exposure(path: str) -> dict[str, dict[str, float]]:
     """
     exposure: dict[str, dict[str, float]] = {}
     for axis, weights in settings.read_yaml(path).items():
+        where = f"exposure: {path}: {axis}"
         if not isinstance(weights, Mapping) or not weights:
             raise InputError(
-                f"exposure: {path}: {axis}: expected values with a weight "
-                f"each, such as {{street: 0.8}}"
+                f"{where}: expected values with a weight each, such as {{street: 0.8}}"
             )
         for value, weight in weights.items():
-            is_number = isinstance(weight, (int, float)) and not isinstance(
-                weight, bool
-            )
-            if not is_number or not 0.0 <= weight <= 1e9:
+            if not _is_weight(weight):
                 raise InputError(
-                    f"exposure: {path}: {axis}: {value}: expected a "
-                    f"number of at least 0, got {weight!r}"
+                    f"{where}: {value}: expected a number of at least 0, got {weight!r}"
                 )
         exposure[str(axis)] = {
             str(value): float(weight) for value, weight in weights.items()
         }
         if sum(exposure[str(axis)].values()) <= 0.0:
-            raise InputError(f"exposure: {path}: {axis}: expected a weight over 0")
+            raise InputError(f"{where}: expected a weight over 0")
     return exposure
+
+
+def _is_weight(value: Any) -> bool:
+    """Return whether a value read from YAML is a weight: a number of 0 to 1e9.
+
+    Booleans are numbers in Python, but no weights.
+    """
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return is_number and bool(0.0 <= value <= 1e9)
 
 
 def describe_exposure(
@@ -304,6 +343,7 @@ def describe_exposure(
         UnknownNameError: if a weighted value is none of its axis.
     """
     lines = []
+    # Predictions that share a draw, as frames of a drive do, are not independent.
     is_independent = is_sweep(result) and result.units is None
     for axis, weights in exposure.items():
         rows = {row.value: row for row in conditions if row.axis == axis}
@@ -314,23 +354,36 @@ def describe_exposure(
                 raise errors.UnknownNameError(
                     f"value of {axis} in the exposure", value, rows
                 )
-        if not is_independent:
+        if is_independent:
+            lines.append(_describe_weighted(axis, rows, weights))
+        else:
             lines.append(
                 f"Weighted by {axis}: not told, as predictions share draws "
                 "(frames of a drive do)."
             )
-            continue
-        mean, lower, upper = _weighted_mean(rows, weights)
-        total = sum(weights.values())
-        fractions = ", ".join(
-            f"{value} {wording.percent(weight / total)}"
-            for value, weight in weights.items()
-        )
-        lines.append(
-            f"Weighted by {axis} ({fractions}): right in {wording.percent(mean)}, "
-            f"95 % interval {wording.format_interval((lower, upper))}."
-        )
     return lines
+
+
+def _describe_weighted(
+    axis: str, rows: Mapping[str, ConditionShare], weights: Mapping[str, float]
+) -> str:
+    """Describe the weighted fraction of right predictions over the values of an axis.
+
+    Args:
+        axis: name of the axis.
+        rows: counts of right predictions by value.
+        weights: weights by value; they need not add up to 1.
+    """
+    mean, lower, upper = _weighted_mean(rows, weights)
+    total = sum(weights.values())
+    fractions = ", ".join(
+        f"{value} {wording.percent(weight / total)}"
+        for value, weight in weights.items()
+    )
+    return (
+        f"Weighted by {axis} ({fractions}): right in {wording.percent(mean)}, "
+        f"95 % interval {wording.format_interval((lower, upper))}."
+    )
 
 
 def _weighted_mean(
@@ -408,13 +461,8 @@ def describe_domain(
         varied = [line for line in searched if find_domain_part(line) == part]
         if not varied:
             varied = [name for name in controls if find_domain_part(name) == part]
-        drives = getattr(result, "drives", None) or []
-        if part == "ways and speeds" and drives:
-            drive = drives[0]
-            varied.append(
-                f"{drive.drives} drives of {drive.seconds:g} s, "
-                f"{drive.frames} frames each"
-            )
+        if part == "ways and speeds":
+            varied += _describe_drives(result)
         fixed_text = "; ".join(filter(None, fixed[part]))
         if varied:
             domain[part] = DomainPart(Variation.VARIED, "; ".join(varied))
@@ -422,11 +470,22 @@ def describe_domain(
             domain[part] = DomainPart(Variation.FIXED, fixed_text)
     if domain["place"].variation is Variation.VARIED:
         for part in ("light", "weather"):
+            description = domain[part].description
             if domain[part].variation is Variation.FIXED:
-                domain[part] = domain[part]._replace(
-                    variation=Variation.WITH_ENVIRONMENT
-                )
+                domain[part] = DomainPart(Variation.WITH_ENVIRONMENT, description)
     return domain
+
+
+def _describe_drives(result: results.Result) -> list[str]:
+    """Describe how many drives a sweep was over; nothing if it was over none.
+
+    A sweep has a row about drives for each model, and all have the same drives.
+    """
+    rows = getattr(result, "drives", None) or []
+    return [
+        f"{row.drives} drives of {row.seconds:g} s, {row.frames} frames each"
+        for row in rows[:1]
+    ]
 
 
 def _fixed_domain(
@@ -447,14 +506,14 @@ def _fixed_domain(
     fixed["road users and things"].append("; ".join(filter(None, things)))
     fixed["camera and picture"].append(join_values(recorded, "camera"))
     fixed["camera and picture"].append(join_values(recorded, "backdrop"))
-    # each value once
-    values = dict[tuple[str, str], None]()
+    # a dictionary without values, as a set in order: each pair once
+    parameters = dict[tuple[str, str], None]()
     for run_settings in recorded:
         fixed_values = run_settings.values.get("set")
         if isinstance(fixed_values, Mapping):
             for name, value in fixed_values.items():
-                values[str(name), str(value)] = None
-    for name, value in values:
+                parameters[str(name), str(value)] = None
+    for name, value in parameters:
         fixed[find_domain_part(name)].append(f"{name} {value}")
     return fixed
 
@@ -501,19 +560,20 @@ def collect_claims(result: results.Result) -> list[views.Claim]:
     """Return the claims of a run; a run without any has a reason."""
     if result.is_unfinished:
         is_running = getattr(result, "ending", "") == results.RUNNING
-        reason = f"the run {'is running' if is_running else 'is not finished'}"
+        reason = "the run is running" if is_running else "the run is not finished"
         if result.brief:
             reason += f"; so far: {result.brief}"
         return [make_empty_claim(reason)]
-    read_claims = workbench.get_experiment(result.command).claims
-    if not read_claims:
+    # the function of the command's experiment that makes claims of a result
+    make_claims = workbench.get_experiment(result.command).claims
+    if not make_claims:
         return [
             make_empty_claim(
                 f"the command {result.command} does not measure how often a model is "
                 "right"
             )
         ]
-    return list(read_claims(result)) or [
+    return list(make_claims(result)) or [
         make_empty_claim("nothing in this run came to its end")
     ]
 
@@ -599,12 +659,7 @@ def describe_run(
         versions: versions and digests that it noted.
     """
     run_settings = recorded[0].values if recorded else {}
-    values = {field: getattr(result, field) for field in type(result).model_fields}
-    renders = values.get("renders")
-    renders_text = "those of its parts" if renders is None else str(renders)
-    if isinstance(renders, Mapping):
-        counts = [f"{number} {name}" for name, number in renders.items() if number]
-        renders_text = ", ".join(counts) or "none"
+    values = _get_fields(result)
     seconds = values.get("seconds") or {}
     setting_texts = dict[str, str]()
     for source_settings in recorded:
@@ -620,7 +675,7 @@ def describe_run(
         excluded=_describe_excluded(result, claims),
         settings=setting_texts,
         cost={
-            "Renders": renders_text,
+            "Renders": _format_renders(values.get("renders")),
             "Time": wording.format_seconds(seconds.get("total")),
         },
         made_with=dict(versions) or {"versions and files": NOT_NOTED},
@@ -628,35 +683,46 @@ def describe_run(
     )
 
 
+def _get_fields(result: results.Result) -> dict[str, Any]:
+    """Return the fields of a result by name, without its properties."""
+    return {field: getattr(result, field) for field in type(result).model_fields}
+
+
+def _format_renders(renders: int | Mapping[str, int] | None) -> str:
+    """Format how many renders a run took.
+
+    Results state a number, or a number for each purpose. Those without either were made
+    from other runs.
+    """
+    if renders is None:
+        return "those of its parts"
+    if isinstance(renders, Mapping):
+        counts = [
+            f"{number} {purpose}" for purpose, number in renders.items() if number
+        ]
+        return ", ".join(counts) or "none"
+    return str(renders)
+
+
 def _describe_subject(
     result: results.Result, recorded: Sequence[RecordedSettings]
 ) -> dict[str, str]:
     """Return object, environment, model, task and what counts as right, by name.
 
-    An environment that a control varied is marked as such. What is not known is left
-    out.
+    What is not known is left out.
 
     Args:
         result: result of the run.
         recorded: the settings that it recorded, its own first.
     """
-    values = {field: getattr(result, field) for field in type(result).model_fields}
+    values = _get_fields(result)
     objects = values.get("object") or ", ".join(values.get("objects") or ())
     right = values.get("label_set") or join_values(
-        recorded, "label", "the object's own label"
+        recorded, "label", otherwise="the object's own label"
     )
-    environment = str(values.get("environment") or "")
-    varied = set[str]()
-    for field in ("over", "controls"):
-        varied |= {name.partition(":")[0] for name in values.get(field) or ()}
-    if environment and {"environment", "sky"} & varied:
-        if is_attack(result):
-            environment = f"varied, see below; the clean scene has {environment}"
-        else:
-            environment = f"{environment}, varied"
     subject = {
         "Object": str(objects or ""),
-        "Environment": environment,
+        "Environment": _describe_environment(result),
         "Model": str(values.get("model") or ""),
         "Names of its classes": join_values(recorded, "labels"),
         "Prompt": join_values(recorded, "prompt"),
@@ -667,6 +733,23 @@ def _describe_subject(
         "Sought": str(values.get("goal") or ""),
     }
     return {name: text for name, text in subject.items() if text}
+
+
+def _describe_environment(result: results.Result) -> str:
+    """Return the environment of a result, marked if a control varied it, or empty."""
+    values = _get_fields(result)
+    environment = str(values.get("environment") or "")
+    varied_controls = set[str]()
+    for field in ("over", "controls"):
+        for name in values.get(field) or ():
+            # of "environment:names"
+            varied_controls.add(name.partition(":")[0])
+    is_varied = bool({"environment", "sky"} & varied_controls)
+    if not environment or not is_varied:
+        return environment
+    if is_attack(result):
+        return f"varied, see below; the clean scene has {environment}"
+    return f"{environment}, varied"
 
 
 def describe_searched(
@@ -686,16 +769,20 @@ def describe_searched(
         lines += _searched_by_attack(result)
     elif is_sweep(result):
         lines += _searched_by_sweep(result)
-    controls = settings.get("controls") or {}
+    ranges_of_control = settings.get("controls")
+    if not isinstance(ranges_of_control, Mapping):  # names alone, without ranges
+        ranges_of_control = {}
     for control in getattr(result, "controls", ()):
-        ranges = controls.get(control) if isinstance(controls, Mapping) else None
+        ranges = ranges_of_control.get(control)
+        is_described = any(line.startswith((control, f"{control}.")) for line in lines)
         if ranges:
             lines.append(f"{control}, as set: {json.dumps(ranges, ensure_ascii=False)}")
-        elif not any(line.startswith((control, f"{control}.")) for line in lines):
+        elif not is_described:
             lines.append(f"{control}: everything that it searches by default")
-    for name in () if is_attack(result) else ("epsilon", "epsilons"):
-        if settings.get(name) is not None:
-            lines.append(f"{name}: {json.dumps(settings[name])}")
+    if not is_attack(result):  # the sentences about an attack state them
+        for name in ("epsilon", "epsilons"):
+            if settings.get(name) is not None:
+                lines.append(f"{name}: {json.dumps(settings[name])}")
     return lines
 
 
@@ -752,10 +839,18 @@ def _describe_measurement(
     settings: Mapping[str, object],
     recorded: Sequence[RecordedSettings],
 ) -> dict[str, str]:
-    """Return policy, seed, samples and the like by name."""
+    """Return policy, seed, samples and the like as text, by name.
+
+    What a run does not have is left out.
+
+    Args:
+        result: result of the run.
+        settings: its own settings.
+        recorded: all settings that it recorded.
+    """
     tasks = [run_settings.task for run_settings in recorded if run_settings.is_of_scene]
     trials = "Trials of the worst configuration" if is_sweep(result) else "Trials"
-    facts = {
+    values = {
         "Policy": getattr(result, "policy", None),
         "Objective": getattr(result, "objective", None),
         "Sampler": getattr(result, "sampler", None),
@@ -766,23 +861,32 @@ def _describe_measurement(
         "Judged with": "; ".join(dict.fromkeys(tasks)),
     }
     texts = {
-        name: str(value) for name, value in facts.items() if value not in (None, "")
+        name: str(value) for name, value in values.items() if value not in (None, "")
     }
     if is_attack(result) and result.verified is not None:
-        verified = result.verified
-        control = result.clean.control
-        counts = f"{verified.trials} renders with fresh seeds"
-        if result.over and control is not None and control.trials > verified.trials:
-            counts += (
-                f" that count, those of {control.trials} in which the clean "
-                "scene is right"
-            )
-        texts["Verification"] = f"{counts}, {verified.spp} samples a pixel"
+        texts["Verification"] = _describe_verification(result)
     formation = getattr(result, "image_formation", None)
     if formation:
         gains = getattr(result, "gains", None)
         texts["Pictures"] = wording.format_formation(formation, gains)
     return texts
+
+
+def _describe_verification(result: workbench.AttackSummary) -> str:
+    """Describe how many fresh renders verify what an attack found.
+
+    Over conditions that are drawn anew, only renders count whose clean scene is right:
+    the clean control has all of them.
+    """
+    verified = result.verified
+    assert verified is not None
+    control = result.clean.control
+    counts = f"{verified.trials} renders with fresh seeds"
+    if result.over and control is not None and control.trials > verified.trials:
+        counts += (
+            f" that count, those of {control.trials} in which the clean scene is right"
+        )
+    return f"{counts}, {verified.spp} samples a pixel"
 
 
 def _describe_excluded(
@@ -794,19 +898,7 @@ def _describe_excluded(
         "renders."
     ]
     if is_attack(result):
-        lines += workbench.get_experiment(result.command).view(result).cautions
-        non_finite = result.non_finite
-        if non_finite.objectives or non_finite.gradient_elements:
-            lines.append(
-                f"Not finite: {non_finite.objectives} objectives, "
-                f"{non_finite.gradient_elements} numbers of gradients."
-            )
-        for adjusted in result.clean.moved:
-            used = f"{wording.format_number(adjusted.used)} {adjusted.unit}"
-            lines.append(
-                f"The clean scene has {adjusted.parameter} {used} in place of "
-                f"{wording.format_number(adjusted.scene)}: the control leaves that out."
-            )
+        lines += _excluded_by_attack(result)
     if is_sweep(result) and result.not_finite:
         lines.append(
             f"{result.not_finite} predictions were not numbers; they count as "
@@ -822,8 +914,27 @@ def _describe_excluded(
     return lines + list(getattr(result, "warnings", ()))
 
 
-# maximum bytes of a picture that is copied
+def _excluded_by_attack(result: workbench.AttackSummary) -> list[str]:
+    """Describe cautions of an attack, numbers that were none, and moved parameters."""
+    lines = list(workbench.get_experiment(result.command).view(result).cautions)
+    non_finite = result.non_finite
+    if non_finite.objectives or non_finite.gradient_elements:
+        lines.append(
+            f"Not finite: {non_finite.objectives} objectives, "
+            f"{non_finite.gradient_elements} numbers of gradients."
+        )
+    for adjusted in result.clean.moved:
+        used = f"{wording.format_number(adjusted.used)} {adjusted.unit}"
+        lines.append(
+            f"The clean scene has {adjusted.parameter} {used} in place of "
+            f"{wording.format_number(adjusted.scene)}: the control leaves that out."
+        )
+    return lines
+
+
+# maximum bytes of a picture that is copied, and number of pictures of a run
 MAX_PICTURE_BYTES = 16 << 20
+MAX_PICTURES = 3
 
 
 def collect_evidence(
@@ -869,6 +980,7 @@ def collect_evidence(
 
 def _list_folders(runs: Sequence[str]) -> list[Path]:
     """Return the directories of runs, each once; of a recipe, those of its parts."""
+    # by the resolved path, so that two names of one directory count once
     folders = dict[Path, Path]()
     for folder in map(directory.find_run, runs):
         candidates = sorted((folder / directory.PARTS).glob("*"))
@@ -881,14 +993,20 @@ def _list_folders(runs: Sequence[str]) -> list[Path]:
 
 
 def _read_pictures(folder: Path, number: int) -> dict[str, bytes]:
-    """Read up to three pictures of a run, by their names in the evidence."""
+    """Read up to `MAX_PICTURES` pictures of a run, by their names in the evidence.
+
+    Args:
+        folder: folder of the run.
+        number: number of the run, which tells its pictures from those of others.
+    """
     files = [folder / directory.IMAGES / f"{name}.png" for name in PICTURES]
+    # A link may lead out of the run.
     files = [file for file in files if file.is_file() and not file.is_symlink()]
     return {
         f"pictures/{number}-{file.name}": stored_files.read_bytes(
             file, "a picture", MAX_PICTURE_BYTES
         )
-        for file in files[:3]
+        for file in files[:MAX_PICTURES]
     }
 
 
@@ -932,15 +1050,20 @@ def _make_evidence_run(
 
     sweeps = _read_sweeps(result)
     searched = _list_searched(folder, result, sweeps) or run.searched
-    domain = describe_domain(sweeps[0][0] if sweeps else result, recorded, searched)
+    # What was made from sweeps is about their domain; the first stands for all.
+    domain = describe_domain(sweeps[0].result if sweeps else result, recorded, searched)
     conditions = count_conditions(result)
     weighted = describe_exposure(result, conditions, exposure)
-    criterion_text = _describe_criterion(criterion, result, sweeps, claims, conditions)
+    criterion_lines = []
+    if criterion is not None:
+        criterion_lines = describe_criterion(
+            claims, conditions, criterion, _list_selected_axes(result, sweeps)
+        )
     return run.model_copy(
         update={
             "searched": searched,
             "excluded": [*_remark_quick(folder), *run.excluded],
-            "criterion": criterion_text,
+            "criterion": criterion_lines,
             "triggering": list_triggering_conditions(result),
             "exposure": weighted,
             "conditions": conditions,
@@ -1003,20 +1126,6 @@ def _describe_stored_run(
     return recorded, run
 
 
-def _describe_criterion(
-    criterion: float | None,
-    result: results.Result,
-    sweeps: Any,
-    claims: Sequence[views.Claim],
-    conditions: Any,
-) -> list[str]:
-    """Describe whether claims meet the criterion; nothing without one."""
-    if criterion is None:
-        return []
-    selected_axes = _list_selected_axes(result, sweeps)
-    return describe_criterion(claims, conditions, criterion, selected_axes)
-
-
 def _collect_versions(
     folder: Path, result: results.Result, read_paths: Sequence[Path]
 ) -> dict[str, str]:
@@ -1029,29 +1138,33 @@ def _collect_versions(
     return versions
 
 
-def _read_sweeps(
-    result: results.Result,
-) -> list[tuple[results.Result, Mapping[str, Any]]]:
-    """Read results and settings of the sweeps whose rows a result was made from.
+class _ReadSweep(NamedTuple):
+    """A sweep whose rows another result was made from, with its settings."""
 
-    The result is about what varied in them.
+    result: results.Result
+    settings: Mapping[str, Any]
+
+
+def _read_sweeps(result: results.Result) -> list[_ReadSweep]:
+    """Read the sweeps whose rows a result was made from.
+
+    The result is about what varied in them. Those that cannot be read are left out.
     """
-    sweeps = list[tuple[results.Result, Mapping[str, Any]]]()
+    sweeps = list[_ReadSweep]()
     for path in find_read_sweeps(result):
         with suppress(errors.AdvsearchError):
-            sweeps.append((read_result(path), read_run_settings(path)))
+            sweeps.append(_ReadSweep(read_result(path), read_run_settings(path)))
     return sweeps
 
 
 def _list_selected_axes(
-    result: results.Result,
-    sweeps: Sequence[tuple[results.Result, Mapping[str, Any]]],
+    result: results.Result, sweeps: Sequence[_ReadSweep]
 ) -> list[str]:
     """Return the axes whose values were chosen, of a run and of sweeps, each once."""
-    axes = dict.fromkeys(find_selected_axes(result))
-    for sweep, _ in sweeps:
-        axes |= dict.fromkeys(find_selected_axes(sweep))
-    return list(axes)
+    axes = find_selected_axes(result)
+    for sweep in sweeps:
+        axes += find_selected_axes(sweep.result)
+    return list(dict.fromkeys(axes))
 
 
 def _make_unfinished_run(folder: Path) -> EvidenceRun:
@@ -1093,22 +1206,21 @@ def _read_photographs(folder: Path) -> tuple[list[views.Claim], list[Any]]:
 
 
 def _list_searched(
-    folder: Path,
-    result: results.Result,
-    sweeps: Sequence[tuple[results.Result, Mapping[str, Any]]],
+    folder: Path, result: results.Result, sweeps: Sequence[_ReadSweep]
 ) -> list[str]:
     """Describe what varied in the claims of a suite, or in the sweeps that it read."""
     noted = read_noted_settings(folder, result)
     if noted is not None:
         return _searched_by_claims(noted.get(CLAIM_KIND))
-    lines = dict[str, None]()
-    for sweep, sweep_settings in sweeps:
-        lines |= dict.fromkeys(describe_searched(sweep, sweep_settings))
-    return list(lines)
+    lines = []
+    for sweep in sweeps:
+        lines += describe_searched(sweep.result, sweep.settings)
+    return list(dict.fromkeys(lines))
 
 
 def _remark_quick(folder: Path) -> list[str]:
     """Return a remark if a run is a part of a quick recipe."""
+    # A part of a recipe lies in the folder of parts of the recipe's run.
     outer = read_run_settings(folder.resolve().parent.parent)
     is_quick = outer.get("command") == "recipe" and outer.get("quick") is True
     return [QUICK] if is_quick else []
@@ -1146,7 +1258,7 @@ def _searched_by_claims(claims: Mapping[str, Mapping[str, Any]] | None) -> list[
     names_of_line = defaultdict[str, list[str]](list)
     for name, claim_settings in claims.items():
         controls = claim_settings.get("controls") or {}
-        if not isinstance(controls, Mapping):
+        if not isinstance(controls, Mapping):  # names alone, separated by commas
             controls = dict.fromkeys(str(controls).split(","))
         for control, ranges in controls.items():
             text = "everything it searches by default"

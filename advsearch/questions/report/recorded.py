@@ -75,11 +75,12 @@ class RecordedSettings:
         command renders nothing, since it names no object, or if the setting makes no
         sense beside the others, as `fps` without a path.
         """
-        defaults = self._defaults
-        if name in defaults and value != defaults[name]:
+        differs = name in self._defaults and value != self._defaults[name]
+        if differs:
             return True
-        renders_nothing = "object" in defaults and not self.is_of_scene
-        if name in self._meaningless or renders_nothing:
+        takes_object = "object" in self._defaults
+        renders_nothing = takes_object and not self.is_of_scene
+        if renders_nothing or name in self._meaningless:
             return False
         is_empty = value is None or value is False or value in ("", {}, [], ())
         return not is_empty
@@ -141,7 +142,7 @@ def describe_task(task: Any, objective: object) -> str:
     """
     options = ", ".join(
         f"{option} {wording.format_number(value)}"
-        for option, value in _task_options(task, objective).items()
+        for option, value in _list_task_options(task, objective).items()
     )
     if not options:
         return _shorten(task)
@@ -159,27 +160,32 @@ def _shorten(value: object) -> str:
     return f"{text[:MAX_VALUE_LENGTH]}... ({len(text)} characters)"
 
 
-def _task_options(named: Any, objective: object) -> dict[str, Any]:
+def _list_task_options(recorded_task: Any, objective: object) -> dict[str, Any]:
     """Return the options of a task by name, those of its parts after their names.
 
     Options that a run sets are left out, and empty ones. None are known of a task that
     cannot be made any more.
+
+    Args:
+        recorded_task: as for `describe_task`.
+        objective: as for `describe_task`.
     """
     from advsearch.extend import workbench  # it brings torch, which takes a second
 
     options = dict[str, Any]()
     with suppress(errors.AdvsearchError):
-        task = workbench.make_task(named)
+        task = workbench.make_task(recorded_task)
         if isinstance(objective, str):
             task = task.with_objective(objective)
-        parts = {"": task}
+        task_of_prefix = {"": task}
         if isinstance(task, workbench.EnsembleTask):
-            parts = {f"{part.name}.": part for part in task.parts}
-        for prefix, part in parts.items():
+            task_of_prefix = {f"{part.name}.": part for part in task.parts}
+        for prefix, part in task_of_prefix.items():
             for option in fields(part):
                 value = getattr(part, option.name)
+                is_set_by_run = option.metadata == workbench.FROM_RUN
                 is_empty = value in (None, "", (), False)
-                if option.metadata != workbench.FROM_RUN and not is_empty:
+                if not is_set_by_run and not is_empty:
                     options[f"{prefix}{option.name}"] = value
     return options
 
@@ -196,12 +202,9 @@ def find_read_sweeps(result: results.Result) -> list[Path]:
 
     Those that do not exist any more are left out.
     """
-    return _find_runs(
-        [
-            *getattr(result, "sweeps", ()),
-            *(side.run for side in getattr(result, "sides", ())),
-        ]
-    )
+    sweeps = getattr(result, "sweeps", ())  # of an explanation
+    sides = getattr(result, "sides", ())  # of a comparison
+    return _find_runs([*sweeps, *(side.run for side in sides)])
 
 
 def find_read_attacks(values: Mapping[str, Any]) -> list[Path]:

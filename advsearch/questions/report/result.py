@@ -105,22 +105,23 @@ class Evidence(results.Result):
 def make_tables(
     run: EvidenceRun,
 ) -> Iterator[tuple[str, Sequence[str], list[list[str]]]]:
-    """Yield title, heads and rows of the tables of a run."""
-    for title, first, verb, conditions in (
-        ("Right", "condition", "right", run.conditions),
-        ("Photographs that agree", "photographs of", "agree", run.photographs),
-    ):
-        if conditions:
-            rows = [
-                [
-                    row.condition,
-                    str(row.right),
-                    str(row.total),
-                    wording.format_interval(row.interval),
-                ]
-                for row in conditions
+    """Yield title, heads and rows of the tables of a run; empty ones are left out."""
+    tables = (
+        ("Right", ("condition", "right"), run.conditions),
+        ("Photographs that agree", ("photographs of", "agree"), run.photographs),
+    )
+    for title, first_heads, conditions in tables:
+        rows = [
+            [
+                row.condition,
+                str(row.right),
+                str(row.total),
+                wording.format_interval(row.interval),
             ]
-            yield title, (first, verb, "of", "95 % interval"), rows
+            for row in conditions
+        ]
+        if rows:
+            yield title, (*first_heads, "of", "95 % interval"), rows
 
 
 def format_markdown(evidence: Evidence) -> str:
@@ -140,15 +141,17 @@ def _run_markdown(run: EvidenceRun) -> list[str]:
     lines += [f"- **{claim.kind}**: {_plain(claim.statement)}" for claim in run.claims]
     lines.append("")
     for _, heads, rows in make_tables(run):
-        for cells in (heads, ["---"] * len(heads), *rows):
+        rule = ["---"] * len(heads)  # the line that Markdown has under heads
+        for cells in (heads, rule, *rows):
             lines.append(f"| {' | '.join(map(_plain, cells))} |")
         lines.append("")
     if run.pictures:
         lines += [f"![{name}]({name})" for name in run.pictures]
         lines.append("")
-    for title, facts in make_sections(run).items():
-        lines += [f"{title}:", "", *(f"- {_plain(text)}" for text in facts), ""]
+    for title, texts in make_sections(run).items():
+        lines += [f"{title}:", "", *(f"- {_plain(text)}" for text in texts), ""]
     if run.command_line:
+        # so that it does not end the block of code
         command = run.command_line.replace("```", "` ` `")
         lines += ["To repeat it:", "", "```sh", command, "```", ""]
     return lines
@@ -166,10 +169,11 @@ def _describe_author(evidence: Evidence) -> str:
 def make_sections(run: EvidenceRun) -> dict[str, list[str]]:
     """Return the lines of the sections of a run by title, without empty ones."""
 
-    def list_facts(facts: Mapping[str, str]) -> list[str]:
-        return [f"{name}: {text}" for name, text in facts.items()]
+    def list_named(texts: Mapping[str, str]) -> list[str]:
+        """Return a line for each text, with its name before it."""
+        return [f"{name}: {text}" for name, text in texts.items()]
 
-    versions = list_facts(run.made_with)
+    versions = list_named(run.made_with)
     if run.begun:
         versions.insert(0, f"begun: {run.begun}")
     twins = [] if run.twins is None else [wording.format_twin_evidence(run.twins)]
@@ -178,14 +182,14 @@ def make_sections(run: EvidenceRun) -> dict[str, list[str]]:
         "Criterion": run.criterion,
         "Triggering conditions": run.triggering,
         "Exposure": run.exposure,
-        "Operational design domain": list_facts(run.domain),
+        "Operational design domain": list_named(run.domain),
         "Not shown": run.not_shown,
-        "On what": list_facts(run.about),
+        "On what": list_named(run.about),
         "What varied": run.searched,
-        "Measured how": list_facts({"ended as": run.ending, **run.measured}),
-        "Settings": list_facts(run.settings),
+        "Measured how": list_named({"ended as": run.ending, **run.measured}),
+        "Settings": list_named(run.settings),
         "Excluded, and to be known": run.excluded,
-        "Budget": list_facts(run.cost),
+        "Budget": list_named(run.cost),
         "Made with": versions,
     }
     return {title: lines for title, lines in lines_of_title.items() if lines}
@@ -203,15 +207,19 @@ def make_evidence_page(
     evidence: Evidence, pictures: Mapping[str, bytes] | None = None
 ) -> str:
     """Return evidence as a page, with pictures (PNG) by name."""
-    claims = [claim for run in evidence.runs for claim in run.claims]
-    n_carried = sum(claim.kind != "nothing claimed" for claim in claims)
     n_runs = len(evidence.runs)
     show = "shows" if n_runs == 1 else "show"
-    summary = (
-        f"What {wording.format_count(n_runs, 'run')} {show}, and no more than that."
+    claims = [claim for run in evidence.runs for claim in run.claims]
+    n_real_claims = sum(claim.kind != "nothing claimed" for claim in claims)
+    header = markup.make_header(
+        f"evidence; {n_real_claims} of {len(claims)} statements carry a claim",
+        f"What {wording.format_count(n_runs, 'run')} {show}, and no more than that.",
+        evidence.warnings,
     )
     rules = [
-        markup.make_element("li", text.replace("`", "")) for text in evidence.rules
+        # Backquotes are Markdown's.
+        markup.make_element("li", text.replace("`", ""))
+        for text in evidence.rules
     ]
     main = markup.make_element(
         "main",
@@ -220,11 +228,6 @@ def make_evidence_page(
         markup.make_element("ul", *rules),
         markup.make_element("p", _describe_author(evidence), class_="soft"),
     )
-    header = markup.make_header(
-        f"evidence; {n_carried} of {len(claims)} statements carry a claim",
-        summary,
-        evidence.warnings,
-    )
     return markup.make_document(
         "evidence", header, main, footer="evidence. This page needs no other file."
     )
@@ -232,40 +235,13 @@ def make_evidence_page(
 
 def _run_html(run: EvidenceRun, pictures: Mapping[str, bytes]) -> markup.Html:
     """Return a run: claims, pictures, tables and sections."""
-    rows = _list_claim_rows(run)
     parts = [
         markup.make_element("h2", f"{run.run} ({run.command})"),
-        markup.make_table(CLAIM_HEADS, rows),
+        markup.make_table(CLAIM_HEADS, _list_claim_rows(run)),
+        *_list_images(run, pictures),
+        *_list_condition_tables(run),
+        _make_section_table(run),
     ]
-    parts += _list_images(run, pictures)
-    for title, heads, cells in make_tables(run):
-        summary = markup.make_element(
-            "summary", f"{title} by condition, {len(cells)} rows"
-        )
-        parts.append(
-            markup.make_element("details", summary, markup.make_table(heads, cells))
-        )
-    facts = [
-        markup.make_element(
-            "tr",
-            markup.make_element("th", name, scope="row"),
-            markup.make_element(
-                "td", *(markup.make_element("div", line) for line in lines)
-            ),
-        )
-        for name, lines in make_sections(run).items()
-    ]
-    table = markup.make_element(
-        "table", markup.make_element("tbody", *facts), class_="facts"
-    )
-    parts.append(
-        markup.make_element(
-            "details",
-            markup.make_element("summary", "On what, how, and what is left out"),
-            table,
-            open="",
-        )
-    )
     if run.command_line:
         parts += [
             markup.make_element("h2", "Do it again"),
@@ -274,35 +250,58 @@ def _run_html(run: EvidenceRun, pictures: Mapping[str, bytes]) -> markup.Html:
     return markup.join_html(*parts)
 
 
+def _list_condition_tables(run: EvidenceRun) -> list[markup.Html]:
+    """Return the tables by condition, each folded under its title."""
+    tables = []
+    for title, heads, rows in make_tables(run):
+        summary = markup.make_element(
+            "summary", f"{title} by condition, {len(rows)} rows"
+        )
+        table = markup.make_table(heads, rows)
+        tables.append(markup.make_element("details", summary, table))
+    return tables
+
+
+def _make_section_table(run: EvidenceRun) -> markup.Html:
+    """Return the sections of a run as an unfolded table, with a row for each."""
+    rows = [
+        markup.make_element(
+            "tr",
+            markup.make_element("th", title, scope="row"),
+            markup.make_element(
+                "td", *(markup.make_element("div", line) for line in lines)
+            ),
+        )
+        for title, lines in make_sections(run).items()
+    ]
+    table = markup.make_element(
+        "table", markup.make_element("tbody", *rows), class_="facts"
+    )
+    summary = markup.make_element("summary", "On what, how, and what is left out")
+    return markup.make_element("details", summary, table, open="")
+
+
 def _list_claim_rows(run: EvidenceRun) -> list[list[str]]:
     """Return the rows of the table of claims."""
     rows = []
     for claim in run.claims:
-        extent = claim.extent
-        counted = (
-            [
-                f"{extent.count} of {extent.total}",
-                wording.format_interval(extent.interval),
-            ]
-            if extent
-            else ["", ""]
-        )
-        rows.append([claim.kind, claim.statement, *counted])
+        count = ""
+        interval = ""
+        if claim.extent:
+            count = f"{claim.extent.count} of {claim.extent.total}"
+            interval = wording.format_interval(claim.extent.interval)
+        rows.append([claim.kind, claim.statement, count, interval])
     return rows
 
 
 def _list_images(run: EvidenceRun, pictures: Mapping[str, bytes]) -> list[markup.Html]:
-    """Return the pictures of a run, or nothing."""
-    parts = list[markup.Html]()
-    if run.pictures:
-        data = {
-            name: markup.make_data_url(pictures[name], "image/png")
-            for name in run.pictures
-            if name in pictures
-        }
-        images = (
-            markup.make_element("figure", markup.make_element("img", src=url, alt=name))
-            for name, url in data.items()
-        )
-        parts.append(markup.make_element("div", *images, class_="pictures"))
-    return parts
+    """Return the pictures of a run side by side; nothing if it names none."""
+    if not run.pictures:
+        return []
+    images = []
+    for name in run.pictures:
+        if name in pictures:
+            url = markup.make_data_url(pictures[name], "image/png")
+            image = markup.make_element("img", src=url, alt=name)
+            images.append(markup.make_element("figure", image))
+    return [markup.make_element("div", *images, class_="pictures")]

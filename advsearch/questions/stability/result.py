@@ -112,7 +112,13 @@ class Check(results.Fields):
 def check_range(
     what: str, value: float, least: float | None = None, most: float | None = None
 ) -> Check:
-    """Check that a number is in a range; NaN is in no range."""
+    """Check that a number is in a range; NaN is in no range.
+
+    Args:
+        what: what the number is.
+        value: the number.
+        least, most: inclusive bounds; None for no bound.
+    """
     ok = not math.isnan(value)
     if least is not None:
         ok = ok and least <= value
@@ -124,6 +130,11 @@ def check_range(
 def check_condition(what: str, truth: bool) -> Check:
     """Check a condition, as a number that has to be 1."""
     return check_range(what, float(truth), 1.0, 1.0)
+
+
+def make_failure(what: str) -> Check:
+    """Return a check that fails: a count of 1 of what must not happen."""
+    return check_range(what, 1.0, 0.0, 0.0)
 
 
 class CaseRow(results.Fields):
@@ -184,7 +195,6 @@ CASE_COLUMNS: Mapping[str, views.Column] = {
 
 def make_view(result: StabilityResult) -> ShownResult:
     """Lay out a result: cases, condition numbers, and those that fell short."""
-    failed = [row for row in result.rows if row.status != OK]
     condition_numbers = []
     for row in result.rows:
         for name, value in row.measured.items():
@@ -193,10 +203,12 @@ def make_view(result: StabilityResult) -> ShownResult:
     n_rows = len(result.rows)
     seconds = math.fsum(row.seconds for row in result.rows)
     failures = [
-        f"{row.case} fell short: {row.decides}; expected: {row.holds}" for row in failed
+        f"{row.case} fell short: {row.decides}; expected: {row.holds}"
+        for row in result.rows
+        if row.status != OK
     ]
     return ShownResult(
-        f"{n_rows - len(failed)} of {n_rows} cases hold, in {seconds:.0f} seconds.",
+        f"{n_rows - len(failures)} of {n_rows} cases hold, in {seconds:.0f} seconds.",
         [
             ResultPart.make_table(result.rows, CASE_COLUMNS, title="Cases"),
             ResultPart("Condition numbers", rows=condition_numbers),
@@ -231,6 +243,19 @@ class CaseOutcome:
         """Return the outcome with more checks, and changed fields."""
         return replace(self, checks=[*self.checks, *more], **known)
 
+    def evaluate(self) -> tuple[str, str]:
+        """Return the status, and what decides it in words.
+
+        That is the first check that fails, or values that are not finite, else the last
+        check.
+        """
+        failed = [check for check in self.checks if not check.ok]
+        if failed:
+            return FELL_SHORT, str(failed[0])
+        if not self.finite:
+            return FELL_SHORT, "NaN or infinite values"
+        return OK, str(self.checks[-1]) if self.checks else ""
+
 
 @dataclass(frozen=True)
 class Case:
@@ -256,33 +281,22 @@ class Case:
         """Run the case. An exception means that it falls short, and is the reason.
 
         An InputError counts as a refusal, any other exception as values that are not
-        finite. What decides is the first check that fails, else the last one.
+        finite.
         """
         start = time.perf_counter()
         try:
             outcome = self.measure()
         except InputError as error:
-            failure = check_range(f"refused: {error}", 1.0, 0.0, 0.0)
+            failure = make_failure(f"refused: {error}")
             outcome = CaseOutcome([failure], ending="refused")
         except Exception as error:
-            failure = check_range(
-                f"raised {type(error).__name__}: {error}", 1.0, 0.0, 0.0
-            )
+            failure = make_failure(f"raised {type(error).__name__}: {error}")
             outcome = CaseOutcome([failure], finite=False, ending="raised")
-        failed = [check for check in outcome.checks if not check.ok]
-        status = OK
-        if failed:
-            status = FELL_SHORT
-            decides = str(failed[0])
-        elif not outcome.finite:
-            status = FELL_SHORT
-            decides = "NaN or infinite values"
-        else:
-            decides = str(outcome.checks[-1]) if outcome.checks else ""
+        status, decisive = outcome.evaluate()
         fields = {
             "case": self.name,
             "status": status,
-            "decides": decides,
+            "decides": decisive,
             "seconds": time.perf_counter() - start,
         }
         return CaseRow.of({**vars(self), **vars(outcome), **fields})

@@ -87,6 +87,7 @@ def make_renderer(
 
 
 def describe_mug() -> SceneDescription:
+    """Return the description of the bundled mug in the default scene."""
     return workbench.load_scene("mug").description
 
 
@@ -134,18 +135,20 @@ def make_mesh(
 
 def make_checkered_object(mesh: assets.Mesh) -> assets.ObjectAsset:
     """Return an object with a checkered texture (4, 4): 0.35 and 0.65, in sRGB."""
-    checks = np.indices((4, 4)).sum(axis=0) % 2
-    base = np.float32(0.5) + np.float32(0.3) * (checks - np.float32(0.5))
-    texels = np.repeat(base[:, :, None], 3, axis=2).clip(0.0, 1.0).astype(np.float32)
+    is_light = np.indices((4, 4)).sum(axis=0) % 2  # 0 or 1
+    gray = np.float32(0.5) + np.float32(0.3) * (is_light - np.float32(0.5))
+    texels = np.repeat(gray[:, :, None], 3, axis=2).clip(0.0, 1.0).astype(np.float32)
     return assets.ObjectAsset("thing", mesh, texels, assets.Material())
 
 
 def paint_mug(texels: np.ndarray) -> assets.ObjectAsset:
-    grey = np.repeat(texels[:, :, None], 3, axis=2).astype(np.float32)
-    return replace(describe_mug().object, name="painted", base_color=grey)
+    """Return the mug with a gray texture (H, W)."""
+    base_color = np.repeat(texels[:, :, None], 3, axis=2).astype(np.float32)
+    return replace(describe_mug().object, name="painted", base_color=base_color)
 
 
 def make_checkered_mug() -> assets.ObjectAsset:
+    """Return the mug with a checkered texture (8, 8) of black and white."""
     return paint_mug(np.indices((8, 8)).sum(axis=0) % 2)
 
 
@@ -174,7 +177,7 @@ def check_scene(
     gradient: Bounds | None = None,
     ending: str = "",
     other_scene: Mapping[str, object] | None = None,
-    apart: Bounds = (None, MAX_PICTURE_DIFFERENCE),
+    difference: Bounds = (None, MAX_PICTURE_DIFFERENCE),
     **scene: object,
 ) -> CaseOutcome:
     """Render a scene, differentiate it, and search from there.
@@ -197,7 +200,7 @@ def check_scene(
         gradient: bounds of the largest absolute entry of the gradient.
         ending: expected status of the search.
         other_scene: arguments of `make_renderer` for another scene.
-        apart: bounds of the mean difference from its image.
+        difference: bounds of the mean difference from its image.
         **scene: further arguments of `make_renderer`.
     """
     renderer = make_renderer(controls, thing, **scene)  # type: ignore[arg-type]
@@ -212,48 +215,75 @@ def check_scene(
             compare_gradient(renderer, start, spp=spp, seeds=seeds, repeats=repeats)
         )
     result = search_scene(renderer, loss, start, spp, evaluations)
-    in_range = float(image.min()) >= 0.0 and float(image.max()) <= 1.0
-    checks = [
-        check_condition("the picture is in [0, 1]", in_range),
-        check_range(
-            "values that were NaN or infinite", float(renderer.non_finite), 0.0, 0.0
-        ),
-        check_range(
-            "objectives that were NaN or infinite",
-            float(result.non_finite_objectives),
-            0.0,
-            0.0,
-        ),
-        *gradient_checks,
-    ]
     measured = {
         "mean": float(image.mean()),
         "largest gradient": float(slope.abs().max()),
     }
-    if mean is not None:
-        checks.append(check_range("mean of the picture", measured["mean"], *mean))
-    if gradient is not None:
-        checks.append(
-            check_range("largest gradient", measured["largest gradient"], *gradient)
-        )
+    checks = [
+        *_check_finite(renderer, image, result),
+        *gradient_checks,
+        *_check_bounds(measured, mean, gradient),
+    ]
     if ending:
         checks.append(
             check_condition(f"the ending is {ending!r}", result.ending.value == ending)
         )
     if other_scene is not None:
         other_arguments: dict[str, Any] = {"controls": controls, **other_scene}
-        checks.append(
-            _compare_images(renderer, start, make_renderer(**other_arguments), apart)
-        )
+        other_renderer = make_renderer(**other_arguments)
+        checks.append(_compare_images(renderer, start, other_renderer, difference))
     is_finite = bool(torch.isfinite(image).all()) and bool(torch.isfinite(slope).all())
-    is_finite = is_finite and renderer.non_finite == 0
     return CaseOutcome(
         checks,
-        finite=is_finite,
+        finite=is_finite and renderer.non_finite == 0,
         relative_error=relative_error,
         ending=result.ending.value,
         measured=measured,
     )
+
+
+def _check_finite(
+    renderer: gradients.Renderer, image: Tensor, search: workbench.SearchResult
+) -> list[Check]:
+    """Check that an image is in [0, 1], and nothing was NaN or infinite.
+
+    Args:
+        renderer: has counted values that were not finite.
+        image: image of the start.
+        search: has counted objectives that were not finite.
+    """
+    in_range = float(image.min()) >= 0.0 and float(image.max()) <= 1.0
+    return [
+        check_condition("the picture is in [0, 1]", in_range),
+        check_range(
+            "values that were NaN or infinite", float(renderer.non_finite), 0.0, 0.0
+        ),
+        check_range(
+            "objectives that were NaN or infinite",
+            float(search.non_finite_objectives),
+            0.0,
+            0.0,
+        ),
+    ]
+
+
+def _check_bounds(
+    measured: Mapping[str, float], mean: Bounds | None, gradient: Bounds | None
+) -> list[Check]:
+    """Check the mean of the image, and the largest entry of the gradient.
+
+    Args:
+        measured: both numbers, "mean" and "largest gradient".
+        mean, gradient: their bounds; None is not checked.
+    """
+    checks = []
+    if mean is not None:
+        checks.append(check_range("mean of the picture", measured["mean"], *mean))
+    if gradient is not None:
+        checks.append(
+            check_range("largest gradient", measured["largest gradient"], *gradient)
+        )
+    return checks
 
 
 def _make_start(
@@ -303,6 +333,7 @@ def _check_gradient(
     """
     if not rows:
         return [], None
+    # `excess` is the error beyond what noise explains; it is often 0 for several rows.
     worst = max(rows, key=lambda row: (row.excess, row.bias or 0.0))
     noisiest = max(rows, key=lambda row: row.doubt or 0.0)
     noise_name = f"noise of the comparison, {noisiest.name}"
@@ -350,11 +381,13 @@ def search_scene(
 def render_image(
     renderer: gradients.Renderer, u: Tensor, seed: int = 0, spp: int = 16
 ) -> Tensor:
+    """Render the image (H, W, 3) of a configuration (d,), without a graph."""
     with torch.no_grad():
         return renderer(u, seed, spp)
 
 
 def mean_difference(image: Tensor, other: Tensor) -> float:
+    """Return the mean absolute difference of two images."""
     return float((image - other).abs().mean())
 
 
@@ -423,16 +456,15 @@ def measure_inward_slope(
     step = 0.04
     loss = gradients.make_smooth_loss(linear.formation.resolution)
     inwards = torch.where(u > 0.5, -1.0, 1.0)
-    # 0.5 - u points inwards.
-    increases_loss = gradient * (0.5 - u) > 0.0
+    increases_loss = gradient * (0.5 - u) > 0.0  # 0.5 - u points inwards, too
     direction = inwards * increases_loss * factor
     slopes = []
     for seed in range(seeds):
+        # losses at the bound, and one and two steps from it
         at_0, at_1, at_2 = (
             float(loss(render_image(linear, u + count * step * direction, seed, spp)))
             for count in range(3)
         )
-        # one-sided difference of second order, from values at 0, 1 and 2 steps
         slopes.append((4.0 * at_1 - 3.0 * at_0 - at_2) / (2.0 * step))
     return float(gradient @ direction), math.fsum(slopes) / seeds
 
@@ -442,27 +474,33 @@ def evaluate(
 ) -> policies.Evaluation:
     """Evaluate a configuration by a loss of the image; above 0 is a success.
 
-    The number of the query is the seed of the noise. It costs the renders that were
-    made, times the samples that it asks for.
+    The index of the query is the seed of the noise. The cost is in renders with `spp`
+    samples.
+
+    Args:
+        renderer: renderer of the scene.
+        loss: loss of the image.
+        spp: samples per pixel.
+        query: what to evaluate; it may ask for a multiple of the samples.
     """
-    spp *= query.samples
+    query_spp = spp * query.samples
     non_finite_before = renderer.non_finite
     renders_before = renderer.renders
     gradient = None
     if query.gradient:
+        # "free": only derivatives that cost no further render
         value, gradient = renderer.gradient(
-            loss, query.u, query.index, spp, free=query.gradient == "free"
+            loss, query.u, query.index, query_spp, free=query.gradient == "free"
         )
     else:
-        value = loss(render_image(renderer, query.u, query.index, spp))
+        value = loss(render_image(renderer, query.u, query.index, query_spp))
     objective = float(value)
-    cost = (renderer.renders - renders_before) * query.samples
     return policies.Evaluation(
         objective=objective,
         gradient=gradient,
         success=objective > 0.0,
         non_finite=renderer.non_finite - non_finite_before,
-        cost=cost,
+        cost=(renderer.renders - renders_before) * query.samples,
     )
 
 
@@ -480,7 +518,7 @@ def run_search(
 
     Args:
         renderer: renderer of the scene.
-        loss: loss of the image, which is maximised.
+        loss: loss of the image, which is maximized.
         steps: steps of the search.
         spp: samples per pixel.
         start: None for the renderer's.
@@ -489,15 +527,13 @@ def run_search(
             again.
     """
     evaluate_all = partial(map, partial(evaluate, renderer, loss, spp))
-    policy = policy or workbench.make_policy("pgd")
-    options = {"candidates": 0, **options}
     return workbench.search(
         evaluate_all,
         make_domain(renderer, start),
-        policy,
+        policy or workbench.make_policy("pgd"),
         steps=steps,
         seed=0,
-        **options,
+        **{"candidates": 0, **options},
     )
 
 

@@ -62,6 +62,8 @@ from advsearch.questions.stability.scene import (
 )
 
 BRIGHT = 1e5
+NOT_ZERO = (1e-12, None)
+"""Bounds of the largest entry of a gradient that is not zero."""
 PLATEAU_STEPS = 40  # evaluations in which a search has to be off a plateau
 TEXTURE: ControlSettings = {"texture": {"resolution": 8}}
 FLASH = make_gray_environment(0.3, BRIGHT)
@@ -71,12 +73,13 @@ DARKNESS = make_gray_environment(0.0)
 def exposure_case(control: str, low: float, high: float) -> dict[str, object]:
     """Return arguments of `check_scene` at the end of a range of exposures, stops.
 
-    That is the upper end of positive ones, the lower end of negative ones.
+    That is the upper end of positive ones, the lower end of negative ones. The exposure
+    is the first value of the configuration.
     """
-    controls = {control: {"exposure": [low, high]}, "texture": {"resolution": 8}}
+    is_upper_end = high > 0.0
     return {
-        "controls": controls,
-        "u": {0: float(high > 0.0)},
+        "controls": {control: {"exposure": [low, high]}, "texture": {"resolution": 8}},
+        "u": {0: 1.0 if is_upper_end else 0.0},
         "slow": control == "environment",
     }
 
@@ -107,7 +110,7 @@ register_cases(
                 "denoise": "oidn",
                 "u": [0.31],
                 "compare": False,
-                "gradient": (1e-12, None),
+                "gradient": NOT_ZERO,
                 "slow": True,
             },
         ),
@@ -155,30 +158,38 @@ register_cases(
 
 
 def refuse_texel(value: float, as_file: bool) -> CaseOutcome:
-    """Require that a texel that is no light, in a file or an array, is rejected."""
+    """Require that a texel that is no light, in a file or an array, is rejected.
+
+    The message has to say in a sentence how many texels there are.
+    """
     radiance = make_gray_environment(0.3).radiance.copy()
     radiance[4, 10] = value
     try:
-        if as_file:
-            with tempfile.TemporaryDirectory() as folder:
-                path = Path(folder) / "bad.exr"
-                with OpenEXR.File({}, {"RGB": radiance}) as picture:
-                    picture.write(str(path))
-                workbench.load_scene("mug", path)
-        else:
-            renderer = make_renderer(
-                TEXTURE, environment=assets.EnvironmentAsset("made", radiance)
-            )
-            render_image(renderer, renderer.start, 0, 1)
+        _load_environment(radiance, as_file)
     except InputError as error:
-        is_clear = "texels" in str(error) and "\n" not in str(error)
-        return CaseOutcome(
-            [check_condition("refused in a sentence that counts the texels", is_clear)],
-            ending="refused",
+        is_sentence = "texels" in str(error) and "\n" not in str(error)
+        check = check_condition(
+            "refused in a sentence that counts the texels", is_sentence
         )
+        return CaseOutcome([check], ending="refused")
     return CaseOutcome(
         [check_condition("refused", False)], ending="rendered all the same"
     )
+
+
+def _load_environment(radiance: assets.Float32Array, as_file: bool) -> None:
+    """Load a scene with an environment map from a file, or render one from an array."""
+    if as_file:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "bad.exr"
+            with OpenEXR.File({}, {"RGB": radiance}) as picture:
+                picture.write(str(path))
+            workbench.load_scene("mug", path)
+    else:
+        renderer = make_renderer(
+            TEXTURE, environment=assets.EnvironmentAsset("made", radiance)
+        )
+        render_image(renderer, renderer.start, 0, 1)
 
 
 REFUSED = "The map is refused before anything is rendered."
@@ -190,7 +201,7 @@ for word, value in (("negative", -1.0), ("infinite", math.inf), ("nan", math.nan
 
 
 def leave_plateau(low: float, high: float) -> CaseOutcome:
-    """Search from a white picture without any gradient.
+    """Search for a darker picture from a white one, where no gradient points the way.
 
     The way out is a lower exposure.
 
@@ -200,13 +211,13 @@ def leave_plateau(low: float, high: float) -> CaseOutcome:
     """
     renderer = make_renderer({"camera": {"exposure": [low, high]}})
     start = torch.ones_like(renderer.start)
+    start_query = workbench.Query(start, 0, gradient=True)
     checks = []
     endings = []
     n_flat = 0
-    loss = lambda image: 0.9 - image.mean()  # noqa: E731
     for policy in map(workbench.make_policy, ("pgd", "adam", "auto")):
         result = run_search(
-            renderer, loss, PLATEAU_STEPS, spp=2, start=start, policy=policy
+            renderer, _darkness, PLATEAU_STEPS, spp=2, start=start, policy=policy
         )
         n_flat += sum(record.gradient_norm == 0.0 for record in result.history)
         checks.append(
@@ -216,17 +227,21 @@ def leave_plateau(low: float, high: float) -> CaseOutcome:
             )
         )
         endings.append(f"{policy.name}: {result.ending.value}")
-    slope = evaluate(
-        renderer, loss, 2, workbench.Query(start, 0, gradient=True)
-    ).gradient
+    slope = evaluate(renderer, _darkness, 2, start_query).gradient
     assert slope is not None
     start_check = check_range(
         "gradient at the start", float(slope.abs().max()), 0.0, 0.0
     )
-    counts = {"evaluations without a gradient": float(n_flat)}
     return CaseOutcome(
-        [start_check, *checks], ending=", ".join(endings), measured=counts
+        [start_check, *checks],
+        ending=", ".join(endings),
+        measured={"evaluations without a gradient": float(n_flat)},
     )
+
+
+def _darkness(image: Tensor) -> Tensor:
+    """Return a loss that is above 0 if a picture is not white."""
+    return 0.9 - image.mean()
 
 
 LEAVES_PLATEAU = (
@@ -314,8 +329,9 @@ def look_through_glass() -> CaseOutcome:
         "texture": {"resolution": 8},
         "environment": {"exposure": [-1.0, 1.0]},
     }
+    # The picture differs from that of the same scene without the glass.
     return check_scene(
-        controls, plugins=make_glass_ball(), other_scene={}, apart=(0.01, None)
+        controls, plugins=make_glass_ball(), other_scene={}, difference=(0.01, None)
     )
 
 
@@ -326,18 +342,14 @@ def texels_at_the_ends() -> CaseOutcome:
     """
     controls = {"texture": {"resolution": 8, "epsilon": 0.2}}
     renderer = make_renderer(controls, make_checkered_mug)
-    raw = renderer.copy_with(transfer="linear")
-    start = renderer.start
-    loss = gradients.make_smooth_loss(raw.formation.resolution)
-    gradient = torch.stack(
-        [raw.gradient(loss, start, seed, REFERENCE_SPP)[1] for seed in range(8)]
-    ).mean(dim=0)
     slope, expected_slope = measure_inward_slope(
-        renderer, gradient, factor=1.0, seeds=8, spp=REFERENCE_SPP
+        renderer, _mean_raw_gradient(renderer), factor=1.0, seeds=8, spp=REFERENCE_SPP
     )
     error = abs(slope / expected_slope - 1.0)
+    start = renderer.start
+    loss = gradients.make_smooth_loss(renderer.formation.resolution)
     best = run_search(renderer, loss, 3).best_u
-    return check_scene(controls, make_checkered_mug, compare=False).with_checks(
+    checks = [
         check_range(
             "gradient error along a direction that points inwards",
             error,
@@ -359,8 +371,20 @@ def texels_at_the_ends() -> CaseOutcome:
         check_condition(
             "the start has both 0 and 1", set(start.tolist()) == {0.0, 1.0}
         ),
-        relative_error=error,
-    )
+    ]
+    scene = check_scene(controls, make_checkered_mug, compare=False)
+    return scene.with_checks(*checks, relative_error=error)
+
+
+def _mean_raw_gradient(renderer: gradients.Renderer) -> Tensor:
+    """Return the mean gradient (d,) over 8 seeds of a smooth loss of the raw image."""
+    raw = renderer.copy_with(transfer="linear")
+    loss = gradients.make_smooth_loss(raw.formation.resolution)
+    samples = []
+    for seed in range(8):
+        _, gradient = raw.gradient(loss, renderer.start, seed, REFERENCE_SPP)
+        samples.append(gradient)
+    return torch.stack(samples).mean(dim=0)
 
 
 # ---- light that is thrown
@@ -380,8 +404,12 @@ def projector_case(
         u: texels of its picture, the first ones or by index.
         **projector: settings of the control.
     """
-    controls = {"projector": {"resolution": SIDE, **projector}}
-    return {"controls": controls, "u": u, "compare": False, "gradient": (1e-12, None)}
+    return {
+        "controls": {"projector": {"resolution": SIDE, **projector}},
+        "u": u,
+        "compare": False,
+        "gradient": NOT_ZERO,
+    }
 
 
 register_cases(
@@ -394,7 +422,7 @@ register_cases(
             {
                 **projector_case({}),
                 "other_scene": {"controls": {"lens": {}}},
-                "apart": (None, 0.02),
+                "difference": (None, 0.02),
             },
         ),
         ("projector-full", FINITE, projector_case()),
@@ -435,7 +463,7 @@ register_cases(
                 "controls": {"spot": {"width": [0.02, 0.1], "lumens": [0.0, 10.0]}},
                 "u": [0.0, 1.0],
                 "compare": False,
-                "gradient": (1e-12, None),
+                "gradient": NOT_ZERO,
             },
         ),
     ],
@@ -654,27 +682,18 @@ register_cases(
 @register_case("geometry", "million-triangles", slow=True)
 def million() -> CaseOutcome:
     """Finite, right, and like the coarse mesh of the same shape."""
-    fine_mesh, coarse_mesh = (
-        assets.normalise_mesh(workbench.make_sphere(*counts))
-        for counts in ((501, 1000), (64, 128))
-    )
-    coarse, renderer = (
-        make_renderer(SHIFT, make_checkered_object(mesh))
-        for mesh in (coarse_mesh, fine_mesh)
-    )
-    _, slope = renderer.gradient(
-        gradients.make_smooth_loss(renderer.formation.resolution),
-        renderer.start,
-        0,
-        SPP,
-    )
+    fine_mesh = assets.normalise_mesh(workbench.make_sphere(501, 1000))
+    coarse_mesh = assets.normalise_mesh(workbench.make_sphere(64, 128))
+    coarse = make_renderer(SHIFT, make_checkered_object(coarse_mesh))
+    fine = make_renderer(SHIFT, make_checkered_object(fine_mesh))
+    loss = gradients.make_smooth_loss(fine.formation.resolution)
+    _, slope = fine.gradient(loss, fine.start, 0, SPP)
     difference = mean_difference(
-        render_image(renderer, renderer.start, 0, 64),
+        render_image(fine, fine.start, 0, 64),
         render_image(coarse, coarse.start, 0, 64),
     )
-    return check_scene(
-        TEXTURE, make_checkered_object(fine_mesh), evaluations=2
-    ).with_checks(
+    scene = check_scene(TEXTURE, make_checkered_object(fine_mesh), evaluations=2)
+    return scene.with_checks(
         check_range("triangles", float(len(fine_mesh.faces)), least=1e6),
         check_condition(
             "the gradient by a shift is finite", bool(torch.isfinite(slope).all())
@@ -700,54 +719,66 @@ def gimbal() -> CaseOutcome:
             "on_ground": "no",
         }
     }
-    locked = make_renderer(angles, make_dark_mug, settings=NO_GROUND)
-    # yaw 36 is roll -36 here
-    yaw, roll = (
-        render_image(locked, torch.tensor(u))
-        for u in ([0.7, 0.5, 0.5], [0.5, 0.5, 0.3])
+    # At this pitch, a yaw of 36 degrees is a roll of -36. In u, whose values are
+    # fractions of the ranges, these are 0.7 and 0.3.
+    yawed_u = [0.7, 0.5, 0.5]
+    rolled_u = [0.5, 0.5, 0.3]
+    by_angles = make_renderer(angles, make_dark_mug, settings=NO_GROUND)
+    yawed = render_image(by_angles, torch.tensor(yawed_u))
+    rolled = render_image(by_angles, torch.tensor(rolled_u))
+
+    vector = {"pose": {"rotation": [-90.0, 90.0], "pitch": 90.0, "on_ground": "no"}}
+    by_vector = make_renderer(vector, make_dark_mug, settings=NO_GROUND)
+    rows = compare_gradient(by_vector, by_vector.start + 0.1, seeds=(3, 5))
+    scene = check_scene(
+        angles, make_dark_mug, settings=NO_GROUND, u=yawed_u, spp=2 * SPP
     )
-    rotation = {"pose": {"rotation": [-90.0, 90.0], "pitch": 90.0, "on_ground": "no"}}
-    free = make_renderer(rotation, make_dark_mug, settings=NO_GROUND)
-    worst = max(
-        row.excess for row in compare_gradient(free, free.start + 0.1, seeds=(3, 5))
-    )
-    return check_scene(
-        angles, make_dark_mug, settings=NO_GROUND, u=[0.7, 0.5, 0.5], spp=2 * SPP
-    ).with_checks(
+    return scene.with_checks(
         check_range(
             "mean difference of yaw 36 and roll -36",
-            mean_difference(yaw, roll),
+            mean_difference(yawed, rolled),
             most=MAX_PICTURE_DIFFERENCE,
         ),
         check_range(
-            "gradient error of the rotation vector", worst, most=MAX_GRADIENT_ERROR
+            "gradient error of the rotation vector",
+            max(row.excess for row in rows),
+            most=MAX_GRADIENT_ERROR,
         ),
     )
 
 
 def full_turn(controls: ControlSettings) -> CaseOutcome:
-    """Check that 0 and 360 degrees are the same, in picture, gradient and steps."""
+    """Check that 0 and 360 degrees are the same, in picture, gradient and steps.
+
+    Args:
+        controls: a control with one angle, whose range is 0 to 360 degrees.
+    """
     renderer = make_renderer(controls)
     zero = torch.zeros_like(renderer.start)
     full = torch.ones_like(renderer.start)
     loss = gradients.make_smooth_loss(renderer.formation.resolution)
-    slopes = [renderer.gradient(loss, u, 0, SPP)[1] for u in (zero, full)]
+    _, zero_slope = renderer.gradient(loss, zero, 0, SPP)
+    _, full_slope = renderer.gradient(loss, full, 0, SPP)
+    slope_difference = float((zero_slope - full_slope).abs().max())
     difference = mean_difference(
         render_image(renderer, zero), render_image(renderer, full)
     )
-    wrapped_u = float(make_domain(renderer).project(full + 0.01).max())
-    size = float(slopes[0].abs().max())
+    past_end = make_domain(renderer).project(full + 0.01)
     return check_scene(controls, u=[0.0], compare=False).with_checks(
         check_range(
             "mean difference of the pictures", difference, most=MAX_PICTURE_DIFFERENCE
         ),
         check_range(
             "difference of the gradients",
-            float((slopes[0] - slopes[1]).abs().max()) / size,
+            slope_difference / float(zero_slope.abs().max()),
             most=0.05,
         ),
+        # to 0.01, but for rounding
         check_range(
-            "where a step of 0.01 past the end goes", wrapped_u, 0.0099, 0.0101
+            "where a step of 0.01 past the end goes",
+            float(past_end.max()),
+            0.0099,
+            0.0101,
         ),
     )
 
@@ -788,19 +819,21 @@ def run_cases(context: RunContext[StabilityConfig]) -> StabilityResult:
             "`register_case` and `group` pick some, `seconds` stops before the next one"
         )
         progress.stage("trying stiff and extreme scenes", len(cases), hint=hint)
-        for planned in cases:
-            is_stored = measurements.read(planned.name) is not None
-            row = measurements.get_row(planned.name, CaseRow, planned.run)
+        for case in cases:
+            is_stored = measurements.read(case.name) is not None
+            row = measurements.get_row(case.name, CaseRow, case.run)
+            # Who collects the rows may stop here: then it is not reported.
             yield row
             if not is_stored:
-                progress.message(f"{planned.name}: {row.status}, {row.seconds:.1f} s")
+                progress.message(f"{case.name}: {row.status}, {row.seconds:.1f} s")
             progress.advance(1)
 
     def make_result(rows: list[CaseRow]) -> StabilityResult:
+        """Return the result with the rows so far."""
         return context.result(
             StabilityResult,
             rows=rows,
-            not_run=[planned.name for planned in cases[len(rows) :]],
+            not_run=[case.name for case in cases[len(rows) :]],
         )
 
     return measurements.collect(measure_rows(), make_result)
@@ -886,25 +919,30 @@ def condition_number(hessian: Tensor) -> float:
 @register_case("stiff", "badly-scaled-range")
 def wide_range() -> CaseOutcome:
     """The derivative does not depend on how wide the searched range is."""
-    wide = {"pose": {"x": [-1e4, 1e4]}}
-    narrow = {"pose": {"x": [-0.3, 0.3]}}
-    slopes = []
-    for controls, width in ((wide, 2e4), (narrow, 0.6)):
-        renderer = make_renderer(controls)
-        loss = gradients.make_smooth_loss(renderer.formation.resolution)
-        derivatives = [
-            float(renderer.gradient(loss, renderer.start, seed, 32)[1][0])
-            for seed in range(6)
-        ]
-        # from u, which is 1 over the whole range, to object sizes
-        slopes.append(statistics.fmean(derivatives) / width)
-    error = abs(slopes[0] / slopes[1] - 1.0)
+    wide_slope = _measure_shift_slope(half_width=1e4)
+    narrow_slope = _measure_shift_slope(half_width=0.3)
+    error = abs(wide_slope / narrow_slope - 1.0)
     error_check = check_range(
         "error of the derivative per object size", error, most=0.2
     )
-    return check_scene(wide, compare=False).with_checks(
-        error_check, relative_error=error
-    )
+    scene = check_scene({"pose": {"x": [-1e4, 1e4]}}, compare=False)
+    return scene.with_checks(error_check, relative_error=error)
+
+
+def _measure_shift_slope(half_width: float) -> float:
+    """Return the mean derivative over 6 seeds by a shift of one object size.
+
+    Args:
+        half_width: the shift is searched in [-half_width, half_width], in object sizes.
+    """
+    renderer = make_renderer({"pose": {"x": [-half_width, half_width]}})
+    loss = gradients.make_smooth_loss(renderer.formation.resolution)
+    derivatives = []
+    for seed in range(6):
+        _, gradient = renderer.gradient(loss, renderer.start, seed, 32)
+        derivatives.append(float(gradient[0]))
+    # They are by u, which goes from 0 to 1 over the range.
+    return statistics.fmean(derivatives) / (2.0 * half_width)
 
 
 @register_case("stiff", "light-rotation-texel", slow=True)
@@ -919,9 +957,7 @@ def light_rotation_texel() -> CaseOutcome:
     }
     renderer = make_renderer(controls)
     u = renderer.start.clone()
-    # power and rotation
-    u[0] = 0.5
-    u[1] = 0.1
+    u[:2] = torch.tensor([0.5, 0.1])  # power and rotation; texels follow
     hessian = _estimate_three_curvatures(renderer, u)
     # from the unit box to watts, degrees and sRGB
     from_unit_box = torch.diag(torch.tensor([1.0 / 12.0, 1.0 / 360.0, 1.0]).double())
@@ -929,7 +965,8 @@ def light_rotation_texel() -> CaseOutcome:
     scaled_path, ending = _record_path(renderer, u, RATIO)
     distances = (path - path[0]).abs().amax(dim=0)
     path_difference = float((path - scaled_path).abs().max())
-    return check_scene(controls, u={0: 0.5, 1: 0.1}, compare=False).with_checks(
+    scene = check_scene(controls, u={0: 0.5, 1: 0.1}, compare=False)
+    return scene.with_checks(
         check_range("how far the power moved", float(distances[0]), least=0.05),
         check_range("how far the rotation moved", float(distances[1]), least=0.05),
         check_range("how far the texels moved", float(distances[2:].max()), least=0.05),
@@ -956,13 +993,14 @@ def _estimate_three_curvatures(renderer: gradients.Renderer, u: Tensor) -> Tenso
     directions[0, 0] = 1.0
     directions[1, 1] = 1.0
     directions[2, 2:] = 1.0
-    steps = [0.2, renderer.plan.groups[1].step * 2.0, 0.08]
-    return estimate_hessian(
-        lambda at: LOGIT_SCALE * float(loss(render_image(renderer, at, 0, 64))),
-        u,
-        directions,
-        steps,
-    )
+    _, rotation_group, *_ = renderer.plan.groups
+    steps = [0.2, rotation_group.step * 2.0, 0.08]
+
+    def objective(configuration: Tensor) -> float:
+        """Return the objective in logits."""
+        return LOGIT_SCALE * float(loss(render_image(renderer, configuration, 0, 64)))
+
+    return estimate_hessian(objective, u, directions, steps)
 
 
 def _record_path(
@@ -977,7 +1015,7 @@ def _record_path(
         18,
         spp=8,
         start=u,
-        on_step=lambda record, at, evaluation: path.append(at),
+        on_step=lambda record, configuration, evaluation: path.append(configuration),
     )
     return torch.stack(path), result.ending.value
 
@@ -1022,9 +1060,11 @@ def heavy_render(count: int = 24) -> CaseOutcome:
     renderer = make_renderer(controls).copy_with(transfer="linear")
     renderer.plan = renderer.plan.with_pixel_steps()
     loss = gradients.make_smooth_loss(renderer.formation.resolution)
-    slopes = torch.stack(
-        [renderer.gradient(loss, renderer.start, seed, 4)[1] for seed in range(count)]
-    ).double()
+    gradient_samples = []
+    for seed in range(count):
+        _, gradient = renderer.gradient(loss, renderer.start, seed, 4)
+        gradient_samples.append(gradient)
+    slopes = torch.stack(gradient_samples).double()
     distance = (slopes - slopes.median()).abs()
     return check_scene(controls, compare=False, spp=4).with_checks(
         check_range(

@@ -41,6 +41,7 @@ from advsearch.questions.test.result import (
 )
 from advsearch.questions.test.settings import (
     ALL_COUNTEREXAMPLES,
+    AnyClaim,
     NotBrokenClaim,
     NoWorseClaim,
     Suite,
@@ -91,7 +92,9 @@ def try_suite(
         added = counterexamples.add_counterexample(config.suite, config.add)
     try:
         planned = _plan_claims(loaded_suite, config, added)
-        if loaded_suite is not suite:
+        is_from_file = loaded_suite is not suite
+        if is_from_file:
+            # A file must not do what only its caller may.
             for claim in planned:
                 claim.config.check_powers(f"claims.{claim.name}.settings")
         remarks = _check_claims(planned, loaded_suite)
@@ -143,18 +146,21 @@ def _note_settings(
     """Note the settings of claims, so that a resumed run tests with the same."""
     run = context.run
     run.store.write_note(SUITE_NOTE, json.dumps(suite.model_dump(mode="json")))
-    judged_with = {
+    settings_of_examples = {
         claim.name: claim.config.get_deciding_settings()
         for claim in planned
         if claim.example is not None
     }
-    run.store.write_note(SETTINGS_NOTE, json.dumps(judged_with))
+    run.store.write_note(SETTINGS_NOTE, json.dumps(settings_of_examples))
+    # settings whose files must not change until the run is resumed
     used_settings = list[dict[str, Any]]()
-    for claim in planned:
-        used_settings.append(claim.config.to_json())
-        tested = None if claim.example is not None else suite.claims[claim.name]
-        if isinstance(tested, NoWorseClaim):
-            used_settings.append({"model": tested.than})
+    for planned_claim in planned:
+        used_settings.append(planned_claim.config.to_json())
+        if planned_claim.example is not None:
+            continue
+        claim = suite.claims[planned_claim.name]
+        if isinstance(claim, NoWorseClaim):
+            used_settings.append({"model": claim.than})
     run.check_files_unchanged(used_settings)
 
 
@@ -186,10 +192,9 @@ class _SuiteRun:
                 last = self.results[-1]
                 tester.progress.message(f"{claim.name}: {last.answer}: {last.reason}")
                 if number < len(self.planned):
-                    # for a run that is killed
-                    tester.run.write_summary(
-                        self.make_result(results.INTERRUPTED, None)
-                    )
+                    # what is read of a run that is killed
+                    so_far = self.make_result(results.INTERRUPTED, None)
+                    tester.run.write_summary(so_far)
         if tester.context.ending == results.INTERRUPTED:
             for claim in self.planned[len(self.results) :]:
                 untested = self._make_untested(
@@ -197,7 +202,7 @@ class _SuiteRun:
                 )
                 self._add_result(claim, untested)
             return results.INTERRUPTED
-        causes = {tested.cause for tested in self.results}
+        causes = {result.cause for result in self.results}
         if Cause.COUNTEREXAMPLE_FAILED in causes:
             tester.warnings.append(
                 "A counterexample failed, so that no claim was "
@@ -208,27 +213,16 @@ class _SuiteRun:
     def _test_claim(self, claim: PlannedClaim) -> ClaimResult:
         """Test a claim, or return its noted result, or why it is not tested.
 
-        It is not tested if an unexpected counterexample failed (unless the settings ask
-        for all), the time is over, or a counterexample does not suit the model. A
-        result is noted unless the time ended the test.
+        A result is noted unless the time ended the test.
         """
         key = f"claim {claim.name}"
         tester = self.tester
         noted = tester.run.store.read_json_note(key)
         if noted is not None:
             return ClaimResult.of(noted)
-        counterexample_failed = any(
-            known.kind == "counterexample" and not known.accepted
-            for known in self.results
-        )
-        if counterexample_failed and claim.example is None and not tester.config.all:
-            return self._make_untested(claim, NOT_TESTED, Cause.COUNTEREXAMPLE_FAILED)
-        if tester.out_of_time:
-            return self._make_untested(
-                claim, f"{OUT_OF_TIME_REASON} before it began", Cause.OUT_OF_TIME
-            )
-        if claim.refusal:
-            return self._make_untested(claim, claim.refusal)
+        untested = self._refuse_claim(claim)
+        if untested is not None:
+            return untested
         pending = self._make_untested(claim, "")
         start = time.perf_counter()
         if claim.example is None:
@@ -239,11 +233,33 @@ class _SuiteRun:
             assert isinstance(claim.config, AttackConfig)
             tested = tester.test_counterexample(pending, claim.example, claim.config)
         if tested.cause is Cause.INTERRUPTED:
-            raise KeyboardInterrupt
+            raise KeyboardInterrupt  # Ctrl-C in a part of the run ends all of it
         tested = tested.model_copy(update={"seconds": time.perf_counter() - start})
         if tested.cause is not Cause.OUT_OF_TIME:
             tester.run.store.write_note(key, json.dumps(tested.to_dict()))
         return tested
+
+    def _refuse_claim(self, claim: PlannedClaim) -> ClaimResult | None:
+        """Return the result of a claim that is not tested; None for one that is.
+
+        It is not tested if an unexpected counterexample failed (unless the settings ask
+        for all), the time is over, or a counterexample does not suit the model.
+        """
+        counterexample_failed = any(
+            result.kind == "counterexample" and not result.accepted
+            for result in self.results
+        )
+        is_counterexample = claim.example is not None
+        tests_all = self.tester.config.all
+        if counterexample_failed and not is_counterexample and not tests_all:
+            return self._make_untested(claim, NOT_TESTED, Cause.COUNTEREXAMPLE_FAILED)
+        if self.tester.out_of_time:
+            return self._make_untested(
+                claim, f"{OUT_OF_TIME_REASON} before it began", Cause.OUT_OF_TIME
+            )
+        if claim.refusal:
+            return self._make_untested(claim, claim.refusal)
+        return None
 
     def _make_untested(
         self, claim: PlannedClaim, reason: str, cause: Cause | None = None
@@ -287,32 +303,24 @@ class _SuiteRun:
         return f"{command} {shlex.join(arguments)}".rstrip()
 
     def make_result(self, ending: str, added: Counterexample | None) -> SuiteResult:
-        """Make the result of the claims so far; `update` stores what is expected.
+        """Make the result of the claims so far; with `update`, expect its verdicts.
 
-        With `update`, a run that is done stores its verdicts as expected, except for
-        claims that were not tested since a counterexample failed.
+        Args:
+            ending: status of the run.
+            added: the counterexample that the run has added, if any.
         """
         tester = self.tester
         config = tester.config
         configs = [claim.config for claim in self.planned]
         controls = [name for config in configs for name in config.controls]
+        not_reached = [
+            self._make_untested(claim, NOT_TESTED_YET, Cause.NOT_REACHED)
+            for claim in self.planned[len(self.results) :]
+        ]
+        claims = [*self.results, *not_reached]
         changes = list[str]()
-        claims = list(self.results)
-        for claim in self.planned[len(self.results) :]:
-            claims.append(self._make_untested(claim, NOT_TESTED_YET, Cause.NOT_REACHED))
         if config.update and ending == "done":
-            answers = {
-                claim.name: claim.answer
-                for claim in claims
-                if claim.cause is not Cause.COUNTEREXAMPLE_FAILED
-            }
-            changes = counterexamples.write_expected(config.suite, answers)
-            claims = [
-                claim.model_copy(
-                    update={"expected": answers.get(claim.name, claim.expected)}
-                )
-                for claim in claims
-            ]
+            claims, changes = self._update_expected(claims)
         return SuiteResult(
             run=str(tester.run.path),
             suite=config.suite,
@@ -335,19 +343,50 @@ class _SuiteRun:
             twins=self._find_twins(configs),
         )
 
+    def _update_expected(
+        self, claims: Sequence[ClaimResult]
+    ) -> tuple[list[ClaimResult], list[str]]:
+        """Store the verdicts of claims as expected.
+
+        Claims that were not tested since a counterexample failed keep what is expected
+        of them.
+
+        Returns:
+            The claims with what is expected now, and a sentence for each change.
+        """
+        verdicts = {
+            claim.name: claim.answer
+            for claim in claims
+            if claim.cause is not Cause.COUNTEREXAMPLE_FAILED
+        }
+        changes = counterexamples.write_expected(self.tester.config.suite, verdicts)
+        updated = [
+            claim.model_copy(
+                update={"expected": verdicts.get(claim.name, claim.expected)}
+            )
+            for claim in claims
+        ]
+        return updated, changes
+
     def _find_twins(self, configs: Sequence[SceneConfig]) -> Any:
-        """Return what a run of twins measured for the claims; None without one."""
-        config = self.tester.config
+        """Return what a run of twins shows about renders of these claims.
+
+        Twins are renders of photographed objects, which are compared with their
+        photographs. None if no run of them is named.
+
+        Args:
+            configs: settings of each claim.
+        """
+        model_names = self.tester.model_names
         return workbench.find_twin_evidence(
-            config.twins,
+            self.tester.config.twins,
             model=_join_distinct(
-                self.tester.model_names.get(claim.model, claim.model)
-                for claim in configs
+                model_names.get(config.model, config.model) for config in configs
             ),
-            task=_join_distinct(claim.task_name for claim in configs),
-            object_name=_join_distinct(claim.object for claim in configs),
-            environment=_join_distinct(claim.environment_name for claim in configs),
-            in_photograph=all(claim.backdrop is not None for claim in configs),
+            task=_join_distinct(config.task_name for config in configs),
+            object_name=_join_distinct(config.object for config in configs),
+            environment=_join_distinct(config.environment_name for config in configs),
+            in_photograph=all(config.backdrop is not None for config in configs),
         )
 
 
@@ -448,35 +487,42 @@ def _check_claims(planned: Sequence[PlannedClaim], suite: Suite) -> list[str]:
     Raises:
         InputError: if a claim could not be tested or decided.
     """
-    checked = list[AttackConfig]()
-    remarks = list[str]()
     claims = [
         (planned_claim, suite.claims[planned_claim.name])
         for planned_claim in planned
         if planned_claim.example is None
     ]
+    remarks = [
+        check_pictures(planned_claim.name, claim, suite.confidence)
+        for planned_claim, claim in claims
+    ]
+    checked = list[AttackConfig]()
     for planned_claim, claim in claims:
-        remark = check_pictures(planned_claim.name, claim, suite.confidence)
-        if remark:
-            remarks.append(remark)
-    for planned_claim, claim in claims:
-        config = planned_claim.config
-        if not isinstance(config, AttackConfig):
-            config = AttackConfig.from_config(config)
-        needed = [config]
-        if isinstance(claim, NotBrokenClaim):
-            _check_search(planned_claim.name, config)
-        elif isinstance(claim, NoWorseClaim):
-            needed.append(config.model_copy(update={"model": claim.than}))
-        for needed_config in needed:
-            if needed_config in checked:
+        for config in _list_used_configs(planned_claim, claim):
+            if config in checked:
                 continue
             try:
-                workbench.check_from_config(needed_config)
+                workbench.check_from_config(config)
             except InputError as error:
                 raise InputError(f"claims.{planned_claim.name}: {error}") from None
-            checked.append(needed_config)
-    return remarks
+            checked.append(config)
+    return list(filter(None, remarks))
+
+
+def _list_used_configs(planned: PlannedClaim, claim: AnyClaim) -> list[AttackConfig]:
+    """Return the settings of what a claim loads, of each model.
+
+    Raises:
+        InputError: if they are not those of a single search, for a claim about one.
+    """
+    config = planned.config
+    if not isinstance(config, AttackConfig):
+        config = AttackConfig.from_config(config)
+    if isinstance(claim, NotBrokenClaim):
+        _check_search(planned.name, config)
+    if isinstance(claim, NoWorseClaim):
+        return [config, config.model_copy(update={"model": claim.than})]
+    return [config]
 
 
 def _check_search(name: str, config: AttackConfig) -> None:

@@ -6,12 +6,12 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 from itertools import islice, repeat
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -35,9 +35,9 @@ from advsearch.extend import (
 from advsearch.questions.test import result as words
 from advsearch.questions.test import settings as suites
 from advsearch.questions.test.counterexamples import (
-    N_TRIALS,
     Counterexample,
     compute_scene_digest,
+    count_trials,
     decide_trials,
     evaluate_trial,
     varies_conditions,
@@ -66,10 +66,54 @@ ChangePicture = Callable[["workbench.Query", Tensor], Tensor]
 """Maps a query and its picture to the picture that the other side predicts."""
 # pictures that are requested at once, for each worker
 BATCHES_AHEAD = 2
+# assumed number of workers of a cluster, which is not known
+CLUSTER_WORKERS = 8
 Evaluated = tuple["workbench.Query", policies.Evaluation, policies.Evaluation | None]
 """A query, its evaluation, and that of the other side if there is one."""
 ATTACK_WORKER = "advsearch.questions.attack.carry_out:attack_worker"
 CLAIM_WORKER = "advsearch.questions.test.claims:claim_worker"
+
+
+class _OtherSide(NamedTuple):
+    """What the evaluations of the model under test are compared with.
+
+    Attributes:
+        journal: evaluates the other model, or the same one on changed pictures.
+        change: makes the other side's picture of the first one; None if the other side
+            has a rendering of its own.
+    """
+
+    journal: workbench.Journal
+    change: ChangePicture | None
+
+
+class _PictureScore(NamedTuple):
+    """What a picture shows about a claim.
+
+    Attributes:
+        score: from 0 (against the claim) to 1 (for it); None if the object is out of
+            view, so that the picture does not count.
+        badness: how bad an example against the claim it is.
+        text: describes what the model predicts.
+    """
+
+    score: float | None
+    badness: float = 0.0
+    text: str = ""
+
+
+class _Example(NamedTuple):
+    """The worst picture against a claim.
+
+    Attributes:
+        badness: how bad it is.
+        query: the query of the picture.
+        text: describes what the model predicts.
+    """
+
+    badness: float
+    query: workbench.Query
+    text: str
 
 
 @dataclass
@@ -81,14 +125,57 @@ class _PictureSample:
         wrong_payloads: what the task recorded of wrong predictions.
         n_hidden: pictures without the object in view, which do not count.
         verdict: what they decide.
-        worst: worst of the worst wrong picture: how bad it is, its query, and its text.
+        worst: the worst picture against the claim, if there is one.
     """
 
     scores: list[float] = field(default_factory=list)
     wrong_payloads: list[Any] = field(default_factory=list)
     n_hidden: int = 0
     verdict: str = UNDECIDED
-    worst: tuple[float, workbench.Query, str] | None = None
+    worst: _Example | None = None
+
+
+@dataclass
+class _TrialSample:
+    """What trials of a counterexample show.
+
+    Attributes:
+        outcomes: whether the model is right in each; None does not count.
+        wrong_payloads: what the task recorded of wrong predictions.
+        label: label of the first wrong prediction; empty without one.
+        picture: its picture inside the run.
+    """
+
+    outcomes: list[bool | None] = field(default_factory=list)
+    wrong_payloads: list[Any] = field(default_factory=list)
+    label: str = ""
+    picture: str | None = None
+
+    @property
+    def n_right(self) -> int:
+        return self.outcomes.count(True)
+
+    @property
+    def n_wrong(self) -> int:
+        return self.outcomes.count(False)
+
+    @property
+    def n_uncounted(self) -> int:
+        return self.outcomes.count(None)
+
+    def is_enough(self, *, over: bool) -> bool:
+        """Return whether further trials of the counterexample change nothing.
+
+        One scene that is right and wrong depends on the noise already. Otherwise it
+        takes `count_trials` that count.
+
+        Args:
+            over: whether conditions vary.
+        """
+        depends_on_noise = self.n_right > 0 and self.n_wrong > 0 and not over
+        return depends_on_noise or self.n_right + self.n_wrong == count_trials(
+            over=over
+        )
 
 
 @dataclass
@@ -154,40 +241,52 @@ class ClaimTester:
     def _test_by_search(
         self, pending: ClaimResult, config: AttackConfig
     ) -> ClaimResult:
-        """Test by a search, as a part of this run, that nothing breaks a model.
-
-        The picture of a claim that fails is the adversarial one, or the clean one if
-        that is wrong already.
-        """
+        """Test by a search, as a part of this run, that nothing breaks a model."""
         search = self._make_search(config)
         summary = self.context.run_part(pending.name, search)
         assert isinstance(summary, workbench.AttackSummary)
         self.warnings += summary.warnings
-        # with the number of steps that was chosen, if none was set
+        # with the number of steps that the search chose, if none was set
         planned = search.model_copy(update={"steps": search.steps or summary.steps})
-        verdict, reason, cause = words.evaluate_search(summary, planned)
-        image_name = "clean" if summary.ending == "already wrong" else "adversarial"
-        part = self.run.locate_part(self.run.path, pending.name)
-        image = part / "images" / f"{image_name}.png"
+        evaluated = words.evaluate_search(summary, planned)
         picture = None
-        if verdict == FAILED and image.is_file():
-            picture = image.relative_to(self.run.path).as_posix()
+        if evaluated.verdict == FAILED:
+            picture = self._find_search_picture(pending.name, summary)
+        # "products" are of matrices: they give images without rendering
         n_pictures = sum(
             count for name, count in summary.renders.items() if name != "products"
         )
         return pending.model_copy(
             update={
-                "answer": verdict,
-                "reason": reason,
-                "cause": cause,
+                "answer": evaluated.verdict,
+                "reason": evaluated.reason,
+                "cause": evaluated.cause,
                 "part": pending.name,
                 "pictures": n_pictures,
                 "picture": picture,
             }
         )
 
+    def _find_search_picture(
+        self, name: str, summary: workbench.AttackSummary
+    ) -> str | None:
+        """Return the path inside the run of the picture that breaks the model.
+
+        It is the adversarial one, or the clean one if that is wrong already; None if
+        the search has not stored it.
+
+        Args:
+            name: name of the claim, and of the part of the run.
+            summary: summary of the search.
+        """
+        image_name = "clean" if summary.ending == "already wrong" else "adversarial"
+        part = self.run.locate_part(self.run.path, name)
+        image = part / "images" / f"{image_name}.png"
+        return image.relative_to(self.run.path).as_posix() if image.is_file() else None
+
     def _make_search(self, config: AttackConfig) -> AttackConfig:
         """Return the settings of the search, within the remaining time."""
+        # at least a millisecond, as a limit has to be positive
         remaining = max(0.001, self.time_limit - self.elapsed_seconds)
         seconds = min(remaining, config.seconds or math.inf)
         changes = {
@@ -195,6 +294,7 @@ class ClaimTester:
             "cluster": self.config.cluster,
             "seconds": seconds if math.isfinite(seconds) else None,
         }
+        # a copy has no Python objects: they are passed on
         return config.model_copy(update=changes).with_python_only_parts(
             config.python_only_parts
         )
@@ -217,16 +317,16 @@ class ClaimTester:
         with self._open_evaluations(pending.name, claim, config, problem) as evaluated:
             sample = self._sample_pictures(evaluated, claim, sequence)
 
-        example, picture = self._save_example(pending, sample.worst, problem)
+        example = ""
+        picture = None
+        if sample.worst is not None:
+            query = sample.worst.query
+            example = f"{sample.worst.text}: {self._describe(problem, query)}"
+            picture = self._save_picture(pending.name, problem, query)
         is_late = sample.verdict == UNDECIDED and self.out_of_time
         reason = _describe_sample(
             claim, sample, sequence.interval, example, problem.task.name
         )
-        if sample.n_hidden:
-            reason += (
-                f"; the object is not to be seen in {sample.n_hidden} more, "
-                "which are not counted"
-            )
         if is_late:
             reason += f"; {OUT_OF_TIME_REASON}"
         rate = None
@@ -247,9 +347,9 @@ class ClaimTester:
 
     @staticmethod
     def _sample_pictures(
-        evaluated: Iterable[Any],
+        evaluated: Iterable[Evaluated],
         claim: ShareClaim | NoWorseClaim,
-        sequence: Any,
+        sequence: statistics.sequential.ConfidenceSequence,
     ) -> _PictureSample:
         """Evaluate pictures until their scores decide the claim, or there are no more.
 
@@ -272,28 +372,14 @@ class ClaimTester:
                 sample.wrong_payloads.append(judgement.payload)
             sequence.add(score)
             sample.scores.append(score)
-            is_worst = sample.worst is None or badness > sample.worst[0]
-            if score == 0.0 and is_worst:
-                sample.worst = (badness, query, text)
+            is_worst = sample.worst is None or badness > sample.worst.badness
+            is_against_claim = score == 0.0
+            if is_against_claim and is_worst:
+                sample.worst = _Example(badness, query, text)
             sample.verdict = _decide(sequence, threshold_mean(claim))
             if sample.verdict != UNDECIDED:
                 break
         return sample
-
-    def _save_example(
-        self,
-        pending: ClaimResult,
-        worst: tuple[float, workbench.Query, str] | None,
-        problem: Problem,
-    ) -> tuple[str, str | None]:
-        """Describe the worst picture and store it; empty without one."""
-        example = ""
-        picture = None
-        if worst is not None:
-            _, query, text = worst
-            example = f"{text}: {self._describe(problem, query)}"
-            picture = self._save_picture(pending.name, problem, query)
-        return example, picture
 
     @contextmanager
     def _open_evaluations(
@@ -314,25 +400,8 @@ class ClaimTester:
             config: settings of its pictures.
             problem: problem of the model under test.
         """
-        worker_config = AttackConfig.from_config(
-            config, workers=self.config.workers, cluster=self.config.cluster
-        )
-        worker = ATTACK_WORKER
-        other = problem
-        # without, the other side gets a rendering of its own
-        change: ChangePicture | None = None
-        has_two_models = isinstance(claim, NoWorseClaim)
-        if isinstance(claim, NoWorseClaim):
-            worker = CLAIM_WORKER
-            other = self._load_problem(config.model_copy(update={"model": claim.than}))
-            worker_config = worker_config.model_copy(
-                update={"model": f"{config.model},{claim.than}"}
-            )
-            if other.renderer.formation == problem.renderer.formation:
-                change = _same_picture
-        elif isinstance(claim, ChangeClaim):
-            # evaluated by what is true of the picture before the change
-            change = self._make_change(claim, config, problem)
+        worker_call, worker_config = self._choose_worker(claim, config)
+        other_problem, change = self._load_other_side(claim, config, problem)
         self.progress.stage(
             name,
             claim.pictures,
@@ -342,18 +411,57 @@ class ClaimTester:
         queries = sample_queries(
             problem, f"claim {name}", claim.pictures, samples_per_pixel(config)
         )
-        with workbench.open_executor(worker_config, worker, self.progress) as executor:
-            # Workers find the problem of a model by its index; see `claim_worker`.
-            problem_name = "0" if has_two_models else ""
-            evaluator = workbench.ParallelEvaluator(problem, executor, problem_name)
+        with workbench.open_executor(
+            worker_config, worker_call, self.progress
+        ) as executor:
+            if isinstance(claim, NoWorseClaim):
+                # Workers find the problem of a model by its index; see `claim_worker`.
+                evaluator = workbench.ParallelEvaluator(problem, executor, "0")
+                other_evaluator = workbench.ParallelEvaluator(
+                    other_problem, executor, "1"
+                )
+            else:
+                evaluator = workbench.ParallelEvaluator(problem, executor)
+                other_evaluator = workbench.ParallelEvaluator(other_problem)
             journal = workbench.Journal(self.run, evaluator)
-            other_journal = None
+            other = None
             if not isinstance(claim, RightClaim):
-                other_evaluator = workbench.ParallelEvaluator(other)
-                if has_two_models:
-                    other_evaluator = workbench.ParallelEvaluator(other, executor, "1")
                 other_journal = workbench.Journal(self.run, other_evaluator)
-            yield self._evaluate_pairs(journal, queries, other_journal, change)
+                other = _OtherSide(other_journal, change)
+            yield self._evaluate_pairs(journal, queries, other)
+
+    def _choose_worker(
+        self, claim: ShareClaim | NoWorseClaim, config: SceneConfig
+    ) -> tuple[str, AttackConfig]:
+        """Return what workers call, and their settings, which name both models."""
+        worker_config = AttackConfig.from_config(
+            config, workers=self.config.workers, cluster=self.config.cluster
+        )
+        if not isinstance(claim, NoWorseClaim):
+            return ATTACK_WORKER, worker_config
+        both_models = {"model": f"{config.model},{claim.than}"}
+        return CLAIM_WORKER, worker_config.model_copy(update=both_models)
+
+    def _load_other_side(
+        self, claim: ShareClaim | NoWorseClaim, config: SceneConfig, problem: Problem
+    ) -> tuple[Problem, ChangePicture | None]:
+        """Return the problem of the other side, and what makes its pictures.
+
+        None makes no picture: then the other side has a rendering of its own.
+
+        Args:
+            claim: the claim.
+            config: settings of its pictures.
+            problem: problem of the model under test.
+        """
+        if isinstance(claim, NoWorseClaim):
+            other = self._load_problem(config.model_copy(update={"model": claim.than}))
+            takes_same_images = other.renderer.formation == problem.renderer.formation
+            return other, _same_picture if takes_same_images else None
+        if isinstance(claim, ChangeClaim):
+            # evaluated by what is true of the picture before the change
+            return problem, self._make_change(claim, config, problem)
+        return problem, None
 
     def _make_change(
         self, claim: ChangeClaim, config: SceneConfig, problem: Problem
@@ -363,16 +471,18 @@ class ClaimTester:
             return lambda query, picture: workbench.change_image(
                 picture, claim.when, problem.model.cameras
             )
-        other = self._load_problem(config)
-        other.renderer.scene.assembly.is_object_hidden = True
-        return lambda query, picture: other.picture(query.u, query.seed, query.spp)
+        # a scene of its own, from which the object is taken out for good
+        without_object = self._load_problem(config)
+        without_object.renderer.scene.assembly.is_object_hidden = True
+        return lambda query, picture: without_object.picture(
+            query.u, query.seed, query.spp
+        )
 
     def _evaluate_pairs(
         self,
         journal: workbench.Journal,
         queries: Iterator[workbench.Query],
-        other_journal: workbench.Journal | None = None,
-        change: ChangePicture | None = None,
+        other_side: _OtherSide | None = None,
     ) -> Iterator[Evaluated]:
         """Yield queries with their evaluations, until the time is over.
 
@@ -381,57 +491,20 @@ class ClaimTester:
         Args:
             journal: evaluates the queries.
             queries: what to evaluate.
-            other_journal: evaluates the other side, if there is one.
-            change: makes the other side's picture of the first one; without it, the
-                other side renders its own.
+            other_side: evaluates the other side, if there is one.
         """
-        pictures: dict[int, Tensor | None] = {}  # of a batch, by number
-
-        def evaluate(
-            queries: Sequence[workbench.Query],
-        ) -> Iterator[policies.Evaluation]:
-            """Evaluate queries, and keep their pictures if they are to be changed."""
-            evaluations = journal.evaluator(
-                [replace(query, with_image=change is not None) for query in queries]
-            )
-            for query, evaluation in zip(queries, evaluations, strict=True):
-                pictures[query.index] = evaluation.picture
-                yield evaluation
-
-        def evaluate_other(
-            queries: Sequence[workbench.Query],
-        ) -> Iterable[policies.Evaluation]:
-            """Evaluate the other side: on changed pictures, or on its own ones."""
-            assert other_journal is not None
-            if change is None:
-                yield from other_journal.evaluator(queries)
-                return
-            problem = journal.evaluator.problem
-            other = other_journal.evaluator.problem
-            for query in queries:
-                # an evaluation that was read back has no picture
-                picture = pictures.get(query.index)
-                if picture is None:
-                    picture = problem.picture(query.u, query.seed, query.spp)
-                changed_picture = change(query, picture)
-                judgement = other.judge(changed_picture, other.add_conditions(query.u))
-                yield policies.Evaluation.from_judgement(judgement)
-
         batch_size = 1
         if journal.evaluator.executor is not None:
-            # of a cluster the number of workers is not known
-            batch_size = BATCHES_AHEAD * (self.config.workers or 8)
+            batch_size = BATCHES_AHEAD * (self.config.workers or CLUSTER_WORKERS)
         while batch := list(islice(queries, batch_size)):
-            pictures.clear()
-            evaluations = journal.evaluate_all(batch, evaluate)
+            evaluations: Iterable[policies.Evaluation]
             others: Iterable[policies.Evaluation | None] = repeat(None)
-            if other_journal is not None:
-                # evaluates all, so that the pictures are there before they are changed
-                evaluations = iter(list(evaluations))
-                other_queries = [
-                    replace(query, kind=f"{query.kind} beside") for query in batch
-                ]
-                others = other_journal.evaluate_all(other_queries, evaluate_other)
+            if other_side is None:
+                evaluations = journal.evaluate_all(
+                    batch, partial(_evaluate_with_pictures, journal, None)
+                )
+            else:
+                evaluations, others = _evaluate_batch(journal, other_side, batch)
             for query, evaluation, other in zip(
                 batch, evaluations, others, strict=False
             ):
@@ -453,12 +526,8 @@ class ClaimTester:
             example: the counterexample.
             config: settings that it is tested with.
         """
-        pending = pending.model_copy(
-            update={
-                "statement": f"{config.model} is right where it said "
-                f"{example.wrong_label}"
-            }
-        )
+        statement = f"{config.model} is right where it said {example.wrong_label}"
+        pending = pending.model_copy(update={"statement": statement})
         try:
             parts = workbench.load_parts(config)
             problem = workbench.make_problem(parts, differentiated=False)
@@ -492,9 +561,6 @@ class ClaimTester:
     ) -> ClaimResult:
         """Test a counterexample by trials with fresh seeds.
 
-        They end when further ones would change nothing, or the time is over. The
-        picture of the result is that of the first wrong trial.
-
         Args:
             pending: the result without a verdict.
             example: the counterexample.
@@ -503,44 +569,54 @@ class ClaimTester:
                 under the same conditions, and does not count if the model is wrong
                 there.
         """
+        sample = self._sample_trials(example, problem, over=over)
+        update = _trials_result(sample, problem.task.name, over=over)
+        is_late = self.out_of_time and not sample.is_enough(over=over)
+        if is_late:
+            reasons = [OUT_OF_TIME_REASON]
+            if sample.outcomes:
+                reasons = [update["reason"], OUT_OF_TIME_REASON]
+            update |= {
+                "answer": UNDECIDED,
+                "reason": "; ".join(reasons),
+                "cause": Cause.OUT_OF_TIME,
+            }
+        update |= {"picture": sample.picture, "spp": example.spp}
+        return pending.model_copy(update=update)
+
+    def _sample_trials(
+        self, example: Counterexample, problem: Problem, *, over: bool
+    ) -> _TrialSample:
+        """Make trials until further ones would change nothing, or the time is over.
+
+        The picture of the first wrong trial is saved. Arguments as for
+        `_test_by_trials`.
+        """
         u = problem.domain.project(example.make_configuration(problem.domain.start))
         # trials by which it is added are not repeated as trials of the suite
         prefix = "added " if self.config.add is not None else ""
         kind = f"{prefix}counterexample {example.name}"
         journal = workbench.Journal(self.run, workbench.ParallelEvaluator(problem))
-        outcomes = list[bool | None]()
-        wrong_payloads = list[Any]()
-        label = ""
-        picture: str | None = None
-        # Over conditions, up to twice as many trials are made, as some may not count;
-        # each also renders the clean scene.
-        max_trials = 4 * N_TRIALS[over] if over else N_TRIALS[over]
-        self.progress.stage(example.name, max_trials, at_most=True)
+        max_renders = count_trials(over=over)
+        if over:
+            # Up to twice as many trials are made, as some may not count; each also
+            # renders the clean scene.
+            max_renders *= 4
+        self.progress.stage(example.name, max_renders, at_most=True)
+        sample = _TrialSample()
         for query, trial, clean in self._run_trials(
             journal, kind, u, example.spp, over=over
         ):
             outcome = evaluate_trial(trial, clean)
-            outcomes.append(outcome)
+            sample.outcomes.append(outcome)
             if outcome is False:
-                wrong_payloads.append(trial.payload)
-                if not label:
-                    label = trial.prediction.label
-                    picture = self._save_picture(example.name, problem, query)
-            if _has_enough_trials(outcomes, over=over):
+                sample.wrong_payloads.append(trial.payload)
+                if not sample.label:
+                    sample.label = trial.prediction.label
+                    sample.picture = self._save_picture(example.name, problem, query)
+            if sample.is_enough(over=over):
                 break
-
-        update = _trials_result(outcomes, label, wrong_payloads, problem, over=over)
-        if self.out_of_time and not _has_enough_trials(outcomes, over=over):
-            update["answer"] = UNDECIDED
-            update["reason"] = (
-                f"{update['reason']}; {OUT_OF_TIME_REASON}"
-                if outcomes
-                else OUT_OF_TIME_REASON
-            )
-            update["cause"] = Cause.OUT_OF_TIME
-        update["picture"] = picture
-        update["spp"] = example.spp
-        return pending.model_copy(update=update)
+        return sample
 
     def _run_trials(
         self, journal: workbench.Journal, kind: str, u: Tensor, spp: int, *, over: bool
@@ -559,33 +635,34 @@ class ClaimTester:
             Query and judgement of the configuration, and the judgement of the clean
             scene, None without `over`.
         """
-        problem = journal.problem
+        clean_u = journal.problem.domain.start
         queries = list[workbench.Query]()
-        for index in range(2 * N_TRIALS[over]):
+        # twice as many as are needed, as some may not count
+        for index in range(2 * count_trials(over=over)):
             seed = seeds.stream(self.suite.seed, kind, index)
             query = workbench.Query(u, seed, kind, index, spp=spp)
             queries.append(query)
             if over:
-                clean_query = replace(
-                    query, u=problem.domain.start, kind=f"{kind}, clean"
-                )
-                queries.append(clean_query)
+                queries.append(replace(query, u=clean_u, kind=f"{kind}, clean"))
         evaluated = self._evaluate_pairs(journal, iter(queries))
         for query, trial, _ in evaluated:
             if not over:
                 yield query, trial.required_judgement, None
                 continue
             # The next query is that of the clean scene; without it, the time is over.
-            clean = next(evaluated, None)
-            if clean is None:
+            clean_result = next(evaluated, None)
+            if clean_result is None:
                 return
-            yield query, trial.required_judgement, clean[1].required_judgement
+            _, clean, _ = clean_result
+            yield query, trial.required_judgement, clean.required_judgement
 
     def _load_problem(self, config: SceneConfig) -> Problem:
         """Load scene, model and task; what there is to remark becomes a warning."""
         parts = workbench.load_parts(AttackConfig.from_config(config))
-        # without the remarks of the task, which the reason has
-        remarks = [*parts.model_and_warnings[1]]
+        _, model_warnings = parts.model_and_warnings
+        # A copy: making the problem adds the remarks of the task, which are part of the
+        # reason of each claim.
+        remarks = list(model_warnings)
         problem = workbench.make_problem(parts, differentiated=False)
         self.model_names[config.model] = problem.model.name
         self.warnings += [*problem.space.list_notes(parts.scene.description), *remarks]
@@ -610,15 +687,92 @@ class ClaimTester:
         return ", ".join(texts)
 
 
+def _evaluate_with_pictures(
+    journal: workbench.Journal,
+    pictures: dict[int, Tensor | None] | None,
+    queries: Sequence[workbench.Query],
+) -> Iterator[policies.Evaluation]:
+    """Evaluate queries, and store their pictures by the index of the query.
+
+    Args:
+        journal: its evaluator renders and predicts them.
+        pictures: gets the pictures; None if they are not needed.
+        queries: what to evaluate.
+    """
+    with_image = pictures is not None
+    evaluations = journal.evaluator(
+        [replace(query, with_image=with_image) for query in queries]
+    )
+    for query, evaluation in zip(queries, evaluations, strict=True):
+        if pictures is not None:
+            pictures[query.index] = evaluation.picture
+        yield evaluation
+
+
+def _evaluate_batch(
+    journal: workbench.Journal,
+    other_side: _OtherSide,
+    batch: Sequence[workbench.Query],
+) -> tuple[Iterable[policies.Evaluation], Iterable[policies.Evaluation]]:
+    """Return the evaluations of both sides of a batch of queries."""
+    pictures: dict[int, Tensor | None] | None = {}
+    if other_side.change is None:
+        pictures = None
+    # All are evaluated at once, so that the pictures are there before they are changed.
+    evaluations = list(
+        journal.evaluate_all(batch, partial(_evaluate_with_pictures, journal, pictures))
+    )
+    # The other side has rows of its own in the store.
+    other_queries = [replace(query, kind=f"{query.kind} beside") for query in batch]
+    others = other_side.journal.evaluate_all(
+        other_queries,
+        partial(_evaluate_other_side, other_side, journal.evaluator.problem, pictures),
+    )
+    return evaluations, others
+
+
+def _evaluate_other_side(
+    other_side: _OtherSide,
+    problem: Problem,
+    pictures: Mapping[int, Tensor | None] | None,
+    queries: Sequence[workbench.Query],
+) -> Iterator[policies.Evaluation]:
+    """Evaluate the other side: on changed pictures, or on its own ones.
+
+    Args:
+        other_side: the other side.
+        problem: problem of the model under test.
+        pictures: its pictures, by the index of the query.
+        queries: what to evaluate.
+    """
+    if other_side.change is None or pictures is None:
+        yield from other_side.journal.evaluator(queries)
+        return
+    other_problem = other_side.journal.evaluator.problem
+    for query in queries:
+        # an evaluation that was read back has no picture
+        picture = pictures.get(query.index)
+        if picture is None:
+            picture = problem.picture(query.u, query.seed, query.spp)
+        changed_picture = other_side.change(query, picture)
+        judgement = other_problem.judge(
+            changed_picture, other_problem.add_conditions(query.u)
+        )
+        yield policies.Evaluation.from_judgement(judgement)
+
+
 def claim_worker(values: dict[str, Any]) -> Callable[[Any], Any]:
     """Return what a worker process calls for a claim about two models.
 
     A model is loaded at its first use; requests name it by its index.
+
+    Args:
+        values: settings of the claim's pictures, with both models.
     """
     models = settings.split_names(str(values["model"]))
 
-    def load_problem(name: str) -> Problem:
-        config = AttackConfig(**{**values, "model": models[int(name)]})
+    def load_problem(model_index: str) -> Problem:
+        config = AttackConfig(**{**values, "model": models[int(model_index)]})
         return workbench.make_problem(
             workbench.load_parts(config), differentiated=False
         )
@@ -632,6 +786,12 @@ def sample_queries(
     """Yield configurations sampled uniformly from the full space and budget.
 
     Each has its own seed.
+
+    Args:
+        problem: problem of the model under test.
+        kind: kind of their seeds and stored rows.
+        count: number of configurations.
+        spp: samples per pixel.
     """
     for index in range(count):
         generator = torch.Generator().manual_seed(
@@ -639,9 +799,9 @@ def sample_queries(
         )
         (u,) = problem.domain.sample(generator)
         seed = seeds.stream(problem.seed, kind, index)
-        values = (
-            problem.describe(u, seed) if problem.domain.dim <= MAX_STORED_VALUES else {}
-        )
+        values = {}
+        if problem.domain.dim <= MAX_STORED_VALUES:
+            values = problem.describe(u, seed)
         yield workbench.Query(
             u, seed, kind, index, spp=spp, values=values, has_success=False
         )
@@ -650,7 +810,8 @@ def sample_queries(
 def threshold_mean(claim: ShareClaim | NoWorseClaim) -> float:
     """Return what the mean of the scores, from 0 to 1, has to exceed.
 
-    Of two models, a mean of 1/2 is that both are equally good.
+    Of two models, a mean of 1/2 is that both are equally good, and the mean falls by
+    1/2 if the model is right 100 percentage points less often.
     """
     if isinstance(claim, ShareClaim):
         return claim.at_least
@@ -669,12 +830,12 @@ def check_pictures(name: str, claim: AnyClaim, confidence: float) -> str:
     """
     if not isinstance(claim, ShareClaim | NoWorseClaim):
         return ""
-    threshold = threshold_mean(claim)
-    needed = max(
-        statistics.sequential.count_needed_samples(mean, confidence=confidence)
-        # what it takes to exceed the threshold, and to fall below it
-        for mean in (threshold, 1.0 - threshold)
+    count_needed = partial(
+        statistics.sequential.count_needed_samples, confidence=confidence
     )
+    threshold = threshold_mean(claim)
+    # to exceed the threshold, and to fall below it
+    needed = max(count_needed(threshold), count_needed(1.0 - threshold))
     if claim.pictures < needed:
         raise InputError(
             f"claims.{name}.pictures: expected at least {needed}, as fewer cannot both "
@@ -684,9 +845,8 @@ def check_pictures(name: str, claim: AnyClaim, confidence: float) -> str:
         )
     if not isinstance(claim, NoWorseClaim):
         return ""
-    needed_if_equal = statistics.sequential.count_needed_samples(
-        threshold, confidence=confidence, value=0.5
-    )
+    # Models that predict alike have a score of 1/2 on each picture.
+    needed_if_equal = count_needed(threshold, value=0.5)
     if claim.pictures >= needed_if_equal:
         return ""
     return (
@@ -699,41 +859,36 @@ def score_picture(
     claim: ShareClaim | NoWorseClaim,
     evaluation: policies.Evaluation,
     other: policies.Evaluation | None,
-) -> tuple[float | None, float, str]:
+) -> _PictureScore:
     """Score a picture for a claim.
+
+    The score is whether the model is right, or predicts as claimed. Of two models it is
+    1 if only the first is right, 0 if only the other is, else 1/2.
 
     Args:
         claim: what is claimed.
         evaluation: evaluation of the model under test.
         other: evaluation of the other side, if there is one.
-
-    Returns:
-        The score from 0 to 1: whether the model is right, or predicts as claimed; of
-        two models 1 if only the first is right, 0 if only the other is, else 1/2. None
-        if the object is out of view. How bad an example against the claim it is: the
-        task's score. And a description of that.
     """
-    before = evaluation.required_judgement.prediction
-    # pictures of two sizes need not show the same
-    is_hidden_from_other = (
-        isinstance(claim, NoWorseClaim)
-        and other is not None
-        and other.required_judgement.prediction.is_out_of_view
-    )
-    if before.is_out_of_view or is_hidden_from_other:
-        return None, 0.0, ""
+    judgement = evaluation.required_judgement
+    prediction = judgement.prediction
+    if prediction.is_out_of_view:
+        return _PictureScore(None)
     if other is None:
-        score = evaluation.required_judgement.score
-        badness = score if math.isfinite(score) else -math.inf
-        text = f"most wrong where it says {before.label}"
-        return float(evaluation.required_judgement.right), badness, text
+        badness = judgement.score if math.isfinite(judgement.score) else -math.inf
+        text = f"most wrong where it says {prediction.label}"
+        return _PictureScore(float(judgement.right), badness, text)
+    other_judgement = other.required_judgement
+    other_prediction = other_judgement.prediction
     if isinstance(claim, ChangeClaim):
-        after = other.required_judgement.prediction
-        text = f"{before.label} before and {after.label} after"
-        return float(workbench.meets_claim(claim.claim, before, after)), 0.0, text
-    is_right = int(evaluation.required_judgement.right)
-    is_other_right = int(other.required_judgement.right)
-    return (is_right - is_other_right + 1) / 2, 0.0, ""
+        text = f"{prediction.label} before and {other_prediction.label} after"
+        is_as_claimed = workbench.meets_claim(claim.claim, prediction, other_prediction)
+        return _PictureScore(float(is_as_claimed), text=text)
+    # pictures of two sizes need not show the same
+    if other_prediction.is_out_of_view:
+        return _PictureScore(None)
+    difference = int(judgement.right) - int(other_judgement.right)  # -1, 0 or 1
+    return _PictureScore((difference + 1) / 2)
 
 
 def _decide(
@@ -770,84 +925,70 @@ def _describe_sample(
         example: the worst example against the claim.
         task: name of the task.
     """
-    n_pictures = len(sample.scores)
     n_for = sample.scores.count(1.0)
-    n_against = sample.scores.count(0.0)
     if isinstance(claim, NoWorseClaim):
         lower, upper = _to_claim_scale(claim, *interval)
-        return words.describe_difference(
+        reason = words.describe_difference(
             sample.verdict,
-            (n_pictures, n_for, n_against),
-            (lower, upper),
-            claim.than,
+            n_pictures=len(sample.scores),
+            n_only_this=n_for,
+            n_only_other=sample.scores.count(0.0),
+            interval=(lower, upper),
+            other_model=claim.than,
         )
-    what = "as claimed"
-    outcomes = ""
-    if isinstance(claim, RightClaim):
-        what = "right"
-        outcome_counts = workbench.count_outcomes(sample.wrong_payloads)
-        outcomes = wording.format_outcomes(outcome_counts, task)
-    return words.describe_fraction(
-        what, sample.verdict, n_for, n_pictures, interval, example, outcomes
-    )
+    else:
+        is_right_claim = isinstance(claim, RightClaim)
+        outcomes = ""
+        if is_right_claim:
+            outcome_counts = workbench.count_outcomes(sample.wrong_payloads)
+            outcomes = wording.format_outcomes(outcome_counts, task)
+        reason = words.describe_fraction(
+            "right" if is_right_claim else "as claimed",
+            sample.verdict,
+            n_for,
+            len(sample.scores),
+            interval,
+            example,
+            outcomes,
+        )
+    if sample.n_hidden:
+        reason += (
+            f"; the object is not to be seen in {sample.n_hidden} more, "
+            "which are not counted"
+        )
+    return reason
 
 
-def _has_enough_trials(outcomes: Sequence[bool | None], *, over: bool) -> bool:
-    """Return whether further trials of a counterexample change nothing.
-
-    One scene that is right and wrong depends on the noise already. Otherwise it takes
-    `N_TRIALS` that count.
-
-    Args:
-        outcomes: whether the model is right in each; None does not count.
-        over: whether conditions vary.
-    """
-    n_right = outcomes.count(True)
-    n_wrong = outcomes.count(False)
-    depends_on_noise = n_right > 0 and n_wrong > 0 and not over
-    return depends_on_noise or n_right + n_wrong == N_TRIALS[over]
-
-
-def _trials_result(
-    outcomes: Sequence[bool | None],
-    label: str,
-    wrong_payloads: Sequence[Any],
-    problem: Problem,
-    *,
-    over: bool,
-) -> dict[str, Any]:
+def _trials_result(sample: _TrialSample, task: str, *, over: bool) -> dict[str, Any]:
     """Return what trials decide: fields of a `ClaimResult`.
 
     Args:
-        outcomes: whether the model is right in each; None does not count.
-        label: label of the first wrong prediction; empty without one.
-        wrong_payloads: payloads of the wrong predictions.
-        problem: problem of the model.
+        sample: the trials.
+        task: name of the task.
         over: whether conditions vary.
     """
-    n_right = outcomes.count(True)
-    n_wrong = outcomes.count(False)
-    total = n_right + n_wrong
-    verdict = decide_trials(n_right, n_wrong, over=over)
+    total = sample.n_right + sample.n_wrong
+    verdict = decide_trials(sample.n_right, sample.n_wrong, over=over)
     interval = None
     rate = None
     if total:
-        interval = statistics.intervals.clopper_pearson(n_right, total)
-        rate = n_right / total
+        interval = statistics.intervals.clopper_pearson(sample.n_right, total)
+        rate = sample.n_right / total
+    outcome_counts = workbench.count_outcomes(sample.wrong_payloads)
     reason = words.describe_trials(
         verdict,
-        (n_right, n_wrong, outcomes.count(None)),
-        label,
-        interval,
+        n_right=sample.n_right,
+        n_wrong=sample.n_wrong,
+        n_uncounted=sample.n_uncounted,
+        label=sample.label,
+        interval=interval,
         over=over,
-        outcomes=wording.format_outcomes(
-            workbench.count_outcomes(wrong_payloads), problem.task.name
-        ),
+        outcomes=wording.format_outcomes(outcome_counts, task),
     )
     return {
         "answer": verdict,
         "reason": reason,
-        "pictures": len(outcomes),
+        "pictures": len(sample.outcomes),
         "rate": rate,
         "interval": interval,
     }

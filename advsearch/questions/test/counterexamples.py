@@ -10,9 +10,10 @@ import hashlib
 import io
 import json
 import lzma
+import math
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isqrt
 from pathlib import Path
@@ -71,8 +72,20 @@ THUMBNAIL_SIDE = 128
 MAX_SIZE = 1 << 24
 # maximum bytes of memory to decompress a block
 MAX_MEMORY = 1 << 27
-# fresh renders that test a scene, and one under many conditions
-N_TRIALS = {False: 6, True: 20}
+# fresh renders that test a scene
+N_TRIALS_OF_SCENE = 6
+# fresh renders that test a scene under varying conditions
+N_TRIALS_OVER_CONDITIONS = 20
+
+
+def count_trials(*, over: bool) -> int:
+    """Return the number of fresh renders that test a counterexample.
+
+    Args:
+        over: whether conditions vary.
+    """
+    return N_TRIALS_OVER_CONDITIONS if over else N_TRIALS_OF_SCENE
+
 
 MODEL_SETTINGS = ("model", "labels", "prompt", "value_range", "ask", "ensemble")
 """Settings of the network under test.
@@ -143,29 +156,27 @@ class _Block(BaseModel):
                 they tile a texture (side, side, 3).
         """
         is_small = len(values) <= MAX_FINE_VALUES
+        stores_signs = signs and not is_small
+        step = COARSE_STEP
+        if is_small:
+            step = FINE_STEP
+        elif stores_signs:
+            # 1.0 where nothing differs: a step of 0 is none
+            step = float(np.abs(values).max()) or 1.0
         side = isqrt(len(values) // 3)
         is_texture = not is_small and 3 * side * side == len(values)
         if not is_texture or side % square != 0:
             square = 1
-        step = COARSE_STEP
-        if is_small:
-            step = FINE_STEP
-        elif signs:
-            # 1.0 where nothing differs: a step of 0 is none
-            step = float(np.abs(values).max()) or 1.0
+        square_values = values
         if square > 1:
-            n_squares = side // square  # along each side
-            squares = values.reshape(n_squares, square, n_squares, square, 3)
-            values = squares.mean(axis=(1, 3)).ravel()
-        steps = np.round(values / step).astype("<i2")
-        data = steps.tobytes()
-        if signs and not is_small:
-            data = _pack_signs(steps)
+            square_values = _average_squares(values, side, square)
+        steps = np.round(square_values / step).astype("<i2")
+        data = _pack_signs(steps) if stores_signs else steps.tobytes()
         compressed = lzma.compress(data, lzma.FORMAT_ALONE)
         return cls(
-            numbers=len(values) * square**2,
+            numbers=len(values),
             step=step,
-            signs=not is_small and signs,
+            signs=stores_signs,
             square=square,
             offsets=base64.b85encode(compressed).decode("ascii"),
         )
@@ -176,21 +187,9 @@ class _Block(BaseModel):
         Raises:
             ValueError, LZMAError: if they are corrupt.
         """
-        n_steps = self.numbers // self.square**2
-        n_bytes = 2 * n_steps
-        if self.signs:
-            n_bytes = -(-n_steps // 3)  # three in a byte, rounded up
-        decompressor = lzma.LZMADecompressor(memlimit=MAX_MEMORY)
-        # more than what is expected shows that it is another block
-        max_bytes = 2 * n_steps + 1
-        data = decompressor.decompress(base64.b85decode(self.offsets), max_bytes)
-        if len(data) != n_bytes:
-            raise ValueError(f"expected {n_steps} numbers, got others")
-        if self.signs:
-            steps = _unpack_signs(data, n_steps)
-        else:
-            steps = np.frombuffer(data, "<i2")
+        steps = self._decompress_steps()
         if self.square > 1:
+            # each step is of a square of texels
             n_squares = isqrt(self.numbers // 3) // self.square  # along each side
             squares = steps.reshape(n_squares, n_squares, 3)
             texels = squares.repeat(self.square, axis=0).repeat(self.square, axis=1)
@@ -198,10 +197,45 @@ class _Block(BaseModel):
         offsets: Floats = steps.astype(np.float32) * np.float32(self.step)
         return offsets
 
+    def _decompress_steps(self) -> np.ndarray[Any, Any]:
+        """Return the steps of the stored values as integers (n / square^2,).
+
+        Raises:
+            ValueError, LZMAError: if they are corrupt.
+        """
+        n_steps = self.numbers // self.square**2
+        n_bytes = 2 * n_steps
+        if self.signs:
+            n_bytes = math.ceil(n_steps / 3)  # three in a byte
+        decompressor = lzma.LZMADecompressor(memlimit=MAX_MEMORY)
+        # more than what is expected shows that it is another block
+        max_bytes = 2 * n_steps + 1
+        data = decompressor.decompress(base64.b85decode(self.offsets), max_bytes)
+        if len(data) != n_bytes:
+            raise ValueError(f"expected {n_steps} numbers, got others")
+        if self.signs:
+            return _unpack_signs(data, n_steps)
+        return np.frombuffer(data, "<i2")
+
+
+def _average_squares(values: Floats, side: int, square: int) -> Floats:
+    """Return the means of squares of texels of a texture (side, side, 3), flattened.
+
+    Args:
+        values: the texels, flattened.
+        side: side of the texture.
+        square: side of a square of texels, which divides that of the texture.
+    """
+    n_squares = side // square  # along each side
+    squares = values.reshape(n_squares, square, n_squares, square, 3)
+    means: Floats = squares.mean(axis=(1, 3)).ravel()
+    return means
+
 
 def _pack_signs(steps: np.ndarray[Any, Any]) -> bytes:
     """Pack three values from -1 to 1 into each byte, as digits of base 3."""
-    threes = np.pad(steps, (0, -len(steps) % 3)).reshape(-1, 3)
+    n_missing = -len(steps) % 3  # to a multiple of three
+    threes = np.pad(steps, (0, n_missing)).reshape(-1, 3)
     packed = threes @ (9, 3, 1) + 13  # 13: adds 1 to each digit, so that none is -1
     return bytes(packed.astype(np.uint8).tobytes())
 
@@ -369,25 +403,29 @@ def evaluate_trial(
     return trial.right
 
 
-def decide_trials(right: int, wrong: int, *, over: bool) -> str:
+def decide_trials(n_right: int, n_wrong: int, *, over: bool) -> str:
     """Return the verdict of the trials that count.
 
     One scene is held if all are right, and failed if all are wrong. Over conditions a
     run counts as found at a rate of 90 %, so the scene is held if the model is right in
     as many, and failed if it is wrong in more than half with 95 % confidence.
+
+    Args:
+        n_right, n_wrong: trials in which the model is right, and in which it is wrong.
+        over: whether conditions vary.
     """
-    total = right + wrong
+    total = n_right + n_wrong
     if not over:
-        depends_on_noise = right > 0 and wrong > 0
-        if total < N_TRIALS[over] or depends_on_noise:
+        depends_on_noise = n_right > 0 and n_wrong > 0
+        if total < N_TRIALS_OF_SCENE or depends_on_noise:
             return UNDECIDED
-        return HELD if right else FAILED
+        return HELD if n_right else FAILED
     if total:
-        lower, _ = statistics.intervals.clopper_pearson(wrong, total)
+        lower, _ = statistics.intervals.clopper_pearson(n_wrong, total)
         if lower >= workbench.MIN_RATE:
             return FAILED
     rule = workbench.OVER_CONDITIONS
-    if total >= rule.min_trials and right >= rule.count_percent(total):
+    if total >= rule.min_trials and n_right >= rule.count_percent(total):
         return HELD
     return UNDECIDED
 
@@ -397,22 +435,26 @@ def _is_wrong_on(
 ) -> bool:
     """Return whether the run's own model fails on the stored scene, with fresh seeds.
 
-    With `over` the clean scene is rendered too, under the same conditions. Without it,
-    the first trial that is right decides.
+    Args:
+        example: the counterexample as it is stored.
+        problem: problem of the run.
+        trials: number of trials; of one scene, the first that is right ends them.
+        over: whether conditions vary; then the clean scene is rendered too, under the
+            same conditions.
     """
     start = problem.domain.start
     u = problem.domain.project(example.make_configuration(start))
+    configurations = [u, start] if over else [u]
     outcomes = list[bool | None]()
     for index in range(trials):
         seed = seeds.stream(problem.seed, "kept", index)
         judgements = []
-        configurations = [u, start] if over else [u]
         for configuration in configurations:
             picture = problem.picture(configuration, seed, example.spp)
-            full = problem.add_conditions(configuration, seed)
-            judgements.append(problem.judge(picture, full))
-        outcomes.append(evaluate_trial(*judgements))
-        is_right = outcomes[-1]
+            full_configuration = problem.add_conditions(configuration, seed)
+            judgements.append(problem.judge(picture, full_configuration))
+        is_right = evaluate_trial(*judgements)
+        outcomes.append(is_right)
         if is_right and not over:
             return False
     n_right = outcomes.count(True)
@@ -461,7 +503,14 @@ def _make_values(
     summary: workbench.AttackSummary,
     parts: workbench.AttackParts,
 ) -> dict[str, Any]:
-    """Return what the file of a counterexample holds."""
+    """Return what the file of a counterexample holds, except for its blocks.
+
+    Args:
+        config: settings of the run.
+        path: directory of the run.
+        summary: summary of the run.
+        parts: what the run loaded.
+    """
     verified = summary.verified
     assert verified is not None
     stored_settings = {
@@ -469,17 +518,18 @@ def _make_values(
         for name, value in config.to_json().items()
         if name not in NOT_DECIDING
     }
-    deciding = make_paths_relative(select_deciding_settings(config))
-    values: dict[str, Any] = {
+    # Those of the network are stored, but their files are not: the suite may replace
+    # them all.
+    settings_with_files = make_paths_relative(select_deciding_settings(config))
+    return {
         "schema": 1,
         "run": path.name,
-        "said": next(iter(verified.labels), ""),
+        "said": next(iter(verified.labels), ""),  # the most frequent one
         "settings": make_paths_relative(stored_settings),
-        "files": directory.summary.compute_file_digests(deciding),
+        "files": directory.summary.compute_file_digests(settings_with_files),
         "scene": compute_scene_digest(parts.scene.description),
         "spp": verified.spp,
     }
-    return values
 
 
 def _write_smallest(
@@ -504,17 +554,37 @@ def _write_smallest(
     """
     block_sizes = [block.size for block in problem.domain.blocks]
     blocks = np.split(offsets, np.cumsum(block_sizes)[:-1])
-    forms = FORMS if max(block_sizes) > MAX_FINE_VALUES else FORMS[-1:]
-    # one scene is tested twice as often as the suite will test it
-    trials = N_TRIALS[over] if over else 2 * N_TRIALS[over]
-    for form in forms:
-        stored = [_Block.quantize(block, *form).model_dump() for block in blocks]
-        text = json.dumps({**values, "blocks": stored}, indent=1)
-        path = writing.write_text(base.with_name(f"{base.name}.json"), text + "\n")
-        example = _read(path)
-        if form == forms[-1] or _is_wrong_on(example, problem, trials, over=over):
-            break
-    return example
+    has_large_block = max(block_sizes) > MAX_FINE_VALUES
+    *coarse_forms, finest_form = FORMS if has_large_block else FORMS[-1:]
+    trials = count_trials(over=over)
+    if not over:
+        trials *= 2  # one scene is tested twice as often as the suite will test it
+    for signs, square in coarse_forms:
+        example = _write_form(base, values, blocks, signs, square)
+        if _is_wrong_on(example, problem, trials, over=over):
+            return example
+    return _write_form(base, values, blocks, *finest_form)
+
+
+def _write_form(
+    base: Path,
+    values: Mapping[str, Any],
+    blocks: Sequence[Floats],
+    signs: bool,
+    square: int,
+) -> Counterexample:
+    """Write a counterexample in a form, and return it as it is read back.
+
+    Args:
+        base: path of the file without suffix.
+        values: content of the file except for the blocks.
+        blocks: offsets of each block from the clean scene.
+        signs, square: the form; see `FORMS`.
+    """
+    stored = [_Block.quantize(block, signs, square).model_dump() for block in blocks]
+    text = json.dumps({**values, "blocks": stored}, indent=1)
+    path = writing.write_text(base.with_name(f"{base.name}.json"), text + "\n")
+    return _read(path)
 
 
 def _name_counterexample(run: Path) -> str:
@@ -573,20 +643,7 @@ def _read(path: Path) -> Counterexample:
     Raises:
         FileFormatError: if the file is none, or corrupt.
     """
-    try:
-        text = stored_files.read_text(path, "a counterexample", MAX_SIZE)
-        content = _File.model_validate(stored_files.parse_json(text))
-        offsets = np.concatenate([block.dequantize() for block in content.blocks])
-    except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        got = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"[:120]
-        raise errors.FileFormatError(
-            f"{path}: expected a counterexample, got one with {got}; remove it"
-        ) from None
-    except (OSError, ValueError, lzma.LZMAError) as error:
-        raise errors.FileFormatError(
-            f"{path}: expected a counterexample, got {str(error)[:80]}; remove it"
-        ) from None
+    content, offsets = _read_content(path)
     try:
         config = AttackConfig(**content.settings)
     except InputError as error:
@@ -601,6 +658,30 @@ def _read(path: Path) -> Counterexample:
         spp=content.spp,
         clean_offsets=offsets,
     )
+
+
+def _read_content(path: Path) -> tuple[_File, Floats]:
+    """Read the content of a counterexample's file, and its offsets (d,).
+
+    Raises:
+        FileFormatError: if the file is none, or corrupt.
+    """
+    try:
+        text = stored_files.read_text(path, "a counterexample", MAX_SIZE)
+        content = _File.model_validate(stored_files.parse_json(text))
+        offsets = np.concatenate([block.dequantize() for block in content.blocks])
+        return content, offsets
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        location = ".".join(map(str, first["loc"]))
+        got = f"{location}: {first['msg']}"[:120]
+        raise errors.FileFormatError(
+            f"{path}: expected a counterexample, got one with {got}; remove it"
+        ) from None
+    except (OSError, ValueError, lzma.LZMAError) as error:
+        raise errors.FileFormatError(
+            f"{path}: expected a counterexample, got {str(error)[:80]}; remove it"
+        ) from None
 
 
 # file of the accepted verdicts of claims that are not held
@@ -624,10 +705,9 @@ def read_expected(suite: str) -> dict[str, str]:
             f"{path}: expected verdicts by claim, got {str(error)[:80]}; remove it"
         ) from None
     verdicts = values.get("expected") if isinstance(values, dict) else None
-    is_valid = isinstance(verdicts, dict) and set(map(str, verdicts.values())) <= set(
+    if not isinstance(verdicts, dict) or not set(map(str, verdicts.values())) <= set(
         VERDICTS
-    )
-    if not isinstance(verdicts, dict) or not is_valid:
+    ):
         raise errors.FileFormatError(
             f"{path}: expected verdicts by claim, got something else; remove it"
         )

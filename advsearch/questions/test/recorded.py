@@ -27,20 +27,24 @@ def read_noted_settings(
     with Store.open_to_read(run) as store:
         suite = store.read_json_note(SUITE_NOTE)
         examples = store.read_json_note(SETTINGS_NOTE)
-    not_tried = (Cause.COUNTEREXAMPLE_FAILED, Cause.NOT_REACHED)
-    tried = {claim.name for claim in result.claims if claim.cause not in not_tried}
+    tested = {
+        claim.name
+        for claim in result.claims
+        if claim.cause not in (Cause.COUNTEREXAMPLE_FAILED, Cause.NOT_REACHED)
+    }
     settings: dict[str, dict[str, Mapping[str, Any]]] = {}
+    # what is raised for a corrupt suite
     with suppress(KeyError, AttributeError, TypeError, ValueError):
         settings["claim"] = {
             name: values
             for name, values in _settings_of_claims(suite).items()
-            if name in tried
+            if name in tested
         }
     if isinstance(examples, Mapping):
         settings["counterexample"] = {
             name: values
             for name, values in examples.items()
-            if name in tried and isinstance(values, Mapping)
+            if name in tested and isinstance(values, Mapping)
         }
     return settings
 

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator, Sequence
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 from urllib.parse import quote
 from xml.etree import ElementTree
 
@@ -193,45 +193,43 @@ def make_view(result: SuiteResult) -> ShownResult:
 def describe_claim(claim: AnyClaim, config: SceneConfig) -> str:
     """Describe what is claimed in a sentence."""
     model = wording.shorten_name(config.model)
-    what = f"{wording.shorten_name(config.object)}, {', '.join(config.controls)}"
+    subject = f"{wording.shorten_name(config.object)}, {', '.join(config.controls)}"
     if isinstance(claim, RightClaim):
         pictures = "the frames" if "path" in config.controls else "the pictures"
-        share = (
-            f"at least {wording.percent(claim.at_least)} of {pictures} that the "
-            "ranges span"
+        return (
+            f"{model} is right in at least {wording.percent(claim.at_least)} of "
+            f"{pictures} that the ranges span: {subject}"
         )
-        return f"{model} is right in {share}: {what}"
     if isinstance(claim, ChangeClaim):
-        says = "says the same"
+        answer = "the same"
         if claim.claim == "must_change":
-            says = "says something else"
+            answer = "something else"
         changes = {**SweepConfig.blind_changes, **SweepConfig.harmless_changes}
-        when = (
-            f"{changes[claim.when]}, in at least {wording.percent(claim.at_least)} "
-            "of pictures"
+        return (
+            f"{model} says {answer} when {changes[claim.when]}, in at least "
+            f"{wording.percent(claim.at_least)} of pictures: {subject}"
         )
-        return f"{model} {says} when {when}: {what}"
     if isinstance(claim, NoWorseClaim):
         points = f"{wording.format_number(claim.points)} points"
         other = wording.shorten_name(claim.than)
         return (
             f"{model} is right at most {points} less often than {other} "
-            f"on the same pictures of {what}"
+            f"on the same pictures of {subject}"
         )
     epsilon = getattr(config, "epsilon", None)
     budget = ""
     if isinstance(epsilon, float):
         budget = f" within {wording.format_number(epsilon)}"
-    elif epsilon is not None:
+    elif epsilon is not None:  # several, as the text that was set
         budget = f" within {epsilon}"
-    return f"no search finds a picture that {model} gets wrong: {what}{budget}"
+    return f"no search finds a picture that {model} gets wrong: {subject}{budget}"
 
 
 def describe_fraction(
     claimed: str,
     verdict: str,
-    right: int,
-    pictures: int,
+    n_right: int,
+    n_pictures: int,
     interval: tuple[float, float],
     worst: str,
     outcomes: str = "",
@@ -241,20 +239,20 @@ def describe_fraction(
     Args:
         claimed: what is claimed of a picture.
         verdict: HELD, FAILED or UNDECIDED.
-        right: number of pictures of which it holds.
-        pictures: number of all pictures.
+        n_right: number of pictures of which it holds.
+        n_pictures: number of all pictures.
         interval: interval of the fraction that holds at all times jointly.
         worst: where it did not hold; empty if it always did.
         outcomes: the outcomes of a detector in the other pictures, or empty.
     """
     reason = "no picture"
-    if pictures:
+    if n_pictures:
         interval_text = wording.format_interval(interval)
-        reason = f"{claimed} in {right} of {pictures} (interval {interval_text})"
+        reason = f"{claimed} in {n_right} of {n_pictures} (interval {interval_text})"
     if outcomes:
         reason += f"; {outcomes}"
     if verdict == UNDECIDED:
-        reason += f"; not decided after {wording.format_count(pictures, 'picture')}"
+        reason += f"; not decided after {wording.format_count(n_pictures, 'picture')}"
     if worst:
         reason += f"; {worst}"
     return reason
@@ -262,7 +260,10 @@ def describe_fraction(
 
 def describe_difference(
     verdict: str,
-    counts: tuple[int, int, int],
+    *,
+    n_pictures: int,
+    n_only_this: int,
+    n_only_other: int,
     interval: tuple[float, float],
     other_model: str,
 ) -> str:
@@ -270,34 +271,49 @@ def describe_difference(
 
     Args:
         verdict: HELD, FAILED or UNDECIDED.
-        counts: all pictures, those in which only the model under test is right, and
-            those in which only the other one is.
+        n_pictures: number of all pictures.
+        n_only_this: pictures in which only the model under test is right.
+        n_only_other: pictures in which only the other one is.
         interval: interval of the difference of their fractions.
         other_model: the other model.
     """
-    pictures, only_this, only_other = counts
-    if not pictures:
+    if not n_pictures:
         return "no picture"
+    pictures = wording.format_count(n_pictures, "picture")
     bounds = " to ".join(f"{100.0 * bound:+.1f}" for bound in interval)
-    points = 100.0 * (only_this - only_other) / pictures
+    points = 100.0 * (n_only_this - n_only_other) / n_pictures
     reason = (
-        f"of {wording.format_count(pictures, 'picture')} it alone is right in {only_this}, "
-        f"{wording.shorten_name(other_model)} alone in {only_other} "
+        f"of {pictures} it alone is right in {n_only_this}, "
+        f"{wording.shorten_name(other_model)} alone in {n_only_other} "
         f"(difference {points:+.1f} points, interval {bounds})"
     )
     if verdict == UNDECIDED:
-        reason += f"; not decided after {wording.format_count(pictures, 'picture')}"
+        reason += f"; not decided after {pictures}"
     return reason
+
+
+class SearchVerdict(NamedTuple):
+    """What a search shows about a claim that nothing breaks a model.
+
+    Attributes:
+        verdict: HELD, FAILED or UNDECIDED.
+        reason: the reason in words.
+        cause: why it is undecided, if the search is not finished.
+    """
+
+    verdict: str
+    reason: str
+    cause: Cause | None = None
 
 
 def evaluate_search(
     summary: workbench.AttackSummary, config: AttackConfig
-) -> tuple[str, str, Cause | None]:
-    """Return the verdict of a search, its reason, and the cause if it is not finished.
+) -> SearchVerdict:
+    """Return what a search shows about a claim that nothing breaks a model.
 
-    A claim fails if the clean scene is wrong already, or a wrong prediction is
+    The claim fails if the clean scene is wrong already, or a wrong prediction is
     verified. It is undecided if what was found is wrong in some trials only, or the
-    time ended the search; else it is held.
+    search is not finished; else it is held.
 
     Args:
         summary: summary of the search.
@@ -305,42 +321,44 @@ def evaluate_search(
     """
     verified = summary.verified
     if summary.ending == "already wrong":
-        return FAILED, _clean_reason(summary), None
+        return SearchVerdict(FAILED, _clean_reason(summary))
     if summary.ending == "found" and verified is not None:
         prediction = describe_wrong_prediction(summary.task, verified)
         interval = wording.format_interval(verified.interval)
-        wrong = (
-            f"wrong in {verified.successes} of {verified.trials} trials (interval "
-            f"{interval})"
+        reason = (
+            f"a verified counterexample: wrong in {verified.successes} of "
+            f"{verified.trials} trials (interval {interval}){prediction}"
         )
-        return FAILED, f"a verified counterexample: {wrong}{prediction}", None
+        return SearchVerdict(FAILED, reason)
     if summary.is_unfinished:
-        return UNDECIDED, INTERRUPTED_REASON, Cause.INTERRUPTED
+        return SearchVerdict(UNDECIDED, INTERRUPTED_REASON, Cause.INTERRUPTED)
     if verified is not None and verified.successes:
         reason = (
             f"what it found is wrong in {verified.successes} of {verified.trials} "
             "trials, by noise"
         )
-        return UNDECIDED, reason, None
+        return SearchVerdict(UNDECIDED, reason)
     max_steps = config.steps
-    has_limit = config.seconds is not None
-    if has_limit and max_steps is not None and summary.steps < max_steps:
+    has_time_limit = config.seconds is not None
+    if has_time_limit and max_steps is not None and summary.steps < max_steps:
         reason = f"{OUT_OF_TIME_REASON} after {summary.steps} of {max_steps} steps"
-        return UNDECIDED, reason, Cause.OUT_OF_TIME
+        return SearchVerdict(UNDECIDED, reason, Cause.OUT_OF_TIME)
     baseline = "" if summary.baseline is None else ", nor by as many random renders"
     steps = wording.format_count(summary.steps, "step")
     reason = f"not broken by {steps} of {summary.policy}{baseline}; this is no proof"
-    return HELD, reason, None
+    return SearchVerdict(HELD, reason)
 
 
 def _clean_reason(summary: workbench.AttackSummary) -> str:
     """Describe that the model is wrong on the clean scene."""
     reason = "wrong on the clean scene already"
-    clean = summary.clean.control
-    if clean is not None:
-        reason += f": right in {clean.correct} of {clean.trials} trials"
-        if clean.outcomes:
-            reason += f", {wording.format_outcomes(clean.outcomes, summary.task)}"
+    clean_trials = summary.clean.control
+    if clean_trials is None:
+        return reason
+    reason += f": right in {clean_trials.correct} of {clean_trials.trials} trials"
+    if clean_trials.outcomes:
+        outcomes = wording.format_outcomes(clean_trials.outcomes, summary.task)
+        reason += f", {outcomes}"
     return reason
 
 
@@ -359,10 +377,12 @@ def describe_unsuitable(error: str) -> str:
 
 def describe_trials(
     verdict: str,
-    counts: tuple[int, int, int],
+    *,
+    n_right: int,
+    n_wrong: int,
+    n_uncounted: int,
     label: str,
     interval: tuple[float, float] | None,
-    *,
     over: bool,
     outcomes: str = "",
 ) -> str:
@@ -370,56 +390,67 @@ def describe_trials(
 
     Args:
         verdict: HELD, FAILED or UNDECIDED.
-        counts: trials in which the model is right, in which it is wrong, and which do
-            not count.
+        n_right, n_wrong: trials in which the model is right, and in which it is wrong.
+        n_uncounted: trials that do not count.
         label: the first wrong prediction.
         interval: interval of the fraction of right trials; None if no trial counts.
         over: whether conditions vary.
         outcomes: the outcomes of a detector in the wrong trials, or empty.
     """
-    right, wrong, uncounted = counts
-    trials = "conditions in which the clean scene is right" if over else "trials"
     if interval is None:
-        if over and uncounted:
-            return (
-                f"none of {uncounted} conditions counts: the clean scene is wrong, "
-                "or the object not to be seen"
-            )
-        return (
-            "nothing of the object is to be seen" if uncounted else OUT_OF_TIME_REASON
-        )
-    if not wrong:
+        return _describe_uncounted(n_uncounted, over=over)
+    trials = "conditions in which the clean scene is right" if over else "trials"
+    if not n_wrong:
         interval_text = wording.format_interval(interval)
-        reason = f"right in {right} of {right} {trials} (interval {interval_text})"
+        reason = f"right in {n_right} of {n_right} {trials} (interval {interval_text})"
     else:
-        lower, upper = interval
+        lower, upper = interval  # of right trials
         interval_text = wording.format_interval((1.0 - upper, 1.0 - lower))
         reason = (
-            f"wrong in {wrong} of {right + wrong} {trials} (interval {interval_text})"
+            f"wrong in {n_wrong} of {n_right + n_wrong} {trials} "
+            f"(interval {interval_text})"
         )
         reason += f": {outcomes}" if outcomes else f", {wording.add_article(label)}"
-    if verdict == UNDECIDED and right and wrong:
+    if verdict == UNDECIDED and n_right and n_wrong:
         cause = "conditions" if over else "noise"
         reason += f": it depends on the {cause}"
-    if uncounted:
+    if n_uncounted:
         why = "the object is not to be seen"
         if over:
             why = "the clean scene is wrong, or the object not to be seen"
-        reason += f"; {uncounted} more are not counted, as {why}"
+        reason += f"; {n_uncounted} more are not counted, as {why}"
     return reason
+
+
+def _describe_uncounted(n_uncounted: int, *, over: bool) -> str:
+    """Describe why a counterexample is undecided of which no trial counts.
+
+    Args:
+        n_uncounted: trials that do not count; without any, the time was over.
+        over: whether conditions vary.
+    """
+    if not n_uncounted:
+        return OUT_OF_TIME_REASON
+    if not over:
+        return "nothing of the object is to be seen"
+    return (
+        f"none of {n_uncounted} conditions counts: the clean scene is wrong, "
+        "or the object not to be seen"
+    )
 
 
 def make_table_rows(result: SuiteResult) -> list[list[str]]:
     """Return the rows of the table of claims."""
     rows = []
     for claim in result.claims:
-        answer = claim.answer
+        verdict = claim.answer
         if claim.expected != HELD:
             if claim.answer == claim.expected:
-                answer += " (as expected)"
+                verdict += " (as expected)"
             else:
-                answer += f" (expected: {claim.expected})"
-        rows.append([claim.name, answer, str(claim.pictures or ""), claim.reason])
+                verdict += f" (expected: {claim.expected})"
+        n_pictures = str(claim.pictures or "")  # an empty cell if there are none
+        rows.append([claim.name, verdict, n_pictures, claim.reason])
     return rows
 
 
@@ -647,6 +678,7 @@ def format_markdown(result: SuiteResult) -> str:
 
 
 def _picture_path(result: SuiteResult, claim: ClaimResult) -> str:
+    """Return the path of a claim's picture; empty without one."""
     return f"{result.run}/{claim.picture}" if claim.picture else ""
 
 

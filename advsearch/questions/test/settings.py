@@ -174,6 +174,8 @@ NUMBER_FIELDS = ("at_least", "points", "pictures", "confidence", "seconds", "see
 
 
 class _YamlModel(BaseModel):
+    """A part of a suite's file, in which every name has to be known."""
+
     model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
 
     @field_validator(*NUMBER_FIELDS, mode="before", check_fields=False)
@@ -188,6 +190,8 @@ class _YamlModel(BaseModel):
 
 
 class _Claim(_YamlModel):
+    """A claim, with settings that override those of the suite."""
+
     config_type: ClassVar[type[SceneConfig]]
     settings: Settings = Field(default_factory=dict)
 
@@ -264,7 +268,7 @@ class NoWorseClaim(_PicturesClaim):
 
 ChangeClaim = MustChangeClaim | MustNotChangeClaim
 AnyClaim = RightClaim | NotBrokenClaim | NoWorseClaim | ChangeClaim
-"""The kinds of claims; each is tested by a method of `Trial`."""
+"""The kinds of claims; `ClaimTester` tests them."""
 
 CLAIM_KINDS = ("right", "not_broken", "no_worse", "must_change", "must_not_change")
 
@@ -356,16 +360,19 @@ def parse_suite(data: Mapping[str, object], where: str) -> Suite:
     try:
         return Suite(**values)
     except ValidationError as error:
-        details = error.errors(include_url=False)
-        # a typing error in a name explains other problems
-        unknown = [each for each in details if each["type"] == "extra_forbidden"]
-        first = (unknown or details)[0]
+        problems = error.errors(include_url=False)
+        # a typing error in a name explains other problems, so it is reported first
+        unknown_names = [
+            problem for problem in problems if problem["type"] == "extra_forbidden"
+        ]
+        first = (unknown_names or problems)[0]
         raise errors.FileFormatError(f"{where}: {_describe_error(first)}") from None
 
 
 def _describe_error(error: Any) -> str:
     """Describe a problem that pydantic found, with what was expected."""
     kind = error["type"]
+    # pydantic puts the kind of a claim into its path
     location = [str(part) for part in error["loc"] if part not in CLAIM_KINDS]
     got = settings.format_value(error["input"])
     if location[-1] == "[key]":  # a name that is a number
@@ -373,7 +380,7 @@ def _describe_error(error: Any) -> str:
             f"{location[0]}: expected names of small letters, digits and hyphens, got "
             f"{got}; put it in quotes"
         )
-    if kind.startswith("union_tag"):
+    if kind.startswith("union_tag"):  # the field `claim`, which tells the kind
         location.append("claim")
         got = "nothing"
         if kind != "union_tag_not_found":
@@ -384,7 +391,10 @@ def _describe_error(error: Any) -> str:
         return f"{where}: {_describe_unknown_name(name, in_claim=len(location) > 2)}"
     if kind == "value_error":
         return f"{where}: {str(error['msg']).removeprefix('Value error, ')}"
-    got = {"missing": "nothing", "too_short": "none"}.get(kind, got)
+    if kind == "missing":
+        got = "nothing"
+    elif kind == "too_short":
+        got = "none"
     return f"{where}: expected {EXPECTED_VALUES.get(name, CLAIM_EXAMPLE)}, got {got}"
 
 

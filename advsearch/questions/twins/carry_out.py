@@ -45,6 +45,8 @@ from advsearch.questions.twins.result import (
 
 LOW_OVERLAP = 0.8  # of silhouettes: below it a pose is doubted
 IMAGE_SIZE = 160  # longer side, pixels, of images on the page
+# the photograph, the twin in it, and that in the environment; not the hole
+N_STORED_IMAGES = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +54,8 @@ class Selection:
     """The objects in photographs that a run compares.
 
     Attributes:
+        objects: objects of all rows; the place of one is the number of its row.
         windows: windows of the rows that are used, by their number.
-        objects: objects of all rows.
         warnings: warnings about what was left out.
     """
 
@@ -158,6 +160,8 @@ def load_judges(
 ) -> tuple[list[ModelJudge], list[str]]:
     """Load the models, and return a judge for each, and warnings.
 
+    Models of single frames have one judge together.
+
     Args:
         config: config of the run.
         network: as for `run_twins`.
@@ -166,10 +170,12 @@ def load_judges(
         InputError: the models take images of different sizes.
     """
     task = workbench.make_task(config.task)
-    by_frame = network if isinstance(network, Mapping) else {}
-    networks = list(dict.fromkeys(by_frame.values())) or [network]
+    network_of_frame = network if isinstance(network, Mapping) else {}
+    networks: list[Any] = [network]
     if network is None:
         networks = list(settings.split_names(config.model))
+    elif network_of_frame:
+        networks = list(dict.fromkeys(network_of_frame.values()))
     scene_config: Any = config
     models, warnings = workbench.load_models(networks, task, scene_config)
     if len({model.input_size for model in models}) > 1:
@@ -181,12 +187,13 @@ def load_judges(
             f"model: expected models that take pictures of one size, got {sizes}; "
             "compare them one by one"
         )
-    if by_frame:
-        model_of_frame = {
-            frame: models[networks.index(model)] for frame, model in by_frame.items()
-        }
-        return [ModelJudge(task, models[0], model_of_frame)], warnings
-    return [ModelJudge(task, model, {}) for model in models], warnings
+    if not network_of_frame:
+        return [ModelJudge(task, model, {}) for model in models], warnings
+    model_of_frame = {
+        frame: models[networks.index(frame_network)]
+        for frame, frame_network in network_of_frame.items()
+    }
+    return [ModelJudge(task, models[0], model_of_frame)], warnings
 
 
 class Comparison:
@@ -223,38 +230,61 @@ class Comparison:
     def select(self, objects: Sequence[PhotographedObject]) -> Selection:
         """Choose the rows that are used, and their windows.
 
+        Left out are other frames, objects that are mostly hidden, and objects that are
+        out of view or tiny.
+
         Raises:
             InputError: none is left, or a model does not know a label.
         """
         is_frame = parse_frames(self._config.frames)
+        candidates = {
+            number: item for number, item in enumerate(objects) if is_frame(item.frame)
+        }
+        visible = {
+            number: item
+            for number, item in candidates.items()
+            if not self._is_hidden(item)
+        }
         assets: dict[Path, Any] = {}
         windows: dict[int, rendering.PhotoWindow] = {}
-        n_hidden = 0
-        n_outside = 0
-        for number, item in enumerate(objects):
-            if not is_frame(item.frame):
-                continue
-            if item.visible is not None and item.visible < self._config.visible:
-                n_hidden += 1
-                continue
+        for number, item in visible.items():
             if item.mesh not in assets:
                 for judge in self._judges:
                     judge.task.check(self._make_facts(item))
                 self._context.progress.stage(f"reading {item.object}")
                 assets[item.mesh] = self._load_asset(item)
-            positions = rendering.project_object(item, assets[item.mesh])
-            photograph = self._load_photograph(item.photograph)
-            window = rendering.choose_window(
-                positions, photograph.full_size, self._size, self.margin
-            )
-            if window is None:
-                n_outside += 1
-            else:
+            window = self._choose_window(item, assets[item.mesh])
+            if window is not None:
                 windows[number] = window
         if not windows:
             raise InputError(
                 "photographs: no object is left; check `frames` and `visible`"
             )
+        warnings = self._describe_left_out(
+            n_hidden=len(candidates) - len(visible),
+            n_outside=len(visible) - len(windows),
+        )
+        return Selection(objects, windows, warnings)
+
+    def _is_hidden(self, item: PhotographedObject) -> bool:
+        """Return whether less of an object is visible than `visible` asks for.
+
+        False where the data does not state how much is.
+        """
+        return item.visible is not None and item.visible < self._config.visible
+
+    def _choose_window(
+        self, item: PhotographedObject, asset: Any
+    ) -> rendering.PhotoWindow | None:
+        """Return the window around an object in its photograph; None if out of view."""
+        positions = rendering.project_object(item, asset)
+        photograph = self._load_photograph(item.photograph)
+        return rendering.choose_window(
+            positions, photograph.full_size, self._size, self.margin
+        )
+
+    def _describe_left_out(self, n_hidden: int, n_outside: int) -> list[str]:
+        """Return warnings about how many objects were left out, and why."""
         warnings = []
         if n_hidden:
             warnings.append(
@@ -266,57 +296,68 @@ class Comparison:
                 f"{n_outside} objects are out of view or smaller than "
                 f"{rendering.MIN_SILHOUETTE:g} pixels and left out."
             )
-        return Selection(objects, windows, warnings)
+        return warnings
 
     def _load_asset(self, item: PhotographedObject) -> Any:
+        """Return the object that a photograph shows; one that was read is cached."""
         return rendering.load_object(item.mesh, item.unit)
 
     def compare(self, selection: Selection, measurements: Any) -> Iterator[TwinRow]:
-        """Yield the rows, object by object, so that each mesh is loaded once."""
-        context = self._context
-        context.progress.stage("twins", len(selection.windows))
+        """Yield the rows, object by object, so that each mesh is loaded once.
+
+        Args:
+            selection: rows that are compared.
+            measurements: `Measurements` of the run, where finished rows are stored.
+        """
+        self._context.progress.stage("twins", len(selection.windows))
+        # Objects of one mesh and one camera's pixels share a renderer.
         groups: dict[tuple[Path, float], list[int]] = {}
         for number in selection.windows:
             item = selection.objects[number]
             key = (item.mesh, round(item.camera.pixel_aspect, 3))
             groups.setdefault(key, []).append(number)
         for numbers in groups.values():
-            missing = [
-                number
-                for number in numbers
-                if any(
-                    measurements.read(make_row_name(number, index)) is None
-                    for index in range(len(self._judges))
+            yield from self._compare_group(numbers, selection, measurements)
+            gc.collect()  # frees the renderer of the group
+
+    def _compare_group(
+        self, numbers: Sequence[int], selection: Selection, measurements: Any
+    ) -> Iterator[TwinRow]:
+        """Yield the rows of objects with one mesh, each for all models."""
+        missing = [
+            number for number in numbers if not self._is_stored(number, measurements)
+        ]
+        layers = self._render_layers(selection, missing)
+        # Mitsuba can't record renders of one scene while another one lives.
+        gc.collect()
+        renderer = None
+        if missing:
+            renderer = self._make_renderer(
+                rendering.SurroundedRenderer,
+                self._config.environment_name,
+                selection,
+                missing,
+            )
+        for number in numbers:
+            layer = layers.pop(number, None)
+            # rendered once for all models, and not at all where all rows are stored
+            make_twin = cache(
+                partial(self._make_twin, number, selection, layer, renderer)
+            )
+            for index, judge in enumerate(self._judges):
+                yield measurements.get_row(
+                    make_row_name(number, index),
+                    TwinRow,
+                    partial(self._compare_object, number, selection, make_twin, judge),
                 )
-            ]
-            # Mitsuba can't record renders of one scene while another one lives.
-            layers = self._render_layers(selection, missing)
-            gc.collect()
-            renderer = None
-            if missing:
-                renderer = self._make_renderer(
-                    rendering.SurroundedRenderer,
-                    self._config.environment_name,
-                    selection,
-                    missing,
-                )
-            for number in numbers:
-                layer = layers.pop(number, None)
-                # rendered once for all models, and not at all where all rows are stored
-                make_twin = cache(
-                    partial(self._make_twin, number, selection, layer, renderer)
-                )
-                for index, judge in enumerate(self._judges):
-                    yield measurements.get_row(
-                        make_row_name(number, index),
-                        TwinRow,
-                        partial(
-                            self._compare_object, number, selection, make_twin, judge
-                        ),
-                    )
-                context.progress.advance(1)
-            renderer = None
-            gc.collect()
+            self._context.progress.advance(1)
+
+    def _is_stored(self, number: int, measurements: Any) -> bool:
+        """Return whether the rows of an object are stored for all models."""
+        return all(
+            measurements.read(make_row_name(number, index)) is not None
+            for index in range(len(self._judges))
+        )
 
     def _render_layers(
         self, selection: Selection, numbers: Sequence[int]
@@ -348,6 +389,14 @@ class Comparison:
         selection: Selection,
         numbers: Sequence[int],
     ) -> Any:
+        """Make a renderer for objects that have one mesh.
+
+        Args:
+            renderer_type: `SurroundedRenderer`, or `LayerRenderer`, or what makes one.
+            environment: environment that lights them.
+            selection: all rows.
+            numbers: numbers of the rows that it renders.
+        """
         item = selection.objects[numbers[0]]
         film = rendering.choose_film(
             [selection.windows[number] for number in numbers], item.camera.pixel_aspect
@@ -392,7 +441,14 @@ class Comparison:
         make_twin: Callable[[], rendering.Twin],
         judge: ModelJudge,
     ) -> TwinRow:
-        """Return what a model says of an object's photograph and of its twins."""
+        """Return what a model says of an object's photograph and of its twins.
+
+        Args:
+            number: number of the row, which is that of the object.
+            selection: all rows.
+            make_twin: renders the twins; called once, and only here.
+            judge: the model's judge.
+        """
         item = selection.objects[number]
         window = selection.windows[number]
         twin = make_twin()
@@ -418,7 +474,10 @@ class Comparison:
     def _make_facts(
         self, item: PhotographedObject, twin: rendering.Twin | None = None
     ) -> Any:
-        """Return what a task takes the truth from."""
+        """Return what a task takes the truth from.
+
+        Before the object is rendered, there is no twin and so nothing about its sight.
+        """
         return tasks.Facts(
             item.object,
             self._find_label(item),
@@ -431,7 +490,7 @@ class Comparison:
 
     def _save_images(self, number: int, twin: rendering.Twin) -> None:
         """Store small images of the photograph and its twins."""
-        for index, name in enumerate(list(twin.images)[:3]):
+        for index, name in enumerate(list(twin.images)[:N_STORED_IMAGES]):
             file = make_image_name(number, index)
             self._context.run.write_file(file, encode_jpeg(twin.images[name]))
 
@@ -439,12 +498,11 @@ class Comparison:
         self, rows: Sequence[TwinRow], warnings: Sequence[str]
     ) -> TwinsResult:
         """Count rows; the worst disagreements come first."""
+        task_title = self._judges[0].task.title
         table = []
         factors = []
         if rows:
-            table = counting.make_table(
-                rows, self.surroundings, self._judges[0].task.title
-            )
+            table = counting.make_table(rows, self.surroundings, task_title)
             factors = counting.explain_disagreement(rows, COMPOSED)
         overlaps = [row.overlap for row in rows if row.overlap is not None]
         worst = sorted(rows, key=rank_disagreement)[: self._config.pictures]
@@ -452,17 +510,13 @@ class Comparison:
             TwinsResult,
             photographs=self._config.photographs,
             model=",".join(judge.model.name for judge in self._judges),
-            task=self._judges[0].task.title,
+            task=task_title,
             table=table,
             overlap=float(np.median(overlaps)) if overlaps else None,
             low_overlaps=sum(overlap < LOW_OVERLAP for overlap in overlaps),
             factors=factors,
             pairs=[
-                TwinPair(
-                    row=row,
-                    pictures=[make_image_name(row.number, index) for index in range(3)],
-                )
-                for row in worst
+                TwinPair(row=row, pictures=list_images(row.number)) for row in worst
             ],
             renders=self.n_renders,
             warnings=list(dict.fromkeys(warnings)),
@@ -470,15 +524,19 @@ class Comparison:
 
 
 def rank_disagreement(row: TwinRow) -> tuple[bool, float]:
-    """Return a key that sorts rows: who disagree first, by how much margins differ."""
+    """Return a key that sorts rows: those who disagree first, by difference of margins.
+
+    Disagreement is about which is right: the photograph or its composed twin.
+    """
     twin = row.twin(COMPOSED)
     difference = abs(row.photo.margin - twin.margin)
     if not math.isfinite(difference):
         difference = math.inf
-    return row.photo.right == twin.right, -difference
+    agrees = row.photo.right == twin.right
+    return agrees, -difference
 
 
-def parse_frames(text: str | None) -> Any:
+def parse_frames(text: str | None) -> Callable[[str], bool]:
     """Return a function that states whether a frame is used, by its name.
 
     Args:
@@ -504,6 +562,7 @@ def parse_frames(text: str | None) -> Any:
             )
 
     def is_used(frame: str) -> bool:
+        # of "scene/000012" or "000012.png"
         number = frame.rpartition("/")[2].partition(".")[0]
         if frame in names or number in names:
             return True
@@ -522,6 +581,11 @@ def make_row_name(number: int, model_index: int) -> str:
 def make_image_name(number: int, index: int) -> str:
     """Return the file of an image of a row in the run's folder."""
     return f"images/twin-{number:06d}-{index}.jpg"
+
+
+def list_images(number: int) -> list[str]:
+    """Return the files of all stored images of a row, the photograph's first."""
+    return [make_image_name(number, index) for index in range(N_STORED_IMAGES)]
 
 
 def encode_jpeg(image: Tensor) -> bytes:

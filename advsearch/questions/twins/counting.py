@@ -70,10 +70,12 @@ def count_agreement(
     """Return how far photographs and twins agree, with intervals over frames.
 
     Args:
-        rows: at least one.
+        rows: at least one, of one model.
         surroundings: surroundings of the twins.
-        model, task: as in results.
-        object_name, condition: object name and condition of the rows; empty for all.
+        model: name of the model, for the result.
+        task: title of the task, for the result.
+        object_name: name that all rows share; empty where they have several.
+        condition: condition that all rows share; empty where they have several.
     """
     units = number_units(rows)
     photos = [row.photo for row in rows]
@@ -104,7 +106,10 @@ def count_agreement(
 
 
 def number_units(rows: Sequence[TwinRow]) -> IntArray:
-    """Return the unit (n,) of each row: frames that share a name are one."""
+    """Number the frames, and return the number (n,) of each row's frame.
+
+    Frames are the independent units: rows of one frame are not independent.
+    """
     names = [row.frame for row in rows]
     return np.unique(names, return_inverse=True)[1].reshape(-1).astype(np.int64)
 
@@ -181,19 +186,25 @@ def find_box(payload: Any, label: str) -> Box | None:
     """
     if not isinstance(payload, dict):
         return None
-    for found in payload.get("found") or []:
-        if found["label"] == label:
-            left, top, right, bottom = found["box"]
+    # A detector stores what it found, the best first.
+    for detection in payload.get("found") or []:
+        if detection["label"] == label:
+            left, top, right, bottom = detection["box"]
             return left, top, right - left, bottom - top
     return None
 
 
 def compute_box_iou(first: Box, second: Box) -> float:
     """Return the overlap of two boxes (x, y, width, height) over their union."""
-    width = min(first[0] + first[2], second[0] + second[2]) - max(first[0], second[0])
-    height = min(first[1] + first[3], second[1] + second[3]) - max(first[1], second[1])
+    first_x, first_y, first_width, first_height = first
+    second_x, second_y, second_width, second_height = second
+    right = min(first_x + first_width, second_x + second_width)
+    bottom = min(first_y + first_height, second_y + second_height)
+    # under 0 where the boxes lie side by side
+    width = right - max(first_x, second_x)
+    height = bottom - max(first_y, second_y)
     overlap = max(width, 0.0) * max(height, 0.0)
-    union = first[2] * first[3] + second[2] * second[3] - overlap
+    union = first_width * first_height + second_width * second_height - overlap
     return overlap / union if union > 0.0 else 0.0
 
 
@@ -203,6 +214,10 @@ def _estimate_coefficient(
     second: npt.NDArray[np.generic],
     units: IntArray,
 ) -> results.Estimate | None:
+    """Return a statistic of two arrays (n,), with its interval over units (n,).
+
+    None where it has no interval.
+    """
     interval = statistics.agreement.correlation_interval(
         statistic, first, second, units
     )
@@ -231,12 +246,16 @@ def explain_disagreement(
     which too few rows are known, is left out.
     """
     parts: list[FactorPart] = []
-    for name, (unit, get) in FACTORS.items():
-        known = [(value, row) for row in rows if (value := get(row)) is not None]
-        if len(known) >= N_PARTS * MIN_ROWS_PER_PART:
-            values = np.array([value for value, _ in known])
-            known_rows = [row for _, row in known]
-            parts += _cut_factor(name, unit, values, known_rows, surroundings)
+    for name, (unit, get_value) in FACTORS.items():
+        values = []
+        known_rows = []
+        for row in rows:
+            value = get_value(row)
+            if value is not None:
+                values.append(value)
+                known_rows.append(row)
+        if len(known_rows) >= N_PARTS * MIN_ROWS_PER_PART:
+            parts += _cut_factor(name, unit, np.array(values), known_rows, surroundings)
     return parts
 
 
@@ -247,17 +266,23 @@ def _cut_factor(
     rows: Sequence[TwinRow],
     surroundings: str,
 ) -> Iterator[FactorPart]:
-    """Yield the parts of a factor with values (n,) of its rows."""
+    """Yield the parts of a factor with values (n,) of its rows.
+
+    A part is the rows between two quantiles of the values. There is none if quantiles
+    coincide, as those of a constant do.
+    """
     edges = np.quantile(values, np.linspace(0.0, 1.0, N_PARTS + 1))
     if len(np.unique(edges)) <= N_PARTS:
         return
-    index = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, N_PARTS - 1)
+    # The largest value is at the last edge, and belongs to the last part.
+    part_of_row = np.searchsorted(edges, values, side="right") - 1
+    part_of_row = np.clip(part_of_row, 0, N_PARTS - 1)
     units = number_units(rows)
     disagrees = np.array(
         [row.photo.right != row.twin(surroundings).right for row in rows]
     )
     for part in range(N_PARTS):
-        inside = index == part
+        inside = part_of_row == part
         yield FactorPart(
             factor=name,
             unit=unit,

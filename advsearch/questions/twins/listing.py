@@ -27,6 +27,9 @@ Float64Array = npt.NDArray[np.float64]
 MAX_JSON_BYTES = 1 << 26  # of a file with all poses of a scene
 MAX_YAML_BYTES = 1 << 17  # of a list in YAML, which is slow to read
 MAX_VIEWS = 100_000  # objects in photographs of one run
+MAX_IMAGE_DIGITS = 12  # of an image's number in BOP's form
+MAX_OBJECT_NUMBER = 999_999  # in BOP's form: file names have six digits
+MAX_TEXT = 200  # letters of a frame, label or condition; the rest is cut
 MAX_ROTATION_ERROR = 0.02  # of an entry of R R^T against the identity
 PINHOLE_KIND = "brown-conrady"  # of camera models, with distortion 0
 MAX_SKEW = 1e-6  # of a camera's focal length; a larger one is refused
@@ -34,10 +37,9 @@ GROUND_TRUTH = "scene_gt.json"
 PHOTO_FOLDERS = ("rgb", "gray")
 PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".webp")
 LIST_SUFFIXES = (".csv", ".json", ".yaml", ".yml")
+REQUIRED_LIST_KEYS = ("photograph", "object", "pose")
 LIST_KEYS = (
-    "photograph",
-    "object",
-    "pose",
+    *REQUIRED_LIST_KEYS,
     "camera",
     "K",
     "unit",
@@ -46,7 +48,7 @@ LIST_KEYS = (
     "frame",
     "mask",
 )
-"""What a row of a list may have; the first three it must."""
+"""What a row of a list must have, and all that it may have."""
 
 
 @dataclass(frozen=True)
@@ -140,10 +142,7 @@ def read_photographs(path: Path) -> Listing:
 
 def _read_bop(folder: Path) -> Listing:
     """Read all scenes of a data set, of a split or of one scene."""
-    patterns = (GROUND_TRUTH, f"*/{GROUND_TRUTH}", f"*/*/{GROUND_TRUTH}")
-    scenes: list[Path] = []
-    for pattern in patterns:
-        scenes = scenes or sorted(file.parent for file in folder.glob(pattern))
+    scenes = _find_scenes(folder)
     if not scenes:
         raise InputError(
             f"photographs: expected a folder in BOP's form, with {GROUND_TRUTH} in it "
@@ -158,6 +157,15 @@ def _read_bop(folder: Path) -> Listing:
         objects += listing.objects
         n_missing += listing.n_missing
     return Listing(objects, n_missing)
+
+
+def _find_scenes(folder: Path) -> list[Path]:
+    """Return the folders of scenes: the folder itself, or those one or two below it."""
+    for pattern in (GROUND_TRUTH, f"*/{GROUND_TRUTH}", f"*/*/{GROUND_TRUTH}"):
+        scenes = sorted(file.parent for file in folder.glob(pattern))
+        if scenes:
+            return scenes
+    return []
 
 
 def _find_models(folder: Path) -> Path:
@@ -183,33 +191,52 @@ def _read_scene(scene: Path, models: Path, condition: str) -> Listing:
     n_missing = 0
     for image, entries in truths.items():
         where = f"{scene / GROUND_TRUTH}: image {image[:20]}"
-        if not (image.isdecimal() and len(image) <= 12) or not _is_rows(entries):
+        is_number = image.isdecimal() and len(image) <= MAX_IMAGE_DIGITS
+        if not is_number or not _is_rows(entries):
             raise errors.FileFormatError(f"{where}: expected a list of objects")
         photograph = _find_photograph(scene, int(image))
         if photograph is None:
             n_missing += len(entries)
             continue
-        camera = _read_bop_camera(scene, cameras, image)
-        rows: Any = infos.get(image)
+        shared: dict[str, Any] = {
+            "photograph": photograph,
+            "frame": f"{scene.name}/{image}",
+            "camera": _read_bop_camera(scene, cameras, image),
+            "unit": "mm",
+            "condition": condition,
+        }
+        image_infos = infos.get(image)
         for index, entry in enumerate(entries):
-            info: Mapping[str, Any] = {}
-            if _is_rows(rows) and index < len(rows):
-                info = rows[index]
             objects.append(
                 PhotographedObject(
-                    photograph=photograph,
-                    frame=f"{scene.name}/{image}",
-                    camera=camera,
-                    unit="mm",
-                    condition=condition,
-                    mask=_find_mask(scene, "mask", image, index),
-                    visible_mask=_find_mask(scene, "mask_visib", image, index),
-                    visible=_get_fraction(info),
-                    box=_get_box(info),
+                    **shared,
+                    **_read_bop_silhouette(scene, image, index, image_infos),
                     **_read_bop_object(where, entry, models),
                 )
             )
     return Listing(objects, n_missing)
+
+
+def _read_bop_silhouette(
+    scene: Path, image: str, index: int, infos: Any
+) -> dict[str, Any]:
+    """Return the masks, the visible fraction and the box of an object, where stated.
+
+    Args:
+        scene: folder of the scene.
+        image: number of the image, as a text.
+        index: place of the object among those of the image.
+        infos: what `scene_gt_info.json` has about the image's objects, unchecked.
+    """
+    info: Mapping[str, Any] = {}
+    if _is_rows(infos) and index < len(infos):
+        info = infos[index]
+    return {
+        "mask": _find_mask(scene, "mask", image, index),
+        "visible_mask": _find_mask(scene, "mask_visib", image, index),
+        "visible": _get_fraction(info),
+        "box": _get_box(info),
+    }
 
 
 def _read_bop_object(
@@ -217,7 +244,7 @@ def _read_bop_object(
 ) -> dict[str, Any]:
     """Return object, mesh and pose of an entry of the ground truth."""
     number = entry.get("obj_id")
-    if not isinstance(number, int) or not 0 <= number < 10**6:
+    if not isinstance(number, int) or not 0 <= number <= MAX_OBJECT_NUMBER:
         raise errors.FileFormatError(f"{where}: expected obj_id, a whole number")
     name = f"obj_{number:06d}"
     mesh = models / f"{name}.ply"
@@ -241,6 +268,7 @@ def _read_bop_camera(scene: Path, cameras: Mapping[str, Any], image: str) -> Pin
 
 
 def _find_photograph(scene: Path, image: int) -> Path | None:
+    """Return the photograph with a number in a BOP scene; None if it is not there."""
     for folder in PHOTO_FOLDERS:
         for suffix in PHOTO_SUFFIXES:
             file = scene / folder / f"{image:06d}{suffix}"
@@ -250,6 +278,7 @@ def _find_photograph(scene: Path, image: int) -> Path | None:
 
 
 def _find_mask(scene: Path, folder: str, image: str, index: int) -> Path | None:
+    """Return the mask of an image's object by its place; None if it is not there."""
     file = scene / folder / f"{int(image):06d}_{index:06d}.png"
     return file if file.is_file() else None
 
@@ -285,6 +314,7 @@ def _read_json(path: Path) -> dict[str, Any]:
 
 
 def _is_rows(value: object) -> TypeGuard[list[dict[str, Any]]]:
+    """Return whether a value read from a file is a list of mappings."""
     return isinstance(value, list) and all(isinstance(row, dict) for row in value)
 
 
@@ -298,27 +328,24 @@ def _read_list(path: Path) -> Iterator[PhotographedObject]:
 
 
 def _read_rows(path: Path) -> list[dict[str, Any]]:
-    """Read a list as mappings; those of CSV have texts."""
-    if path.suffix.lower() == ".csv":
-        text = stored_files.read_existing_text(
-            path, "a list of photographs", MAX_JSON_BYTES
-        )
-        rows: Any = [
+    """Read a list as mappings; those of CSV have texts, and leave empty cells out."""
+    suffix = path.suffix.lower()
+    is_yaml = suffix not in (".csv", ".json")  # YAML has two suffixes
+    text = stored_files.read_existing_text(
+        path, "a list of photographs", MAX_YAML_BYTES if is_yaml else MAX_JSON_BYTES
+    )
+    rows: Any
+    if suffix == ".csv":
+        rows = [
             {key: value for key, value in row.items() if value}
             for row in csv.DictReader(io.StringIO(text))
         ]
-    elif path.suffix.lower() == ".json":
-        text = stored_files.read_existing_text(
-            path, "a list of photographs", MAX_JSON_BYTES
-        )
+    elif suffix == ".json":
         rows = stored_files.parse_text(path, text, "JSON", stored_files.parse_json)
     else:
         # imports torch
         from advsearch.extend import workbench
 
-        text = stored_files.read_existing_text(
-            path, "a list of photographs", MAX_YAML_BYTES
-        )
         rows = stored_files.parse_text(path, text, "YAML", workbench.parse_yaml)
     if isinstance(rows, dict):
         rows = rows.get("photographs")
@@ -330,16 +357,20 @@ def _read_rows(path: Path) -> list[dict[str, Any]]:
 
 
 def _read_row(row: Mapping[str, Any], path: Path, where: str) -> PhotographedObject:
-    unknown = sorted(map(str, set(row) - set(LIST_KEYS)))
-    if unknown:
-        raise errors.FileFormatError(
-            f"{where}: expected some of {', '.join(LIST_KEYS)}, got {unknown[0][:40]}"
-        )
-    for key in LIST_KEYS[:3]:
-        if key not in row:
-            raise errors.FileFormatError(f"{where}: expected {key}, got none")
+    """Read a row of a list.
+
+    Args:
+        row: values by the names in `LIST_KEYS`.
+        path: path of the list, whose folder has the files.
+        where: the list and the row, for messages.
+
+    Raises:
+        FileFormatError: something in it cannot be used.
+    """
+    _check_keys(row, where)
     photograph = _get_file(row, "photograph", path, where)
     mesh = _get_file(row, "object", path, where)
+    # Of a (4, 4) matrix, the last row says nothing.
     numbers = _to_numbers(row["pose"], f"{where}: pose", 12, 16)
     matrix = np.eye(4)
     matrix[:3] = numbers[:12].reshape(3, 4)
@@ -348,16 +379,28 @@ def _read_row(row: Mapping[str, Any], path: Path, where: str) -> PhotographedObj
         raise errors.FileFormatError(f"{where}: unit: expected mm, cm, m or in")
     return PhotographedObject(
         photograph=photograph,
-        frame=str(row.get("frame") or photograph.name)[:200],
+        frame=str(row.get("frame") or photograph.name)[:MAX_TEXT],
         object=mesh.stem,
         mesh=mesh,
         unit=unit,
         pose=_check_pose(matrix, where),
         camera=_read_row_camera(row, path, photograph, where),
-        label=str(row.get("label") or "")[:200],
-        condition=str(row.get("condition") or "")[:200],
+        label=str(row.get("label") or "")[:MAX_TEXT],
+        condition=str(row.get("condition") or "")[:MAX_TEXT],
         mask=_get_file(row, "mask", path, where) if "mask" in row else None,
     )
+
+
+def _check_keys(row: Mapping[str, Any], where: str) -> None:
+    """Refuse a row with an unknown key, or without one that it must have."""
+    unknown = sorted(map(str, set(row) - set(LIST_KEYS)))
+    if unknown:
+        raise errors.FileFormatError(
+            f"{where}: expected some of {', '.join(LIST_KEYS)}, got {unknown[0][:40]}"
+        )
+    for key in REQUIRED_LIST_KEYS:
+        if key not in row:
+            raise errors.FileFormatError(f"{where}: expected {key}, got none")
 
 
 def _get_file(row: Mapping[str, Any], key: str, path: Path, where: str) -> Path:
@@ -378,20 +421,23 @@ def _read_row_camera(
     row: Mapping[str, Any], path: Path, photograph: Path, where: str
 ) -> Pinhole:
     """Return the camera of a row: its `K`, or that of a camera file."""
-    if ("K" in row) == ("camera" in row):
+    has_matrix = "K" in row
+    has_file = "camera" in row
+    if has_matrix == has_file:  # both or neither
         raise errors.FileFormatError(
             f"{where}: expected either K, nine numbers in pixels, or camera, a file"
         )
-    if "K" in row:
+    if has_matrix:
         return _make_pinhole(_to_numbers(row["K"], f"{where}: K", 9), where)
     # imports torch
     from advsearch.extend import workbench
 
-    file = _get_file({"camera": str(row["camera"])}, "camera", path, where)
+    file = _get_file(row, "camera", path, where)
     model = workbench.read_camera(str(file))
-    values = dict(model.values)
-    lens = {key: values.pop(key) for key in ("fx", "fy", "cx", "cy")}
-    if any(values.values()) or model.kind != PINHOLE_KIND:
+    # fractions of the width and the height
+    lens = {key: model.values[key] for key in ("fx", "fy", "cx", "cy")}
+    distortion = [value for key, value in model.values.items() if key not in lens]
+    if any(distortion) or model.kind != PINHOLE_KIND:
         raise InputError(
             f"{where}: camera: expected a pinhole, got a lens with distortion; "
             "undistort the photographs first"
@@ -451,4 +497,5 @@ def _make_pinhole(numbers: Float64Array, where: str) -> Pinhole:
         raise errors.FileFormatError(f"{where}: expected focal lengths over 0")
     if abs(skew) > MAX_SKEW * fx:
         raise errors.FileFormatError(f"{where}: expected a camera without skew")
+    # from the corner of the photograph, where pixel centers are at halves
     return Pinhole(fx, fy, cx + 0.5, cy + 0.5)

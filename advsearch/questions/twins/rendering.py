@@ -121,14 +121,25 @@ def choose_window(
     is_outside = high.min() <= 0.0 or low[0] >= photo_width or low[1] >= photo_height
     if is_outside or longer < MIN_SILHOUETTE:
         return None
-    shape = np.array([model_size[1], model_size[0]], np.float64)
-    size = shape * float(((high - low + 2.0 * margin * longer) / shape).max())
+    # from here on, sizes are (width, height), as positions are (x, y)
+    model_shape = np.array([model_size[1], model_size[0]], np.float64)
+    widened = high - low + 2.0 * margin * longer
+    # the smallest of the model's shape that holds all of it
+    size = model_shape * float((widened / model_shape).max())
     size *= min(1.0, photo_width / size[0], photo_height / size[1])
     width, height = (max(1, math.floor(side)) for side in size)
-    corner = (low + high) / 2.0 - np.array([width, height]) / 2.0
-    x = min(max(round(float(corner[0])), 0), photo_width - width)
-    y = min(max(round(float(corner[1])), 0), photo_height - height)
-    return PhotoWindow(x, y, width, height)
+    center = (low + high) / 2.0
+    return PhotoWindow(
+        _center_within(float(center[0]), width, photo_width),
+        _center_within(float(center[1]), height, photo_height),
+        width,
+        height,
+    )
+
+
+def _center_within(center: float, length: int, limit: int) -> int:
+    """Return where a stretch begins: as near a center as it fits from 0 to a limit."""
+    return min(max(round(center - length / 2.0), 0), limit - length)
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,22 +300,20 @@ def make_twin(
         surrounded: sRGB renders by environment.
         model_size: (height, width) in pixels.
     """
-    size = (window.height, window.width)
-    coverage = layer.alpha
-    front = read_front(item, photograph)
-    if front is not None:
-        hidden = cut_window(torch.from_numpy(front), window) / 255.0
-        coverage = coverage * (1.0 - hidden)
+    window_size = (window.height, window.width)
     crop = cut_photograph(photograph, window)
+    coverage = _compute_visible_coverage(item, photograph, window, layer)
+    is_covered = coverage >= 0.5
     around = crop[coverage < 0.5]
+    # Where the object fills the window, the mean of all of it is the best guess.
     mean_around = around.mean(dim=0) if len(around) else crop.mean(dim=(0, 1))
-    difference = (layer.composed - crop)[coverage >= 0.5]
     images = {
         PHOTOGRAPH: crop,
         COMPOSED: layer.composed,
-        **{name: resize(image, size) for name, image in surrounded.items()},
+        **{name: resize(image, window_size) for name, image in surrounded.items()},
         HOLE: torch.lerp(crop, mean_around.expand_as(crop), coverage[..., None]),
     }
+    difference = (layer.composed - crop)[is_covered]
     return Twin(
         {name: resize(image, model_size) for name, image in images.items()},
         layer.sight,
@@ -312,10 +321,22 @@ def make_twin(
         size=math.sqrt(float(layer.alpha.sum())),
         brightness=float(difference.mean()) if len(difference) else 0.0,
         contrast=float(around.std()) if len(around) > 1 else 0.0,
-        texture=correlate_luminance(
-            layer.composed[coverage >= 0.5], crop[coverage >= 0.5]
-        ),
+        texture=correlate_luminance(layer.composed[is_covered], crop[is_covered]),
     )
+
+
+def _compute_visible_coverage(
+    item: PhotographedObject,
+    photograph: reading.backdrop.BackdropPhotograph,
+    window: PhotoWindow,
+    layer: Layer,
+) -> Tensor:
+    """Return what an object covers of a window (h, w), less what hides it, in [0, 1]."""
+    front = read_front(item, photograph)
+    if front is None:
+        return layer.alpha
+    hidden = cut_window(torch.from_numpy(front), window) / 255.0
+    return layer.alpha * (1.0 - hidden)
 
 
 def correlate_luminance(first: Tensor, second: Tensor) -> float | None:
@@ -330,17 +351,26 @@ def correlate_luminance(first: Tensor, second: Tensor) -> float | None:
 def _make_sight(
     surfaces: Any, metres: float | None, model_size: tuple[int, int]
 ) -> Any:
-    """Return what is visible of the object, as tasks take it."""
+    """Return what is visible of the object, as tasks take it.
+
+    Args:
+        surfaces: what the renderer sees in each pixel of the film.
+        metres: metres of one object size, in which depths are; None if not known.
+        model_size: (height, width) of the result.
+    """
     # imports the tasks
     from advsearch.extend import tasks
 
-    def enlarge(values: Tensor) -> Tensor:
+    def scale(values: Tensor) -> Tensor:
+        """Scale values of pixels (h, w) to the model's size, by the nearest pixel."""
         return F.interpolate(values[None, None].float(), size=model_size)[0, 0]
 
+    # Depths stay in object sizes where nothing is known of the size.
+    metres_per_unit = metres or 1.0
     return tasks.Sight(
-        enlarge(surfaces.visible_mask(OBJECT)) > 0.5,
-        enlarge(surfaces.depth) * (metres or 1.0),
-        enlarge(surfaces.z_depth) * (metres or 1.0),
+        scale(surfaces.visible_mask(OBJECT)) > 0.5,
+        scale(surfaces.depth) * metres_per_unit,
+        scale(surfaces.z_depth) * metres_per_unit,
         metres,
     )
 
@@ -378,16 +408,23 @@ def compute_mesh_to_camera(
 def make_camera_inputs(
     item: PhotographedObject, asset: assets.ObjectAsset, window: PhotoWindow
 ) -> dict[str, Tensor]:
-    """Return the scene inputs of the camera that sees a window of a photograph."""
-    to_camera = compute_mesh_to_camera(item, asset)
+    """Return the scene inputs of the camera that sees a window of a photograph.
+
+    The world has the coordinates of the mesh. The angle of view is that of the window's
+    longer side; shifts are from the principal point to the window's center, in widths
+    and heights of the window.
+    """
+    mesh_to_camera = FLIP @ compute_mesh_to_camera(item, asset)
+    camera_to_world = np.linalg.inv(mesh_to_camera)
     camera = item.camera
-    to_world = np.linalg.inv(FLIP @ to_camera)
-    tangent = max(window.width / camera.fx, window.height / camera.fy) / 2.0
-    fov = math.degrees(2.0 * math.atan(tangent))
-    shift_x = (window.x + window.width / 2.0 - camera.cx) / window.width
-    shift_y = (window.y + window.height / 2.0 - camera.cy) / window.height
+    half_tangent = max(window.width / camera.fx, window.height / camera.fy) / 2.0
+    fov = math.degrees(2.0 * math.atan(half_tangent))
+    center_x = window.x + window.width / 2.0
+    center_y = window.y + window.height / 2.0
+    shift_x = (center_x - camera.cx) / window.width
+    shift_y = (center_y - camera.cy) / window.height
     return {
-        "camera.to_world": torch.from_numpy(to_world).float(),
+        "camera.to_world": torch.from_numpy(camera_to_world).float(),
         "camera.fov": torch.tensor([fov]),
         "camera.shift_x": torch.tensor([shift_x]),
         "camera.shift_y": torch.tensor([shift_y]),
@@ -440,9 +477,11 @@ def read_front(
     """
     if item.visible_mask is None:
         return None
-    full = PhotoWindow(0, 0, photograph.full_size[1], photograph.full_size[0])
-    visible = load_mask(item.visible_mask, full).float()
-    hidden = 1.0 - F.max_pool2d(visible[None, None], 3, 1, 1)[0, 0]
+    height, width = photograph.full_size
+    all_pixels = PhotoWindow(0, 0, width, height)
+    visible = load_mask(item.visible_mask, all_pixels).float()
+    widened = F.max_pool2d(visible[None, None], kernel_size=3, stride=1, padding=1)
+    hidden = 1.0 - widened[0, 0]
     front: npt.NDArray[np.uint8] = (255.0 * hidden).to(torch.uint8).numpy()
     return front
 
@@ -470,17 +509,19 @@ def measure_pose(
         return int((mask & covered).sum()) / union if union else None
     if item.box is None or not bool(covered.any()):
         return None
+    return counting.compute_box_iou(_find_box(covered, window), item.box)
+
+
+def _find_box(covered: Tensor, window: PhotoWindow) -> counting.Box:
+    """Return the box, in the photograph, of what is covered (h, w) bool of a window."""
     columns = covered.any(dim=0).nonzero().flatten()
     rows = covered.any(dim=1).nonzero().flatten()
     left = window.x + float(columns[0])
     top = window.y + float(rows[0])
-    box = (
-        left,
-        top,
-        float(columns[-1] - columns[0]) + 1,
-        float(rows[-1] - rows[0]) + 1,
-    )
-    return counting.compute_box_iou(box, item.box)
+    # The last pixel is part of the box.
+    width = float(columns[-1] - columns[0]) + 1
+    height = float(rows[-1] - rows[0]) + 1
+    return left, top, width, height
 
 
 @lru_cache(maxsize=64)

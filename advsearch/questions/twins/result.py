@@ -26,6 +26,8 @@ COMPOSED = results.IN_PHOTOGRAPH
 HOLE = results.WITHOUT_OBJECT
 CLASSIFIER_MARGIN = 0.25
 DETECTOR_MARGIN = 1.5
+"""How far a window reaches beyond the object's box, in longer sides of it."""
+MAX_TEXT_PAIRS = 5  # pairs that are listed on a terminal
 
 
 class TwinsConfig(Config):
@@ -135,17 +137,20 @@ class TwinsConfig(Config):
     @field_validator("labels", mode="before")
     @classmethod
     def _labels_as_text(cls, value: Any) -> Any:
+        """Turn a list of labels or a path into the text that a command line has."""
         return settings.to_text(value, several=True)
 
     @field_validator("names", mode="before")
     @classmethod
     def _names_as_texts(cls, value: Any) -> Any:
+        """Turn names and labels that YAML reads as numbers into texts."""
         if isinstance(value, Mapping):
             return {str(name): str(label) for name, label in value.items()}
         return value
 
     @property
     def environment_name(self) -> str:
+        """The environment that surrounds the object in the other twin."""
         return self.environment or "room"
 
     @property
@@ -210,6 +215,7 @@ class TwinRow(results.Fields):
 
     @property
     def photo(self) -> TwinPrediction:
+        """The prediction about the photograph."""
         return self.twin(PHOTOGRAPH)
 
     def twin(self, surroundings: str) -> TwinPrediction:
@@ -303,6 +309,7 @@ HEADS = (
 
 
 def _agreement_cells(row: results.TwinAgreement, name: str) -> list[str]:
+    """Return the cells of a row under `HEADS`, with its name first."""
     agreement = wording.format_estimate(row.agreement)
     if row.boxes is not None:
         agreement += f"; boxes {wording.format_estimate(row.boxes)}"
@@ -317,31 +324,44 @@ def _agreement_cells(row: results.TwinAgreement, name: str) -> list[str]:
     ]
 
 
+def _photograph_cells(row: results.TwinAgreement, name: str) -> list[str]:
+    """Return the cells about photographs themselves: what compares twins is empty."""
+    no_agreement = ["", "", ""]
+    return [
+        name,
+        str(row.pairs),
+        wording.format_estimate(row.photo_right),
+        *no_agreement,
+        f"wrong at all: {wording.format_estimate(row.photo_wrong)}",
+    ]
+
+
 def make_agreement_part(table: Sequence[results.TwinAgreement]) -> ResultPart:
-    """Return the table of all objects and conditions."""
-    total = [row for row in table if not row.object and not row.condition]
-    several = len({row.model for row in total}) > 1
+    """Return the table of all objects and conditions: the twins of each model, each
+    after a row about the photographs.
+    """
+    totals = _list_totals(table)
+    models = {row.model for row in totals}
     rows = []
-    models = set()
-    for row in total:
-        prefix = f"{row.model}: " if several else ""
-        if row.model not in models:
-            models.add(row.model)
-            photo = [
-                f"{prefix}{PHOTOGRAPH}",
-                str(row.pairs),
-                wording.format_estimate(row.photo_right),
-                "",
-                "",
-                "",
-            ]
-            photo.append(f"wrong at all: {wording.format_estimate(row.photo_wrong)}")
-            rows.append(photo)
-        rows.append(_agreement_cells(row, f"{prefix}{_name_surroundings(row)}"))
+    models_above = set()
+    for total in totals:
+        prefix = f"{total.model}: " if len(models) > 1 else ""
+        if total.model not in models_above:
+            models_above.add(total.model)
+            rows.append(_photograph_cells(total, f"{prefix}{PHOTOGRAPH}"))
+        rows.append(_agreement_cells(total, f"{prefix}{_name_surroundings(total)}"))
     return ResultPart("How far twins hold", heads=HEADS, rows=rows, note=TABLE_NOTE)
 
 
+def _list_totals(
+    table: Sequence[results.TwinAgreement],
+) -> list[results.TwinAgreement]:
+    """Return the rows of all objects and conditions together."""
+    return [row for row in table if not row.object and not row.condition]
+
+
 def _name_surroundings(row: results.TwinAgreement) -> str:
+    """Name the twin of a row in a sentence."""
     if row.surroundings in (COMPOSED, HOLE):
         return row.surroundings
     return f"twin in the environment {row.surroundings}"
@@ -365,6 +385,7 @@ def _group_parts(table: Sequence[results.TwinAgreement]) -> Iterator[ResultPart]
 
 
 def _factor_part(result: TwinsResult) -> ResultPart:
+    """Return the table of how often twins disagree, by parts of each factor."""
     rows = []
     for part in result.factors:
         bounds = f"{_factor_number(part.lower)} to {_factor_number(part.upper)}"
@@ -386,6 +407,7 @@ def _factor_part(result: TwinsResult) -> ResultPart:
 
 
 def _factor_number(value: float) -> str:
+    """Format a value of a factor, such as a size in pixels or a fraction."""
     return f"{value:.0f}" if abs(value) >= 10.0 else f"{value:.2f}"
 
 
@@ -409,6 +431,7 @@ def make_twins_view(result: TwinsResult) -> ShownResult:
 
 
 def _overlap_text(result: TwinsResult) -> str:
+    """Describe how well silhouettes overlap; empty where the data has none."""
     if result.overlap is None:
         return ""
     text = f"median overlap {result.overlap:.2f}"
@@ -419,8 +442,7 @@ def _overlap_text(result: TwinsResult) -> str:
 
 def summarize_twins(table: Sequence[results.TwinAgreement]) -> str:
     """Summarise how far twins hold in sentences, model by model."""
-    total = [row for row in table if not row.object and not row.condition]
-    composed_rows = [row for row in total if row.surroundings == COMPOSED]
+    composed_rows = [row for row in _list_totals(table) if row.surroundings == COMPOSED]
     if len(composed_rows) == 1:
         return summarize_composed(composed_rows[0])
     texts = [f"{row.model}: {summarize_composed(row)}" for row in composed_rows]
@@ -452,44 +474,36 @@ def summarize_composed(composed: results.TwinAgreement) -> str:
 def _pair_parts(result: TwinsResult) -> Iterator[ResultPart]:
     """Yield the pairs, for a terminal and for a page."""
     title = "Worst disagreements first"
+    has_several_models = "," in result.model
     lines = []
     groups = []
     for pair in result.pairs:
         row = pair.row
         name = f"{row.object} in {row.frame}"
-        if "," in result.model:
+        if has_several_models:
             name = f"{row.model}, {name}"
         texts = [
             f"{image.surroundings}: {_verdict(image)}" for image in row.predictions
         ]
         lines.append(f"{name}: {'; '.join(texts)}")
-        by_name = {image.surroundings: image for image in row.predictions}
-        captions = [
-            f"{surroundings}: {_verdict(by_name[surroundings])}"
-            for surroundings in list(by_name)[: len(pair.pictures)]
-        ]
+        # Fewer images are stored than there are predictions: the last have none.
+        captions = texts[: len(pair.pictures)]
         if captions:
             captions[0] = f"{name}, {row.size:.0f} pixels. {captions[0]}"
-        groups.append(
-            [
-                views.Picture(file, caption)
-                for file, caption in zip(pair.pictures, captions, strict=False)
-            ]
-        )
-    yield ResultPart(title, lines[:5], only="text")
+        groups.append(list(map(views.Picture, pair.pictures, captions)))
+    yield ResultPart(title, lines[:MAX_TEXT_PAIRS], only="text")
     yield ResultPart(title, pictures=groups, only="page")
 
 
 def _verdict(image: TwinPrediction) -> str:
+    """Describe the prediction about an image: its label, verdict and margin."""
     verdict = "right" if image.right else "wrong"
     return f"{image.label or 'nothing'}, {verdict}, margin {image.margin:+.1f}"
 
 
 def make_twins_claims(result: TwinsResult) -> Iterator[views.Claim]:
     """Yield a claim for each of the surroundings."""
-    for row in result.table:
-        if row.object or row.condition:
-            continue
+    for row in _list_totals(result.table):
         extent = results.Extent.from_count(
             "pairs of photograph and twin that agree",
             round(row.agreement.value * row.pairs),

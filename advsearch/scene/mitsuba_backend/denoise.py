@@ -99,19 +99,17 @@ def denoise_image(
         quick: as for `denoise`.
     """
     color = rendered[..., :3].contiguous()
-    channels = [denoise(color, albedo, normal, quick=quick), rendered[..., 3:4]]
+    coverage = rendered[..., 3:4]
+    channels = [denoise(color, albedo, normal, quick=quick), coverage]
     if plane_radiance is not None:
-        # nothing else has a normal
-        is_surface = (normal != 0.0).any(dim=-1, keepdim=True)
-        channels.append(
-            plane_radiance
-            * is_surface
-            * _denoise_shade(
-                rendered[..., 4:] / plane_radiance,
-                (1.0 - rendered[..., 3:4]).clamp(0.0, 1.0),
-                lambda shade: denoise(shade, albedo, normal, quick=quick),
-            )
+        relative_change = _denoise_shade(
+            rendered[..., 4:] / plane_radiance,
+            (1.0 - coverage).clamp(0.0, 1.0),  # where no surface covers the plane
+            lambda shade: denoise(shade, albedo, normal, quick=quick),
         )
+        # the plane is a surface too: where nothing is hit there is no normal
+        is_surface = (normal != 0.0).any(dim=-1, keepdim=True)
+        channels.append(plane_radiance * is_surface * relative_change)
     return torch.cat(channels, dim=-1)
 
 

@@ -32,6 +32,7 @@ from advsearch.errors import AdvsearchError, EnvironmentSetupError
 from advsearch.trust.code import SUBPROCESS_DIRECTORY
 
 ENVIRONMENT_VARIABLE = "DRJIT_LIBLLVM_PATH"
+ELF_HEADER_SIZE = 20  # bytes of the beginning of an ELF file that are compared
 MIN_VERSION = 17  # the first major version that renders: see the head of this file
 _PATTERNS = (
     "usr/lib/*/libLLVM*.so*",
@@ -102,13 +103,15 @@ def find_libraries(
     library = ctypes.util.find_library("LLVM") if root == Path("/") else None
     if library and os.sep in library:
         paths.append(Path(library))
+    # several links may lead to one file
     link_of_file = {path.resolve(): path for path in paths if path.is_file()}
-    candidates = [
+    libraries = [
         examine_library(path, name_hint=link) for path, link in link_of_file.items()
     ]
+    # in falling order: without a refusal first, then by version
     return sorted(
-        candidates,
-        key=lambda candidate: (not candidate.refusal, candidate.version),
+        libraries,
+        key=lambda library: (not library.refusal, library.version),
         reverse=True,
     )
 
@@ -136,22 +139,19 @@ def examine_library(path: Path, *, name_hint: Path) -> LibraryFile:
         path: path of the file, symbolic links resolved.
         name_hint: the link through which it was found.
     """
+    # of Python itself; empty where programs are no ELF files
     interpreter_header = read_interpreter_header()
     header = b""
     try:
         with path.open("rb") as file:
-            header = file.read(20)
+            header = file.read(ELF_HEADER_SIZE)
     except OSError as error:
         return LibraryFile(path, (), f"it cannot be read: {error.strerror}")
-    if interpreter_header and (header[:4] != b"\x7fELF" or len(header) < 20):
-        return LibraryFile(path, (), "it is not a shared library")
-    # Of an ELF header, bytes 4 and 5 are word size and byte order, 18 and 19 the
-    # processor: those of Python itself are right.
-    if interpreter_header and (header[4:6], header[18:20]) != (
-        interpreter_header[4:6],
-        interpreter_header[18:20],
-    ):
-        return LibraryFile(path, (), "it is for another processor")
+    if interpreter_header:
+        if header[:4] != b"\x7fELF" or len(header) < ELF_HEADER_SIZE:
+            return LibraryFile(path, (), "it is not a shared library")
+        if _get_architecture(header) != _get_architecture(interpreter_header):
+            return LibraryFile(path, (), "it is for another processor")
     version = (
         parse_version(path) or parse_version(name_hint) or query_version(str(path))
     )
@@ -167,6 +167,11 @@ def explain_refusal(version: Version) -> str:
     if version[0] < MIN_VERSION:
         return "it aborts the process at the first render"
     return ""
+
+
+def _get_architecture(elf_header: bytes) -> bytes:
+    """Return the word size, byte order and processor in a header of an ELF file."""
+    return elf_header[4:6] + elf_header[18:20]
 
 
 def parse_version(path: Path) -> Version:
@@ -202,7 +207,8 @@ def ensure_llvm() -> LibraryFile:
         return library
     path = Path(variable)
     advice = "Correct it, or unset it to let advsearch look for one."
-    # the dynamic loader looks it up; only the library itself knows its version
+    # A plain name: the dynamic loader finds the file, and only the library itself knows
+    # its version.
     if os.sep not in variable:
         version = query_version(variable)
         library = LibraryFile(path, version, explain_refusal(version))
@@ -211,16 +217,14 @@ def ensure_llvm() -> LibraryFile:
     else:
         raise EnvironmentSetupError(
             f"{ENVIRONMENT_VARIABLE}: expected a libLLVM file, got {variable!r}, which "
-            "does not "
-            f"exist. {advice}"
+            f"does not exist. {advice}"
         )
     if library.refusal:
         raise EnvironmentSetupError(
             f"{ENVIRONMENT_VARIABLE}: expected a libLLVM of version {MIN_VERSION} or "
-            "later, got "
-            f"{library}. {advice}"
+            f"later, got {library}. {advice}"
         )
-    return replace(library, path=path)
+    return replace(library, path=path)  # as the variable has it, not resolved
 
 
 def get_install_command(
@@ -282,10 +286,8 @@ def select_newest(candidates: list[LibraryFile]) -> LibraryFile:
     separator = "\n" if "\n" in command else " "
     raise EnvironmentSetupError(
         f"expected a libLLVM of version {MIN_VERSION} or later, with which Dr.Jit "
-        "compiles "
-        f"its kernels. {rejected_text} "
-        f"Install one with:{separator}{command}{separator}or name a file in "
-        f"{ENVIRONMENT_VARIABLE}."
+        f"compiles its kernels. {rejected_text} Install one "
+        f"with:{separator}{command}{separator}or name a file in {ENVIRONMENT_VARIABLE}."
     )
 
 
@@ -297,7 +299,7 @@ def read_interpreter_header() -> bytes:
     """
     try:
         with open(sys.executable, "rb") as file:
-            header = file.read(20)
+            header = file.read(ELF_HEADER_SIZE)
     except OSError:
         return b""
     return header if header[:4] == b"\x7fELF" else b""

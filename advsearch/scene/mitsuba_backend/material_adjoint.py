@@ -36,6 +36,7 @@ first hit and its shadow ray only; see `LIMITS`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -52,39 +53,58 @@ from advsearch.scene.mitsuba_backend.material_view import (
 from advsearch.scene.mitsuba_backend.variant import dr, mi
 
 LIMITS: Mapping[str, str] = {
-    "without shadow samples the shadows of the mesh, on the ground and on itself, do "
-    "not move":
+    (
+        "without shadow samples the shadows of the mesh, on the ground and on itself, "
+        "do not move"
+    ): (
         "mug on the ground, direct light: cosine 0.65 without, 0.995 with 4 shadow "
-        "samples a pixel",
-    "light that reaches the camera over more than one surface is a constant at the "
-    "first, and its shadows stay":
+        "samples a pixel"
+    ),
+    (
+        "light that reaches the camera over more than one surface is a constant at "
+        "the first, and its shadows stay"
+    ): (
         "mug on the ground, 6 segments: error 0.34, cosine 0.95 (smooth cotangent), "
-        "0.09 and 0.997 (2 pixels); chair "
-        "on the ground: 0.34, 0.97 and 0.43, 0.92",
-    "a cotangent that changes from pixel to pixel is smoothed by a tent two pixels "
-    "wide, and the noise grows":
-        "variance x time against central differences of 16 samples, six axes: 15 times "
-        "better for cotangents smooth "
-        "over 16 pixels, 4 to 14 times over 2 pixels, 0.1 to 1 times for white ones, "
-        "which are off by 0.33",
-    "polished surfaces are noisy, since directions of light are fixed in the world; a "
-    "mirror's reflections stay":
+        "0.09 and 0.997 (2 pixels); chair on the ground: 0.34, 0.97 and 0.43, 0.92"
+    ),
+    (
+        "a cotangent that changes from pixel to pixel is smoothed by a tent two "
+        "pixels wide, and the noise grows"
+    ): (
+        "variance x time against central differences of 16 samples, six axes: 15 "
+        "times better for cotangents smooth over 16 pixels, 4 to 14 times over 2 "
+        "pixels, 0.1 to 1 times for white ones, which are off by 0.33"
+    ),
+    (
+        "polished surfaces are noisy, since directions of light are fixed in the "
+        "world; a mirror's reflections stay"
+    ): (
         "roughness 0.3, 0.1, 0.02: noise of a rotation 0.1, 0.4, 4.5 where the "
-        "gradient is 4",
-    "direct sun: shadow samples ignore where the light comes from, so they are noisy":
+        "gradient is 4"
+    ),
+    (
+        "direct sun: shadow samples ignore where the light comes from, so they are "
+        "noisy"
+    ): (
         "low sun, ground alone, 16 shadow samples a pixel: noise 0.16 where the "
-        "gradient is 0.23",
-    "a deformation that is not rigid reads low, for a reason not found yet":
-        "smooth deformation of a mug or ball: 4 to 5 % low with normals that follow, 7 "
-        "to 13 % with normals held",
-    "shadows of point, spot and directional lights stay where they are":
-        "not measured: derivative 0",
-    "a surface that cuts through another: the line where they meet is taken for fixed":
-        "not measured: about 0",
-    "a thin lens counts as a pinhole; participating media and what shines on the mesh "
-    "itself are left out":
-        "not measured",
-}  # fmt: skip
+        "gradient is 0.23"
+    ),
+    "a deformation that is not rigid reads low, for a reason not found yet": (
+        "smooth deformation of a mug or ball: 4 to 5 % low with normals that follow, "
+        "7 to 13 % with normals held"
+    ),
+    "shadows of point, spot and directional lights stay where they are": (
+        "not measured: derivative 0"
+    ),
+    (
+        "a surface that cuts through another: the line where they meet is taken for "
+        "fixed"
+    ): "not measured: about 0",
+    (
+        "a thin lens counts as a pinhole; participating media and what shines on the "
+        "mesh itself are left out"
+    ): "not measured",
+}
 """What the estimator does not cover, and what that costs where it was measured.
 
 Errors are relative, of the mean of several seeds over six pose axes; noise is the
@@ -153,14 +173,16 @@ def material_adjoint(
 
 
 def _is_rough(cotangent: Tensor) -> bool:
-    """Return whether neighbouring pixels of a cotangent are hardly correlated.
+    """Return whether neighbouring pixels of a cotangent (H, W, 3) hardly correlate.
 
-    The mean square of a difference is twice the variance times one minus the
-    correlation; the sum of both directions is compared with that at `ROUGH_COTANGENT`.
+    That is, by less than `ROUGH_COTANGENT`. The mean square of the difference of two
+    neighbours is 2 v (1 - c), where v is the mean square of the values and c their
+    correlation.
     """
     values = cotangent.detach().to(torch.float64)
     right_square = torch.diff(values, dim=1).square().mean()
     down_square = torch.diff(values, dim=0).square().mean()
+    # 4: twice for each of the two directions
     return bool(
         right_square + down_square
         > 4.0 * (1.0 - ROUGH_COTANGENT) * values.square().mean()
@@ -170,9 +192,9 @@ def _is_rough(cotangent: Tensor) -> bool:
 def _compute_interior_term(view: FilmView, seed: int, spp: int, tile: int) -> Any:
     """Return a value whose gradient by the vertices is the interior term.
 
-    The chain is taken in two steps: first back to the points and normals of each
-    sample, where gradients that are not finite are set to zero, then on to the
-    vertices. `spp` and `tile` are as for `_sample_first_hits`.
+    The derivative is taken in two steps, as some samples have one that is not finite:
+    first back to the point and the normals of each sample, and from those that are
+    finite on to the vertices. `spp` and `tile` are as for `_sample_first_hits`.
     """
     with dr.suspend_grad():
         film, hit, sampler = _sample_first_hits(view, seed, spp, tile)
@@ -181,13 +203,14 @@ def _compute_interior_term(view: FilmView, seed: int, spp: int, tile: int) -> An
         si = hit.compute_surface_interaction(
             view.camera.make_ray(film), mi.RayFlags.All
         )
+    # point, normal and shading normal, and copies at which the first step ends
     attached = view.attach_hit(hit)[:3]
     local_values = [type(value)(dr.detach(value)) for value in attached]
     dr.enable_grad(local_values)
-    # local copies, at which the first step ends
     point, scaled_normal, shading_normal = local_values
 
-    # Sum of W L J / J over all samples, attached to these points and normals.
+    # Over all samples the sum of cotangent W, radiance L and the relative change of the
+    # film area J that a piece of the surface covers.
     jacobian = (
         dr.dot(scaled_normal, point - view.camera.eye)
         / view.camera.compute_depth(point) ** 3
@@ -230,13 +253,11 @@ def _sample_first_hits(
     column = cell % n_columns
     row = cell // n_columns
 
-    # twice negated, so that quotients are rounded up
-    tiles_across = -(-n_columns // tile)
-    n_tiles = tiles_across * -(-n_rows // tile)
+    tiles_across = math.ceil(n_columns / tile)
+    n_tiles = tiles_across * math.ceil(n_rows / tile)
     tile_index = row // tile * tiles_across + column // tile
-    sampler = make_sampler(
-        make_stream(seed, 0), n_tiles * spp, tile_index * spp + sample
-    )
+    stream = make_stream(seed, 0)  # 0: the interior term, whatever the mesh
+    sampler = make_sampler(stream, n_tiles * spp, tile_index * spp + sample)
 
     # A cell has as many strata as samples, in an almost square grid.
     strata_across = _find_largest_divisor(spp)
@@ -288,7 +309,7 @@ def _attach_interaction(
     """
 
     def attach_normal(fixed: Any, normal: Any) -> Any:
-        """Attach a normal to ours, which may point to the other side."""
+        """Give a fixed normal the gradient of another, which may be its opposite."""
         sign = dr.dot(dr.detach(normal), fixed)
         return dr.replace_grad(fixed, dr.mulsign(dr.normalize(normal), sign))
 
@@ -297,9 +318,9 @@ def _attach_interaction(
     moving_si.n = attach_normal(si.n, scaled_normal)
     normal = attach_normal(si.sh_frame.n, shading_normal)
     tangent = si.sh_frame.s
-    tangent = dr.replace_grad(
-        tangent, dr.normalize(dr.fma(-normal, dr.dot(normal, tangent), tangent))
-    )
+    # the part of the tangent that is perpendicular to the normal
+    perpendicular = dr.fma(-normal, dr.dot(normal, tangent), tangent)
+    tangent = dr.replace_grad(tangent, dr.normalize(perpendicular))
     moving_si.sh_frame = mi.Frame3f(tangent, dr.cross(normal, tangent), normal)
     to_eye = dr.normalize(view.camera.eye - point)
     moving_si.wi = dr.replace_grad(si.wi, moving_si.sh_frame.to_local(to_eye))
@@ -321,7 +342,7 @@ def _sample_reflected(view: FilmView, moving_si: Any, si: Any, sampler: Any) -> 
     direct = _reflect_light(view, moving_si, si, ds, em_weight, active_em)
 
     # Light along the sampled direction is a constant, of which the BSDF passes more or
-    # less; a mirror's stays.
+    # less as the surface moves; what a mirror reflects stays the same.
     bsdf_value = si.bsdf().eval(
         mi.BSDFContext(), moving_si, moving_si.to_local(wo), active & is_smooth
     )
@@ -355,9 +376,10 @@ def _sample_incoming(
 ) -> tuple[Any, Any, Any]:
     """Sample a direction by the BSDF, and the light that arrives along it.
 
+    Direct light is sampled at emitters too, and counts here by its MIS weight alone.
+
     Returns:
-        The BSDF sample; its weight times the radiance, without the part of direct light
-        that is sampled at emitters; and where there is a sample.
+        The BSDF sample; its weight times the radiance; and where there is a sample.
     """
     bsdf_sample, bsdf_weight = si.bsdf().sample(
         mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active
@@ -365,13 +387,13 @@ def _sample_incoming(
     active = active & dr.any(bsdf_weight != 0.0)
     is_smooth = ~mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
     ray = si.spawn_ray(si.to_world(bsdf_sample.wo))
-    # with all of what the next surface emits
+    # all of what the next surface emits is in it
     L = view.sample_radiance(ray, sampler, view.max_depth - 1, active)
     si_next = view.scene.ray_intersect(ray, active)
     ds_next = mi.DirectionSample3f(view.scene, si=si_next, ref=si)
     em_pdf = view.scene.pdf_emitter_direction(si, ds_next, active & is_smooth)
     mis = mi.ad.integrators.common.mis_weight(bsdf_sample.pdf, em_pdf)
-    # Direct light along it counts by its MIS weight alone.
+    # the part that the samples at emitters have
     L -= (1.0 - mis) * ds_next.emitter.eval(si_next, active & is_smooth)
     return bsdf_sample, bsdf_weight * L, active
 
@@ -382,9 +404,9 @@ def _reflect_light(
     """Return the reflected light of emitters that were sampled, attached to the moving
     point.
 
-    The point on the emitter stays. With the moving point the direction to it, the
-    falloff with distance and the BSDF change; of an infinitely far emitter only the
-    BSDF does.
+    The point on the emitter stays. As the reflecting point moves, three factors change:
+    the direction to the emitter, the falloff with distance, and the BSDF; of an
+    infinitely far emitter only the BSDF does.
 
     Args:
         view: the scene.

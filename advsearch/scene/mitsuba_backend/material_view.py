@@ -140,10 +140,14 @@ class FilmView:
         cotangent: Tensor,
         max_depth: int,
     ) -> None:
-        """Sort the scene's meshes into those that move and others, as `TriMesh`."""
+        """Sort the scene's meshes into those that move and others, as `TriMesh`.
+
+        Arguments are those of the class.
+        """
         self.scene = scene
         self.camera = Camera(sensor)
         self.max_depth = max_depth
+        # one pixel wider on each side, and no channel more
         self.padded_cotangent = to_drjit_array(
             torch.nn.functional.pad(cotangent.detach(), (0, 0, 1, 1, 1, 1))
         )
@@ -165,6 +169,7 @@ class FilmView:
                 self.still_meshes.append(
                     _make_mesh(shape, parameters, positions, normals)
                 )
+        # `moving` has the names of normals too
         self.moving_meshes = [
             moving_meshes[name] for name in moving if name in moving_meshes
         ]
@@ -177,6 +182,8 @@ class FilmView:
         width = self.camera.width
         height = self.camera.height
         active = active & self.camera.is_in_frame(dr.detach(film))
+        # From the center of the first pixel of the padded image, which is half a pixel
+        # outside of the film. Cells lie between pixel centers.
         padded_film = film + 0.5
         cell_position = dr.floor(dr.detach(padded_film))
         cell = mi.Point2u(
@@ -194,7 +201,9 @@ class FilmView:
         return dr.lerp(top, bottom, fraction.y) & active
 
     def attach_hit(self, hit: Any) -> tuple[Any, Any, Any, Any]:
-        """Return the surface point of a hit, attached to the vertices.
+        """Return the surface point of a hit, attached to the vertices of moving meshes.
+
+        It stays at the same barycentric coordinates of its triangle.
 
         Returns:
             The point; the normal of its triangle, times twice the area; the shading
@@ -217,13 +226,14 @@ class FilmView:
             mesh_point = dr.fma(b - a, u, dr.fma(c - a, v, a))
             point = dr.select(on_mesh, mesh_point, point)
             scaled_normal = dr.select(on_mesh, face_normal, scaled_normal)
+            mesh_shading_normal = face_normal
             if mesh.is_smooth:
                 a, b, c = (
                     dr.gather(mi.Normal3f, mesh.normals, corner, on_mesh)
                     for corner in corners
                 )
-                face_normal = dr.fma(b - a, u, dr.fma(c - a, v, a))
-            shading_normal = dr.select(on_mesh, face_normal, shading_normal)
+                mesh_shading_normal = dr.fma(b - a, u, dr.fma(c - a, v, a))
+            shading_normal = dr.select(on_mesh, mesh_shading_normal, shading_normal)
             is_moving = is_moving | on_mesh
         return point, scaled_normal, shading_normal, is_moving
 
@@ -306,7 +316,10 @@ def make_stream(seed: int, purpose: int, index: int = 0) -> int:
     (Fibonacci hashing). `purpose` is one of the streams above, and `index` that of a
     mesh.
     """
-    return (((seed * 64 + index) * 4 + purpose + 1) * 0x9E3779B97F4A7C15) % 2**63
+    # Different for each: a seed has up to 64 meshes, and a mesh up to 4 purposes, which
+    # count from 0. With the 1, it is never 0, whose product would be 0.
+    number = (seed * 64 + index) * 4 + purpose + 1
+    return (number * 0x9E3779B97F4A7C15) % 2**63
 
 
 def sample_uniform(stream: int, count: int, dimensions: int) -> Tensor:
@@ -464,15 +477,17 @@ def _sample_outline(
     Returns:
         The samples; None if no outline is in the image.
     """
+    # Dr.Jit's points have one entry for each axis, of one lane each
     eye = torch.tensor([axis[0] for axis in camera.eye], dtype=torch.float64)
     forward = torch.tensor([axis[0] for axis in camera.forward], dtype=torch.float64)
     ends, outwards = _find_outline(mesh, eye)
     if len(ends) == 0 or len(random) == 0:
         return None
-    a = project_to_film(camera, mesh.vertices[ends[:, 0]])
-    b = project_to_film(camera, mesh.vertices[ends[:, 1]])
+    first_on_film = project_to_film(camera, mesh.vertices[ends[:, 0]])
+    second_on_film = project_to_film(camera, mesh.vertices[ends[:, 1]])
     depth = (mesh.vertices[ends] - eye) @ forward
-    length = _measure_on_film(camera, a, b, depth)
+    length = _measure_on_film(camera, first_on_film, second_on_film, depth)
+    # no edge is on the film
     if not float(length.sum()) > 0.0:
         return None
     edge_index, film_fraction = _sample_along(length, random)
@@ -482,9 +497,8 @@ def _sample_outline(
     outwards_on_film = project_to_film(
         camera, midpoints + 1e-3 * mesh.extent * outwards
     ) - project_to_film(camera, midpoints)
-    normal = _find_film_normals(
-        b[edge_index] - a[edge_index], outwards_on_film[edge_index]
-    )
+    edge_on_film = second_on_film[edge_index] - first_on_film[edge_index]
+    normal = _find_film_normals(edge_on_film, outwards_on_film[edge_index])
     # even on the film is not even in space
     fraction = _to_space_fraction(film_fraction, depth[edge_index])
     pixels_per_sample = float(length.sum()) / len(random)
@@ -492,10 +506,10 @@ def _sample_outline(
 
 
 def _find_outline(mesh: TriMesh, eye: Tensor) -> tuple[Tensor, Tensor]:
-    """Find the edges that the eye (3,) may see as an outline.
+    """Find the edges of a mesh that an eye at a position (3,) may see as its outline.
 
-    All faces of such an edge lie on one side of the plane through the edge and the eye,
-    be it one face or several; edges that something hides are among them.
+    All faces of such an edge, one or several, lie on one side of the plane through the
+    edge and the eye. Edges that something hides are among them.
 
     Returns:
         (E, 2) vertices of the edges, and (E, 3) that plane's unit normal, away from the
@@ -507,8 +521,9 @@ def _find_outline(mesh: TriMesh, eye: Tensor) -> tuple[Tensor, Tensor]:
         mesh.vertices[ends[:, 0]] - eye, mesh.vertices[ends[:, 1]] - eye
     )
     plane = torch.nn.functional.normalize(plane, dim=1)
-    # (3 F,) on which side of its edge's plane the third corner of each face lies
+    # (3 F,) signed distance of the third corner of each face from its edge's plane
     offset_from_plane = (plane[owner] * (mesh.vertices[across] - eye)).sum(dim=1)
+    # (E,) the smallest and the largest over the faces of an edge
     min_offset = torch.full(
         (len(ends),), torch.inf, dtype=offset_from_plane.dtype
     ).scatter_reduce(0, owner, offset_from_plane, "amin")
@@ -516,6 +531,7 @@ def _find_outline(mesh: TriMesh, eye: Tensor) -> tuple[Tensor, Tensor]:
         (len(ends),), -torch.inf, dtype=offset_from_plane.dtype
     ).scatter_reduce(0, owner, offset_from_plane, "amax")
     on_outline = (min_offset > 0.0) | (max_offset < 0.0)
+    # away from the faces
     sign = torch.where(min_offset[on_outline] > 0.0, -1.0, 1.0)[:, None]
     return ends[on_outline], plane[on_outline] * sign
 
@@ -545,7 +561,9 @@ def _sample_along(length: Tensor, random: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _find_edges(vertices: Tensor, corners: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Find the edges of a mesh; vertices at the same position count as one.
+    """Find the edges of a mesh, each with all faces on it.
+
+    Vertices at the same position count as one.
 
     Args:
         vertices: (V, 3) positions.
@@ -556,14 +574,16 @@ def _find_edges(vertices: Tensor, corners: Tensor) -> tuple[Tensor, Tensor, Tens
         index of its edge and (3 F,) the vertex across, which is the face's third
         corner.
     """
+    # (V,) the same number for vertices at one position
     position_id = torch.unique(vertices, dim=0, return_inverse=True)[1]
     face_sides = torch.cat([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
     across = torch.cat([corners[:, 2], corners[:, 0], corners[:, 1]])
     lower, higher = position_id[face_sides].aminmax(dim=1)
+    # one number for each pair of positions, in either direction
     edge_keys, owner = torch.unique(lower * len(vertices) + higher, return_inverse=True)
     side_index = torch.arange(len(owner))
-    # The vertices of an edge are those of the first side that lies on it. Assigning by
-    # index would take any side's, not the same one in each call.
+    # An edge has the vertices of the first side that lies on it. To assign them by
+    # index would take those of any side, not the same one in each call.
     first_side = torch.full((len(edge_keys),), len(owner)).scatter_reduce(
         0, owner, side_index, "amin"
     )
@@ -597,7 +617,8 @@ def compute_shadow_term(
     if shadow is None:
         return mi.Float(0)
     lit_point, _, _, lit_point_moves = view.attach_hit(shadow.hit)
-    # of the angle between each line and its edge: an edge along the line sweeps no area
+    # sine of the angle between each line and its edge: an edge along the line sweeps no
+    # area
     sine = torch.linalg.cross(
         sampled.direction, _compute_edge_directions(mesh.vertices, sampled.ends)
     ).norm(dim=1)
@@ -607,12 +628,10 @@ def compute_shadow_term(
     speed = dr.dot(
         shadow.edge_normal, edge_point - dr.select(lit_point_moves, lit_point, 0.0)
     )
-    return (
-        # minus: where the edge moves outwards, light is blocked; the last factor is the
-        # measure of lines that one sample stands for
-        dr.sum(shadow.strength * to_drjit_float(sine[shadow.sample_index]) * speed)
-        * -sampled.measure_per_sample
-    )
+    strength = shadow.strength * to_drjit_float(sine[shadow.sample_index])
+    # minus: where the edge moves outwards, light is blocked; and each sample stands for
+    # a measure of lines
+    return dr.sum(strength * speed) * -sampled.measure_per_sample
 
 
 class _ShadowBorders(NamedTuple):
@@ -656,9 +675,9 @@ def _sample_shadow_borders(
         dr.gather(type(value), value, lit_index)
         for value in (lit, hit, si, edge_position, offset, edge_normal)
     )
-    strength = dr.sum(
-        lit * _sample_radiance_difference(view, si, edge_position, offset, stream)
-    )
+    # how much the loss changes as the lit point passes the shadow's border
+    difference = _sample_radiance_difference(view, si, edge_position, offset, stream)
+    strength = dr.sum(lit * difference)
     strength = dr.select(dr.isfinite(strength), strength, 0.0)
     dr.eval(strength, hit)
     return _ShadowBorders(
@@ -692,8 +711,10 @@ def _eval_lit_points(view: FilmView, si: Any, d: Any) -> Any:
     pixel_area = abs(
         float(matrix[0, 0][0]) * camera.width * float(matrix[1, 1][0]) * camera.height
     )
-    scale = dr.abs(dr.dot(si.n, to_eye)) / depth**3 * pixel_area
-    value *= scale / dr.maximum(dr.abs(dr.dot(si.n, d)), MIN_COSINE)
+    film_area = dr.abs(dr.dot(si.n, to_eye)) / depth**3 * pixel_area
+    # A line's spread is measured across it, and covers more of a surface that it meets
+    # at a grazing angle: hence over the cosine, which is also a factor of the value.
+    value *= film_area / dr.maximum(dr.abs(dr.dot(si.n, d)), MIN_COSINE)
     return dr.select(active, value * view.interpolate_cotangent(film, active), 0.0)
 
 
@@ -719,7 +740,7 @@ def _sample_radiance_difference(
     occluder = view.scene.ray_intersect_preliminary(
         make_ray(p + offset), coherent=False
     )
-    # Shorter by a tolerance, so that the mesh at the edge itself is no occluder.
+    # shorter by a tolerance, so that the mesh at the edge itself does not count
     distance_to_edge = dr.norm(p - si.p) * (1.0 - DEPTH_TOLERANCE) - 2.0 * dr.norm(
         offset
     )
@@ -827,10 +848,10 @@ def _measure_exterior_angles(mesh: TriMesh) -> _ExteriorAngles:
     """
     vertices = mesh.vertices
     ends, owner, across = _find_edges(vertices, mesh.corners)
-    # sides of faces, edge by edge
-    order = torch.argsort(owner, stable=True)
+    # Sides of faces, sorted by their edge: those of one edge follow one another.
+    sorted_sides = torch.argsort(owner, stable=True)
     n_faces = torch.bincount(owner, minlength=len(ends))
-    # of each edge, in that order
+    # where the last side of each edge is among the sorted ones
     last_entry = n_faces.cumsum(dim=0) - 1
     length = (vertices[ends[:, 1]] - vertices[ends[:, 0]]).norm(dim=1)
     is_measured = (n_faces <= 2) & (length > 0.0)
@@ -840,11 +861,13 @@ def _measure_exterior_angles(mesh: TriMesh) -> _ExteriorAngles:
 
     def along_face(entry: Tensor) -> Tensor:
         """Return unit vectors along one of an edge's faces, perpendicular to it."""
-        vector = vertices[across[order[entry[is_measured]]]] - vertices[ends[:, 0]]
+        side = sorted_sides[entry[is_measured]]
+        vector = vertices[across[side]] - vertices[ends[:, 0]]
         return torch.nn.functional.normalize(
             vector - (vector * axis).sum(dim=1, keepdim=True) * axis, dim=1
         )
 
+    # of an edge with a single face both are the same
     along_first = along_face(last_entry - n_faces + 1)
     along_second = along_face(last_entry)
     opening, angle = _measure_between_faces(along_first, along_second, axis, is_single)
@@ -877,7 +900,9 @@ def _measure_between_faces(
         angle.
     """
     cosine = (along_first * along_second).sum(dim=1, keepdim=True)
+    # the part of the first direction that is perpendicular to the second
     perpendicular = along_first - cosine * along_second
+    # away from the first face; of a single face either side will do
     opening = torch.where(
         is_single[:, None],
         torch.linalg.cross(axis, along_second),

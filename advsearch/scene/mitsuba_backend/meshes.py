@@ -247,6 +247,7 @@ def make_mitsuba_mesh(
     linear = to_world[:3, :3]
     vertices = multiply_rows(mesh.vertices.astype(np.float64), linear.T)
     vertices += to_world[:3, 3]
+    # Normals go by the inverse transpose: as rows, by the inverse.
     inverse = np.linalg.inv(linear).astype(np.float64)
     normals = multiply_rows(mesh.normals.astype(np.float64), inverse)
     normals /= np.maximum(compute_lengths(normals), 1e-12)

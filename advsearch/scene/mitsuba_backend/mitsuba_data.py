@@ -36,8 +36,7 @@ DIFFERENCES_FIRST = (*DIFFERENCES_ONLY, "adjoint")
 def find_plugin_numbers(
     description: SceneDescription, name: str, keys: tuple[str, ...]
 ) -> tuple[PluginNumber, ...]:
-    """Return the numbers and colors of a scene that have some of Mitsuba's keys, each
-    once.
+    """Return the numbers and colors of a scene by Mitsuba's keys, each once.
 
     For `KEY.red`, a channel of the color KEY, the full color is returned.
 
@@ -52,24 +51,25 @@ def find_plugin_numbers(
         InputError: there is something else than a number or a color.
     """
     numbers, other_types = _find_numbers(description)
+    # of a channel of a color, such as "KEY.red", the color's key
     color_of_channel: dict[str, str] = {}
     for key, plugin_number in numbers.items():
         if len(plugin_number.values) > 1:
             color_of_channel |= {f"{key}.{channel}": key for channel in CHANNELS}
-    # in the requested order, a color with several channels once
-    keys = tuple(dict.fromkeys(color_of_channel.get(key, key) for key in keys))
-    for key in keys:
+    # in the requested order, a color of which several channels are requested once
+    full_keys = tuple(dict.fromkeys(color_of_channel.get(key, key) for key in keys))
+    for key in full_keys:
         if key in other_types:
             raise InputError(
                 f"`controls` mitsuba:{key}: expected a number or a colour, and Mitsuba "
-                f"has {other_types[key]} there; other "
-                "controls may move it, such as pose and texture"
+                f"has {other_types[key]} there; other controls may move it, such as "
+                "pose and texture"
             )
         if key not in numbers:
             raise UnknownNameError("number or colour in Mitsuba", key, numbers)
     return tuple(
         replace(numbers[key], input=numbers[key].input or f"{name}.{key}")
-        for key in keys
+        for key in full_keys
     )
 
 
@@ -93,11 +93,11 @@ def _find_numbers(
     other_types: dict[str, str] = {}
     for key in scene.parameters.keys():
         value = scene.parameters[key]
-        is_plain = isinstance(value, float)
-        is_number = isinstance(value, mi.Float) and len(value) == 1
+        is_plain = isinstance(value, float)  # a constant of Mitsuba's
+        is_single_number = isinstance(value, mi.Float) and len(value) == 1
         if is_plain:
             values: tuple[float, ...] = (value,)
-        elif is_number or isinstance(value, mi.Color3f):
+        elif is_single_number or isinstance(value, mi.Color3f):
             values = tuple(map(float, np.array(value).reshape(-1)))
         else:
             other_types[key] = f"a {type(value).__name__}"

@@ -89,12 +89,16 @@ def _compute_cap_height(
 
 
 def _find_highest_drops(drops: Float64Array, half_width: float) -> IntArray:
-    """Return the index (GRID, GRID) of the highest drop in each cell, as
-    `sample_raindrops`.
+    """Return the index (GRID, GRID) of the highest drop at the center of each cell.
 
-    `drops` (count, 4) and the half width of the sheet are those of `sample_raindrops`.
-    A cell without a drop has the index `count`.
+    Rows are along y. A cell without a drop has the index `count`.
+
+    Args:
+        drops: (count, 4) x and y of each drop's center, its radius on the sheet, and
+            the radius of its curvature, millimetres.
+        half_width: half the width of the grid, which is around 0, millimetres.
     """
+    # along either axis
     cell_centers = (
         np.arange(GRID_SIZE) + 0.5
     ) / GRID_SIZE * 2.0 * half_width - half_width
@@ -220,6 +224,7 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
             # ---- emission of the surface or of the outside
             active_e = at_surface
             if dr.hint(self.hide_emitters, mode="scalar"):
+                # the camera does not see what is outside
                 active_e = at_surface & ~(is_first & ~si.is_valid())
             ds = mi.DirectionSample3f(scene, si, prev)
             mis = common.mis_weight(
@@ -243,19 +248,12 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
                 scene, sampler, event, active_em, primal
             )
             with dr.resume_grad(when=not primal):
-                bsdf_value_em, bsdf_pdf_em = bsdf.eval_pdf(
-                    context, si, si.to_local(ds_em.d), active_em & at_surface
-                )
-                bsdf_value_em = dr.select(scattered, ISOTROPIC_PHASE, bsdf_value_em)
-                bsdf_pdf_em = dr.select(scattered, ISOTROPIC_PHASE, bsdf_pdf_em)
-                mis = dr.select(
-                    ds_em.delta, 1.0, common.mis_weight(ds_em.pdf, bsdf_pdf_em)
+                mis_value_em = _eval_towards_emitter(
+                    bsdf, si, ds_em, scattered, active_em & at_surface, β
                 )
                 transmittance = dr.exp(-extinction * em_haze_length)
                 Lr_dir = dr.select(
-                    active_em,
-                    β * mis * bsdf_value_em * em_weight * transmittance,
-                    0.0,
+                    active_em, mis_value_em * em_weight * transmittance, 0.0
                 )
 
             # ---- the direction in which the path goes on
@@ -273,12 +271,14 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
             # ---- derivatives
             if dr.hint(not primal, mode="scalar"):
                 with dr.resume_grad():
+                    # the light of later events, as it depends on this one's surface
                     reflected = bsdf.eval(
                         context, si, bsdf_sample.wo, active_next & at_surface
                     )
                     L_further = dr.select(
                         at_surface, L * dr.relative_grad(reflected), L
                     )
+                    # all of it depends on the flight through the haze
                     Lo = (Le + Lr_dir + L_further) * dr.relative_grad(weight)
                     if dr.hint(dr.grad_enabled(Lo), mode="scalar"):
                         dr.backward_from(δL * Lo)
@@ -296,7 +296,11 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
         return (L if primal else δL, bounces + scatterings != 0, [], L)
 
     def _intersect(self, scene: Any, ray: Any, is_first: Any, active: Any) -> Any:
-        """Return the next surface, behind visible emitters where those are hidden."""
+        """Return what a ray hits first.
+
+        Where the integrator hides emitters, a ray from the camera goes on through the
+        surfaces that emit, and hits what is behind them.
+        """
         si = scene.ray_intersect(ray, mi.RayFlags.All, is_first, active)
         if self.hide_emitters:
             is_emitter = si.shape.emitter() != None  # noqa: E711 (for each lane)
@@ -325,7 +329,7 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
         """
         # along the ray, where it is nearest to the center of the ball
         closest_distance = -dr.dot(origin, direction)
-        # 0 where the ray passes the ball: then the length is 0 too
+        # half the length in the ball, 0 where the ray passes it
         half_chord = dr.sqrt(
             dr.maximum(
                 dr.square(closest_distance) - dr.squared_norm(origin) + self.radius**2,
@@ -333,19 +337,20 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
             )
         )
         start = dr.maximum(closest_distance - half_chord, 0.0)
-        return start, dr.maximum(
-            dr.minimum(closest_distance + half_chord, max_distance) - start, 0.0
-        )
+        end = dr.minimum(closest_distance + half_chord, max_distance)
+        return start, dr.maximum(end - start, 0.0)
 
     def _sample_flight(
         self, sampler: Any, haze_length: Any, active: Any
     ) -> tuple[Any, Any, Any, Any, Any]:
         """Sample how far light flies through the haze before it is scattered.
 
+        `haze_length` is the length of the segment in the haze.
+
         Returns:
-            Whether it is scattered within the haze; the distance; the weight (attached
-            to the haze's parameters; only its relative gradient counts); the detached
-            albedo per channel; and the extinction, which is grey.
+            Whether it is scattered within the haze; the distance; a weight, attached to
+            the haze's parameters, of which only the relative gradient counts; the
+            detached albedo per channel; and the extinction, which is grey.
         """
         scattering, _, extinction = self.haze.get_scattering_coefficients(
             dr.zeros(mi.MediumInteraction3f)
@@ -389,6 +394,28 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
         return ds, weight, haze_length, active
 
 
+def _eval_towards_emitter(
+    bsdf: Any, si: Any, ds: Any, scattered: Any, active: Any, throughput: Any
+) -> Any:
+    """Return throughput times MIS weight times value of an event towards an emitter.
+
+    The value is that of the phase function where light is `scattered` in the haze, else
+    that of the BSDF.
+
+    Args:
+        bsdf, si: the BSDF and the interaction of the surface.
+        ds: the direction sample of the emitter.
+        scattered: where the event is in the haze.
+        active: where the BSDF is evaluated.
+        throughput: throughput of the path up to the event.
+    """
+    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active)
+    value = dr.select(scattered, ISOTROPIC_PHASE, value)
+    pdf = dr.select(scattered, ISOTROPIC_PHASE, pdf)
+    mis = dr.select(ds.delta, 1.0, common.mis_weight(ds.pdf, pdf))
+    return throughput * mis * value
+
+
 def _make_event(ray: Any, si: Any, scattered: Any, distance: Any) -> Any:
     """Return the interaction of one event of a path.
 
@@ -427,16 +454,13 @@ class _PlaneHits:
     def __init__(self, scene: Any, sampler: Any, ray: Any, active: Any) -> None:
         """Intersect camera rays with the plane, and sample what it does to the light.
 
-        `is_hit` is where a ray meets the plane, `direct_change` the change of its
-        direct light, `path_ray` the ray by which the path goes on: bounced there,
-        unchanged elsewhere. `is_traced` is where there is such a ray, and `weight` its
-        factor after the bounce.
+        Arguments and what is set are those of the class.
         """
         plane = next(shape for shape in scene.shapes() if shape.id() == PLANE_SHAPE)
         hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
         self.is_hit = active & hit.is_valid() & (hit.shape == mi.ShapePtr(plane))
         self._si = hit.compute_surface_interaction(ray, mi.RayFlags.All, self.is_hit)
-        light = self._sample_emitter(scene, sampler)
+        light = self._sample_emitter(scene, sampler)  # which also sets `_factor`
         self.direct_change = dr.select(self.is_hit, self._factor * light, 0.0)
         bounce, self.weight = self._si.bsdf().sample(
             mi.BSDFContext(),
@@ -452,10 +476,8 @@ class _PlaneHits:
     def _sample_emitter(self, scene: Any, sampler: Any) -> Any:
         """Sample an emitter from the plane, and return its radiance over the density.
 
-        `_factor` is set to what the object changes: the light that the plane reflects,
-        times -1 for light of the environment that something blocks and 0 for what
-        passes; for a lamp, which the photograph does not have, 0 for what is blocked
-        and 1 for what passes.
+        `_factor` is set to the fraction of this light that the plane reflects, with the
+        sign by which it changes the photograph.
         """
         si = self._si
         ds, light = scene.sample_emitter_direction(
@@ -464,6 +486,8 @@ class _PlaneHits:
         is_sampled = self.is_hit & (ds.pdf != 0.0)
         is_blocked = scene.ray_test(si.spawn_ray_to(ds.p), is_sampled)
         is_environment = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+        # of a lamp: 0 where it is blocked, 1 where its light passes; of the environment
+        # -1 and 0, since the photograph has its light already
         sign = dr.select(is_blocked, 0.0, 1.0)
         sign = dr.select(is_environment, sign - 1.0, sign)
         reflected = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(ds.d), is_sampled)
@@ -482,7 +506,8 @@ class _PlaneHits:
             light = scene.eval_emitter_direction(self._si, ds, is_sampled)
             light *= dr.select(is_sampled, dr.rcp(ds.pdf), 0.0)
             if dr.grad_enabled(light):
-                # The path goes along the same edges later: they are kept.
+                # Derivatives of the rest of the path go back through the same lights
+                # later: what leads to them is kept.
                 change = cotangent * self._factor * light
                 dr.backward_from(change, dr.ADFlag.ClearInterior)
 
@@ -650,17 +675,25 @@ def _refract_through_drop(
     )
 
     # From the center of curvature: where the ray enters, and where it leaves.
-    entry = mi.Vector3f(dx, dy, dr.safe_sqrt(drop.w * drop.w - drop.z * drop.z))
+    radius = drop.z
+    curvature_radius = drop.w
+    entry = mi.Vector3f(
+        dx,
+        dy,
+        dr.safe_sqrt(curvature_radius * curvature_radius - radius * radius),
+    )
     entry_cosine = dr.dot(entry, inside_direction)
     # along the ray inside, to the sphere of the cap
     exit_distance = (
         dr.safe_sqrt(
-            entry_cosine * entry_cosine - dr.squared_norm(entry) + drop.w * drop.w
+            entry_cosine * entry_cosine
+            - dr.squared_norm(entry)
+            + curvature_radius * curvature_radius
         )
         - entry_cosine
     )
     exit_point = entry + inside_direction * exit_distance
-    normal = exit_point / drop.w
+    normal = exit_point / curvature_radius
 
     cos_inside = dr.dot(inside_direction, normal)
     # Snell's law at the cap; below 0 is total reflection
@@ -696,7 +729,7 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
     """
 
     def __init__(self, props: Any) -> None:
-        """Read the model, the clipping and perhaps drops from the sensor's properties."""
+        """Read model, clipping and perhaps drops from the sensor's properties."""
         super().__init__(props)
         values = tuple(float(props[name]) for name in NUMBER_NAMES)
         self._model = CameraModel(
@@ -761,7 +794,8 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         if self._sheet_half_width > 0.0:
             direction, transmitted = self._bend_by_drops(direction, sample3)
         weight = dr.select(is_inside, transmitted, 0.0)
-        # Every field is set: a ragged ray has no derivatives.
+        # Every field is set: Dr.Jit differentiates no ray with fields of different
+        # lengths.
         ray = dr.zeros(mi.RayDifferential3f)
         ray.time = time
         ray.o = self.pose @ mi.Point3f(self._near * direction)
@@ -784,7 +818,7 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         Ground truth such as depth is that of the scene behind the drops.
         """
         half_width = self._sheet_half_width
-        self._sheet_half_width = 0.0
+        self._sheet_half_width = 0.0  # no sheet, so no drops
         try:
             return self.sample_ray(time, 0.5, position, mi.Point2f(0.5))
         finally:
@@ -802,10 +836,11 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         aperture_point = APERTURE_RADIUS * mi.warp.square_to_uniform_disk_concentric(
             sample
         )
+        # along the ray
         sheet_distance = SHEET_DISTANCE / dr.maximum(direction.z, 1e-3)
         x = direction.x * sheet_distance + aperture_point.x
         y = direction.y * sheet_distance + aperture_point.y
-        # 0.1: rays almost along the sheet meet no drop
+        # 0.1: rays that go almost along the sheet meet no drop
         drop, dx, dy, is_hit = self._find_drop(x, y, direction.z > 0.1)
         refracted, transmitted, is_lost = _refract_through_drop(direction, dx, dy, drop)
         weight = dr.select(is_hit, dr.select(is_lost, 0.0, transmitted), 1.0)
@@ -839,7 +874,8 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         drop = dr.gather(mi.Vector4f, self._drops, drop_index)
         dx = x - drop.x
         dy = y - drop.y
-        is_hit = on_grid & (drop.z > 0.0) & (dx * dx + dy * dy < drop.z * drop.z)
+        radius = drop.z  # below 0 in a cell without a drop, see `NO_DROP`
+        is_hit = on_grid & (radius > 0.0) & (dx * dx + dy * dy < radius * radius)
         return drop, dx, dy, is_hit
 
     def _make_rays(self) -> None:

@@ -195,24 +195,8 @@ def translate_mesh(part: parts.MeshPart, lobes: Plugin | None = None) -> Transla
         surface = meshes.make_principled(part, lobes)
         inputs += _make_principled_inputs(name)
     else:
-
-        def load_base_texture(options: Mapping[str, object]) -> object:
-            """Load the base color, and add the input that owns this texture."""
-            texture = mi.load_dict(
-                meshes.make_base_texture(part.base_color, options), optimize=False
-            )
-            # The key is found by its owner: the surface may have other textures.
-            inputs.append(
-                SceneInput(
-                    f"{name}.base_color",
-                    f"{name}.*.data",
-                    is_interior=True,
-                    owner=texture,
-                )
-            )
-            return texture
-
-        surface = meshes.fill_base_color(part.surface, load_base_texture)
+        surface, surface_inputs = _load_user_surface(part, part.surface)
+        inputs += surface_inputs
     if meshes.has_textured_emission(part):
         inputs.append(
             SceneInput(
@@ -227,26 +211,65 @@ def translate_mesh(part: parts.MeshPart, lobes: Plugin | None = None) -> Transla
     return Translation({name: mesh}, tuple(inputs))
 
 
+def _load_user_surface(
+    part: parts.MeshPart, surface: Mapping[str, object]
+) -> tuple[Plugin, list[SceneInput]]:
+    """Return a surface in Mitsuba's words with its base color loaded; and its inputs.
+
+    The only input is the base color, if the surface has one.
+    """
+    inputs = list[SceneInput]()
+
+    def load_base_texture(options: Mapping[str, object]) -> object:
+        """Load the base color, and add the input that owns this texture."""
+        texture = mi.load_dict(
+            meshes.make_base_texture(part.base_color, options), optimize=False
+        )
+        # The key is found by its owner: the surface may have other textures.
+        inputs.append(
+            SceneInput(
+                f"{part.name}.base_color",
+                f"{part.name}.*.data",
+                is_interior=True,
+                owner=texture,
+            )
+        )
+        return texture
+
+    return meshes.fill_base_color(surface, load_base_texture), inputs
+
+
 def _make_principled_inputs(name: str) -> list[SceneInput]:
-    """Return the inputs of a mesh's principled surface."""
+    """Return the inputs of the principled surface of a mesh of a name.
+
+    They are its base color and its numbers. None of them moves an outline: the interior
+    adjoint differentiates all.
+    """
     base_color = SceneInput(
         f"{name}.base_color", f"{name}.*.base_color.data", is_interior=True
     )
-    return [base_color] + [
+    numbers = [
         SceneInput(
             f"{name}.{parameter}",
             f"{name}.*.{key}",
-            to_flat_array,
+            write=to_flat_array,
             is_interior=True,
             shape=(1,),
             rendered_range=meshes.RENDERED_RANGES.get(parameter),
         )
         for parameter, key in SURFACE_KEYS.items()
     ]
+    return [base_color, *numbers]
 
 
 def _make_light_input(name: str, parameter: str, key: str) -> SceneInput:
-    """Return the input of a part's light, a color."""
+    """Return the input of a part's light, a color (3,).
+
+    Args:
+        name: name of the part.
+        parameter: what the input is called after it, such as "radiance".
+        key: Mitsuba's key of the color within the part.
+    """
     return SceneInput(
         f"{name}.{parameter}",
         f"{name}.{key}.value",
@@ -273,7 +296,7 @@ def _translate_plugin(part: parts.PluginPart) -> Translation:
 
 @translate_part.register
 def _translate_numbers(part: parts.PluginNumbers) -> Translation:
-    """Return inputs for numbers of other plugins; those of other parts exist already."""
+    """Return inputs for numbers of other plugins; other parts have theirs already."""
     return Translation(
         {},
         tuple(
@@ -401,8 +424,8 @@ def _translate_beam(part: parts.BeamLamp) -> Translation:
     slanted by it.
     """
     height, width = part.table.shape
-    # Centers of the table's cells, on a plane at distance 1: every second of the points
-    # that cut the plane into half cells. A field of view of 90 degrees is 2 wide there.
+    # Centers of the table's cells on a plane at distance 1, where a field of view of 90
+    # degrees is 2 wide: every second of the points that cut the plane into half cells.
     x = np.linspace(-1.0, 1.0, 2 * width + 1)[1::2]
     y = np.linspace(-1.0, 1.0, 2 * height + 1)[1::2]
     cosine = (1.0 + x[None] ** 2 + (y[:, None] * height / width) ** 2) ** -0.5
@@ -484,6 +507,7 @@ def make_scene_dict(
     to_world = camera_to_world(description, width / height)
     camera: Plugin = {
         **_make_lens(description),
+        # object sizes
         "near_clip": 0.01,
         "far_clip": 1e5,
         "to_world": mi.ScalarTransform4f(to_world),
@@ -533,7 +557,8 @@ def _make_ground(description: SceneDescription) -> Any:
         return None
     level = 0.0
     if description.backdrop_photograph is not None:
-        # A photograph has a ground of its own; the plane only takes the shadow.
+        # What is rendered into a photograph stands on the ground that this shows; our
+        # plane only takes the shadow, and may be left out.
         if not has_plane(description):
             return None
         level = description.get_number("ground.level")
@@ -573,8 +598,8 @@ def convert_refusals(description: SceneDescription) -> Iterator[None]:
             raise  # it is our own mistake
         reason = " ".join(str(error).split())
         raise InputError(
-            f"{description.object_name}: Mitsuba refuses the scene: "
-            f"{reason}; change it there"
+            f"{description.object_name}: Mitsuba refuses the scene: {reason}; change "
+            "it there"
         ) from error
 
 
@@ -599,8 +624,7 @@ def _check_background(
     if has_plain_backdrop and may_leave_black:
         raise InputError(
             "background: it would show where the camera's lens sees nothing as well; "
-            "leave the plain background out, "
-            "or take a lens that fills the picture"
+            "leave the plain background out, or take a lens that fills the picture"
         )
 
 
@@ -624,6 +648,7 @@ def _make_lens(description: SceneDescription) -> Plugin:
         }
         # Aperture and focus are inputs, which are set later.
         thin_lens = {"type": "thinlens", "aperture_radius": 1e-4, "focus_distance": 1.0}
+        # the thin lens has the pinhole's field of view
         return pinhole | thin_lens if description.thin_lens else pinhole
     _check_background(description, model, drops)
     camera: Plugin = {
@@ -637,12 +662,12 @@ def _make_lens(description: SceneDescription) -> Plugin:
             name: description.get_number(f"camera.{name}")
             for name in ("drops", "drop_size", "drop_seed")
         }
-        half_fov = math.radians(description.get_number("camera.fov")) / 2.0
         # Drops cover what the lens sees; a searched lens, without a name, is taken for
         # the pinhole with the same field of view.
         if model.name:
             camera["drop_tangent"] = max(model.visible_tangents)
         else:
+            half_fov = math.radians(description.get_number("camera.fov")) / 2.0
             camera["drop_tangent"] = math.tan(half_fov)
     return camera
 

@@ -186,8 +186,9 @@ class MitsubaScene:
     def _set_integrator(self, integrator: str | None) -> None:
         """Set the integrator of images, and the lengths from which paths may end early.
 
-        In a room light is reflected many times: Russian roulette pays there alone.
-        `integrator` is Mitsuba's type, None for the default.
+        Among walls light is reflected many times: there Russian roulette saves more
+        time than its noise costs. `integrator` is Mitsuba's type; None takes "path"
+        there, and "prb" elsewhere.
         """
         self.integrator = integrator or "prb"
         self.roulette_depth = NO_ROULETTE_DEPTH
@@ -213,7 +214,8 @@ class MitsubaScene:
             for translation in translations:
                 plugins |= translation.plugins
                 self._path |= translation.integrator
-            # A path that meets a dark lamp by chance still counts, should it be lit.
+            # No light is sampled from lamps that are dark by default. One that an input
+            # lights is found by paths that meet it by chance.
             if "emitters" in self._leave_out:
                 for part in description.parts:
                     if isinstance(part, Lamp) and part.dark:
@@ -227,8 +229,7 @@ class MitsubaScene:
         return inputs
 
     def _declare_inputs(self, inputs: Sequence[parts.SceneInput]) -> None:
-        """Set `declared_inputs` and what follows from it, by the inputs that the scene
-        really has.
+        """Set `declared_inputs`, inputs that the scene really has, and sets of them.
 
         An input is left out if Mitsuba has no parameter for it.
         """
@@ -249,6 +250,7 @@ class MitsubaScene:
             for name, (key, _) in self.declared_inputs.items()
             if key.endswith((POSITIONS, NORMALS))
         )
+        # Numbers that Mitsuba compiles into its kernels, as constants.
         self._literals = frozenset(
             name
             for name, (_, scene_input) in self.declared_inputs.items()
@@ -268,16 +270,17 @@ class MitsubaScene:
         What may change is `max_depth`, `sampler`, `integrator` and `leave_out`.
         """
         description, filter_name = self.definition
-        settings = {
+        arguments = {
             "max_depth": self.max_depth,
             "leave_out": self._leave_out,
             "sampler": self.sampler,
             **changes,
         }
         other = MitsubaScene(
-            description, self.resolution, filter=filter_name, **settings
+            description, self.resolution, filter=filter_name, **arguments
         )
-        # Load both now: one that is loaded later makes the recordings of all scenes stale.
+        # Load both now: one that is loaded later makes the recordings of all scenes
+        # stale.
         for method in ("path", "guides"):
             other._integrator(method)
         return other
@@ -288,7 +291,8 @@ class MitsubaScene:
         None.
         """
         depth_before = self.depth
-        self.depth = self.depth if depth is None else min(depth, self.max_depth)
+        if depth is not None:
+            self.depth = min(depth, self.max_depth)
         try:
             yield
         finally:
@@ -401,7 +405,7 @@ class MitsubaScene:
                 if self._freeze:
                     key = (method, spp, self.depth, self.window)
                     function = self._recorded.get_or_record(key, render, media)
-                # opaque: a literal seed would be part of the kernel
+                # opaque: a literal seed would be a constant of the recorded kernel
                 drjit_image = function(
                     self._scene, self._sensor, integrator, dr.opaque(mi.UInt32, seed)
                 )
@@ -466,7 +470,8 @@ class MitsubaScene:
                 self._scene, self._sensor, (height * subdivision, width * subdivision)
             )
             for part in self.definition[0].parts:
-                if isinstance(part, LampGlass):  # it counts as what carries it
+                if isinstance(part, LampGlass):
+                    # it counts as the face of the carrier that it was cut out of
                     on_glass = hits.visible_mask(part.name)
                     carrier_face = torch.from_numpy(part.face_of_carrier)
                     hits.face[on_glass] = carrier_face[hits.face[on_glass]]
@@ -505,16 +510,18 @@ class MitsubaScene:
         """
         with mitsuba_lock:
             requested = tuple(inputs if wrt is None else wrt)
-            # inputs that are differentiated although nobody asks for it
-            extra = (
-                set() if "gradients" in self._leave_out else set(self.interior_inputs)
-            )
+            # inputs that are differentiated although they are not requested
+            extra = set[str]()
+            if "gradients" not in self._leave_out:
+                extra = set(self.interior_inputs)
             # the projective integrator knows no lens and no medium
-            has_boundary = method == "path" and self._pinhole and not self.is_volumetric
-            if "boundary" not in self._leave_out and has_boundary:
+            can_be_projective = (
+                method == "path" and self._pinhole and not self.is_volumetric
+            )
+            if can_be_projective and "boundary" not in self._leave_out:
                 method = "boundary"
                 extra = extra | self._buffers
-            # What renders the images may have no adjoint; `prb` has.
+            # the integrator of images may have no adjoint; `prb` has
             if method == "path" and self.integrator != "prb":
                 method = "adjoint"
             image_gradient = self._make_image_gradient(cotangent)
@@ -544,13 +551,14 @@ class MitsubaScene:
         derivative here; and with a plane in a photograph also the 3 of its change.
         """
         gradient = cotangent.detach().to(torch.float32)
-        color_gradient = gradient[..., :3]
+        image_gradient = gradient[..., :3]
         if self._backdrop:
+            # coverage, and behind it the change of a plane
             n_others = 1 if self.plane_radiance is None else 4
             others = torch.zeros(*gradient.shape[:2], n_others)
             others[..., 1:] = gradient[..., 4:]
-            color_gradient = torch.cat([color_gradient, others], dim=-1)
-        return color_gradient.contiguous()
+            image_gradient = torch.cat([image_gradient, others], dim=-1)
+        return image_gradient.contiguous()
 
     @contextmanager
     def _tracked(
@@ -586,7 +594,9 @@ class MitsubaScene:
             yield tracked
         finally:
             mi.set_log_level(level)
-            while old_values:  # what is put back must have no second owner, see `_set`
+            # taken out of the dictionary: what is put back must have no second owner,
+            # see `_set`
+            while old_values:
                 self.parameters.__setitem__(*old_values.popitem())
             self.parameters.update()
 
@@ -672,6 +682,8 @@ class MitsubaScene:
                 projector,
                 self._find_plane(),
             )
+            # Coordinates are converted to those of a repeating texture, which a
+            # principled surface of ours has already.
             size = self.parameters[key].shape[:2]
             surface = None
             if projector is None:
@@ -707,8 +719,8 @@ class MitsubaScene:
             inputs = {**self._every, **inputs}
             self._applied.clear()
         changes = self._find_changes(inputs)
-        changes_literal = not self._literals.isdisjoint(changes)
-        population.changes += changes_literal
+        if not self._literals.isdisjoint(changes):
+            population.changes += 1
         for name, fresh in changes.items():
             self._write(name, fresh)
             if fresh is None:
@@ -754,11 +766,10 @@ class MitsubaScene:
         return changes
 
     def _write(self, name: str, fresh: Tensor | None) -> None:
-        """Write the value of an input, or its base value if `fresh` is None, to
-        Mitsuba.
+        """Write a value of an input, or its base value if `fresh` is None, to Mitsuba.
 
         At the first write the base value is stored. Vertices and normals are written
-        into the memory that they have.
+        into the memory that they have, to which recordings refer.
         """
         key, scene_input = self.declared_inputs[name]
         current = self.parameters[key]
@@ -783,7 +794,8 @@ class MitsubaScene:
             address = current.torch().data_ptr()
             dr.scatter(current, value, dr.arange(mi.UInt32, len(current)))
             dr.eval(current)
-            # Dr.Jit copies what has a second owner; then recordings know another memory
+            # Dr.Jit has copied the memory if something else had it too: then recordings
+            # refer to the old one, and are stale
             population.changes += current.torch().data_ptr() != address
             self.parameters.set_dirty(key)
         else:
@@ -798,6 +810,7 @@ class MitsubaScene:
         """
         key = method, self.depth
         if key not in self._integrators:
+            # `_path` has what a part of the scene needs, such as haze
             adjoint = {
                 "type": "prb",
                 "max_depth": self.depth,
@@ -856,6 +869,7 @@ def _to_repeating(
         size: rows and columns of the texture.
     """
     if surface is None:
+        # to the centers of the outer texels, beyond which the image stays the same
         half_texel = 0.5 / torch.tensor(size[::-1])
         return uv.clamp(half_texel, 1.0 - half_texel)
     options = next(

@@ -19,6 +19,7 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import (
     FileAxis,
     Float32Array,
+    Float64Array,
     Mesh,
     ObjectAsset,
     normalise_mesh,
@@ -109,13 +110,13 @@ def read_scene_dict(scene: Path | Mapping[str, object]) -> tuple[Plugin, list[st
 
 
 def _check_numbers(plugin: Mapping[str, object], where: str) -> None:
-    """Check that some entries of a plugin are numbers, since they are read here.
+    """Check that the entries of a plugin that we read ourselves are numbers.
 
-    All other entries are checked by Mitsuba. A color counts as an entry; other inner
-    plugins are checked like this one. `where` is the beginning of an error. Raises
-    InputError.
+    They are those of `NUMERIC_ENTRIES`; all others are checked by Mitsuba. Inner
+    plugins are checked too. Raises InputError, which begins with `where`.
     """
     for key, value in plugin.items():
+        # a color is a value, though it is written as a plugin
         is_color = isinstance(value, Mapping) and value.get("type", "rgb") in (
             "rgb",
             "spectrum",
@@ -223,20 +224,21 @@ def import_mitsuba_scene(
         frozenset[str](),
     )
     emission = _find_radiance(shape)
-    left_out_clauses = _describe_left_out(
-        tree, shape, hazy=haze is not None, lit=emission is not None
-    )
-    missing_clauses = _describe_missing_attributes(surface.plugin, mesh)
-    notes += [
-        f"{where}: {clause}"
-        for clause in (*left_out_clauses, *surface.notes, *missing_clauses)
+    clauses = [
+        *_describe_left_out(
+            tree, shape, hazy=haze is not None, lit=emission is not None
+        ),
+        *surface.notes,
+        *_describe_missing_attributes(surface.plugin, mesh),
     ]
-    # upright, as all our meshes
-    rotation = frame.rotation.astype(np.float32)
-    mesh = replace(
-        mesh, vertices=mesh.vertices @ rotation.T, normals=mesh.normals @ rotation.T
+    notes += [f"{where}: {clause}" for clause in clauses]
+    mesh, base_color = _paint(
+        _make_upright(mesh, frame.rotation),
+        has_uvs,
+        surface,
+        str(shape["type"]),
+        where,
     )
-    mesh, base_color = _paint(mesh, has_uvs, surface, str(shape["type"]), where)
     source = scene if isinstance(scene, Path) else Path("scene.xml")
     asset = ObjectAsset(
         name=f"{make_safe_name(source)}-{sanitize_name(object_id)}",
@@ -259,23 +261,34 @@ def import_mitsuba_scene(
     return ImportedScene(asset, tuple(surroundings), cameras)
 
 
+def _make_upright(mesh: Mesh, rotation: Float64Array) -> Mesh:
+    """Return a mesh turned by a rotation (3, 3) from scene coordinates to z up."""
+    matrix = rotation.astype(np.float32).T
+    return replace(mesh, vertices=mesh.vertices @ matrix, normals=mesh.normals @ matrix)
+
+
 def _find_shape(
     named: Mapping[str, Mapping[str, object]], object_id: str, where: str
 ) -> str:
-    """Return the id of a shape, or that of the only one whose letters and digits are
-    the same.
+    """Return the id of the shape that a user names.
 
-    Case and signs do not count. Raises UnknownNameError: there is none, or several.
+    Without a shape of that id, it is the only one whose id differs in nothing but case
+    and signs. Raises UnknownNameError: there is none, or several.
+
+    Args:
+        named: the scene's plugins by name.
+        object_id: the name.
+        where: the scene, for errors.
     """
 
-    def letters_of(name: str) -> str:
+    def simplify(name: str) -> str:
         """Return the letters and digits of a name, without case."""
         return "".join(filter(str.isalnum, name.casefold()))
 
     ids = [name for name, plugin in named.items() if plugin["type"] in SHAPE_TYPES]
     if object_id in ids:
         return object_id
-    similar = [name for name in ids if letters_of(name) == letters_of(object_id)]
+    similar = [name for name in ids if simplify(name) == simplify(object_id)]
     if len(similar) != 1:
         raise UnknownNameError(f"shape of {where}", object_id, ids)
     return similar[0]
@@ -327,9 +340,10 @@ def _paint(
 ) -> tuple[Mesh, Float32Array]:
     """Return a mesh with texture coordinates for its base color, and that base color.
 
-    Where anything is looked up by the mesh's own coordinates, or by its attributes,
-    they stay, after the base color's own transform. A shape of one color gets new ones
-    where its own do not tell its points apart, as on a cube.
+    A textured surface, or one that looks anything else up by texture coordinates or
+    attributes, keeps its own; the base color's own transform is applied to them. A
+    shape of one color gets new ones where its own do not tell its points apart, as on a
+    cube.
 
     Args:
         mesh: mesh of the shape.
@@ -339,12 +353,12 @@ def _paint(
         where: the scene, for errors.
     """
     if surface.is_textured or surface.is_bound:
-        # flip v, transform, and flip it back
-        file_uvs = mesh.uvs * (1.0, -1.0) + (0.0, 1.0)
-        file_uvs = file_uvs @ surface.to_uv[:2, :2].T + surface.to_uv[:2, 2]
-        uvs = (file_uvs * (1.0, -1.0) + (0.0, 1.0)).astype(np.float32)
+        # to Mitsuba's v, which points down (1 - v), by the transform, and back
+        mitsuba_uvs = mesh.uvs * (1.0, -1.0) + (0.0, 1.0)
+        mitsuba_uvs = mitsuba_uvs @ surface.to_uv[:2, :2].T + surface.to_uv[:2, 2]
+        uvs = (mitsuba_uvs * (1.0, -1.0) + (0.0, 1.0)).astype(np.float32)
         return replace(mesh, uvs=uvs), surface.base_color
-    # On these, several points have the same texture coordinates.
+    # On these several points have the same texture coordinates.
     has_shared_uvs = kind in ("cube", "sphere", "cylinder", "disk")
     keeps_uvs = has_uvs and not has_shared_uvs
     surface_color = ImportedSurface(color=surface.base_color[0, 0])
@@ -387,13 +401,16 @@ def _find_surface(
     to.
 
     It is the shape's first inner plugin that is neither a light nor a medium; without
-    one, Mitsuba's default. Raises UnknownNameError: a reference leads nowhere, or in a
-    circle.
+    one, Mitsuba's default. `named` are the scene's plugins. Raises UnknownNameError: a
+    reference leads nowhere, or in a circle; InputError: it has too many plugins.
     """
-    n_plugins = 0
+    n_plugins = 0  # how many have been resolved
 
     def resolve(plugin: Mapping[str, object], depth: int) -> Mapping[str, object]:
-        """Return a plugin, which `depth` references lead to, with its own resolved."""
+        """Return a plugin with the references in it resolved.
+
+        `depth` references lead to it from the shape.
+        """
         nonlocal n_plugins
         n_plugins += 1
         if n_plugins > MAX_PLUGINS:
@@ -409,12 +426,10 @@ def _find_surface(
             return resolve(named[name], depth + 1)
         return map_inner_plugins(plugin, lambda inner: resolve(inner, depth))
 
-    for entry in shape.values():
-        if (
-            isinstance(entry, Mapping)
-            and entry["type"] not in LIGHT_TYPES | MEDIUM_TYPES
-        ):
-            return resolve(entry, 0)
+    inner_plugins = (entry for entry in shape.values() if isinstance(entry, Mapping))
+    for plugin in inner_plugins:
+        if plugin["type"] not in LIGHT_TYPES | MEDIUM_TYPES:
+            return resolve(plugin, 0)
     return {"type": "diffuse"}
 
 
@@ -427,14 +442,13 @@ def _find_radiance(shape: Mapping[str, object]) -> Float32Array | None:
     for inner in shape.values():
         if not isinstance(inner, Mapping) or inner["type"] != "area":
             continue
-        if set(inner) <= {"type", "id", "radiance"}:
-            radiance = shapes.parse_constant_color(inner.get("radiance"))
-            if (
-                radiance is not None
-                and 0.0 < radiance.max() <= MAX_RADIANCE
-                and radiance.min() >= 0.0
-            ):
-                return radiance.reshape(1, 1, 3)
+        if not set(inner) <= {"type", "id", "radiance"}:
+            continue
+        radiance = shapes.parse_constant_color(inner.get("radiance"))
+        if radiance is None:
+            continue
+        if radiance.min() >= 0.0 and 0.0 < radiance.max() <= MAX_RADIANCE:
+            return radiance.reshape(1, 1, 3)
     return None
 
 
@@ -448,8 +462,7 @@ def _describe_missing_attributes(
             available = ", ".join(sorted(mesh.attributes)) or "none"
             yield (
                 f"the mesh has no attribute {format_name(str(name))} (it has "
-                f"{available}), "
-                "so that is black"
+                f"{available}), so that is black"
             )
 
 
@@ -571,13 +584,15 @@ class _ObjectFrame:
         """
         kind = plugin["type"]
         if kind in MEDIUM_TYPES:
+            # density is per length, and the object's unit of length is `size` times as
+            # long as the scene's
             scale = float(np.asarray(plugin.get("scale", 1.0)))
             entries = {**plugin, "scale": scale * self.size}
         elif kind in ("gridvolume", "constvolume"):
             entries = self._with_pose(plugin)
         elif not at_top:
             entries = dict(plugin)
-        elif kind == "merge":
+        elif kind == "merge":  # its shapes count as standing at the top
             return map_inner_plugins(plugin, self.move_plugin)
         elif kind in SHAPE_TYPES - {"shapegroup"}:
             entries = self._with_pose(plugin)
@@ -608,10 +623,11 @@ class _ObjectFrame:
         return entries
 
     def _move_lamp(self, plugin: Mapping[str, object]) -> Plugin:
-        """Move a lamp, and scale its power.
+        """Return a lamp in the object's coordinates, with its power scaled.
 
-        Lengths become smaller by the object's size; the intensity of a lamp is
-        irradiance times a squared length, so it is divided by the squared size.
+        Lengths become smaller by the object's size. The intensity of a lamp is an
+        irradiance times a squared length, so it is divided by the squared size; a
+        projector's irradiance too, as it is that at a distance of 1.
         """
         kind = str(plugin["type"])
         entries = dict(plugin)
@@ -675,8 +691,8 @@ def _read_film_size(film: Mapping[str, object]) -> tuple[float, float]:
     height = float(np.asarray(film.get("height", 576)))
     if not min(width, height) >= 1.0:
         raise InputError(
-            "camera: expected a film of at least 1 x 1 pixels, got "
-            f"{width:g} x {height:g}"
+            f"camera: expected a film of at least 1 x 1 pixels, got {width:g} x "
+            f"{height:g}"
         )
     return width, height
 

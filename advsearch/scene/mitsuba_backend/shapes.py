@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,17 +28,17 @@ from advsearch.scene.mitsuba_backend.meshes import (
 from advsearch.scene.mitsuba_backend.variant import Plugin, mi, suppress_warnings
 from advsearch.scene.parts import BASE_COLOR, HazePart, iterate_plugins
 
-Buffers = tuple[
-    Float64Array,
-    IntArray,
-    Float64Array | None,
-    Float64Array | None,
-    dict[str, Float32Array],
-]
-"""Vertices, faces, normals and texture coordinates of a mesh, and its attributes.
 
-The attributes are (V or F, n), by their names.
-"""
+class Buffers(NamedTuple):
+    """The buffers of a mesh in a Mitsuba scene."""
+
+    vertices: Float64Array  # (V, 3)
+    faces: IntArray  # (F, 3)
+    normals: Float64Array | None  # (V, 3), if it has any
+    uvs: Float64Array | None  # (V, 2) texture coordinates, if it has any
+    attributes: dict[str, Float32Array]  # (V or F, n), by name
+
+
 # texture coordinates of a face that has none, as in Mitsuba
 DEFAULT_FACE_UVS = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
 ROUND_SEGMENTS = 64  # segments around a round shape
@@ -108,41 +108,29 @@ def load_shape_mesh(shape: Mapping[str, object], name: str) -> tuple[Mesh, bool]
     Raises:
         InputError: the shape has no triangles, or vertices that are not finite.
     """
-    vertices, faces, normals, uvs, attributes = _load_any_buffers(shape, name)
-    if not np.isfinite(vertices).all():
+    buffers = _load_any_buffers(shape, name)
+    if not np.isfinite(buffers.vertices).all():
         raise InputError(
-            f"object {name}: expected finite vertices, got NaN or "
-            "infinite ones; repair the mesh"
+            f"object {name}: expected finite vertices, got NaN or infinite ones; "
+            "repair the mesh"
         )
-
-    has_uvs = uvs is not None
-    is_flat = normals is None or bool(shape.get("face_normals"))
-    if uvs is None or normals is None or is_flat:
-        # Every corner of a face becomes a vertex of its own.
-        corners = faces.reshape(-1)
-        attributes = _select_vertices(attributes, corners)
-        vertices = vertices[corners]
-        faces = np.arange(len(corners)).reshape(-1, 3)
-        face_normals = _normalize(compute_area_vectors(vertices[faces])).repeat(
-            3, axis=0
-        )
-        if is_flat or normals is None:
-            normals = face_normals
-        else:
-            normals = normals[corners]
-        uvs = (
-            np.tile(DEFAULT_FACE_UVS, (len(faces), 1)) if uvs is None else uvs[corners]
-        )
+    has_uvs = buffers.uvs is not None
+    if shape.get("face_normals"):
+        buffers = buffers._replace(normals=None)
+    vertices, faces, normals, uvs, attributes = buffers
+    if uvs is None or normals is None:
+        vertices, faces, normals, uvs, attributes = _separate_faces(buffers)
 
     used_vertices, vertex_index = np.unique(faces, return_inverse=True)
     faces = vertex_index.reshape(-1, 3)
     vertices = vertices[used_vertices]
-    # v points up in our meshes, and down in Mitsuba's
+    # v points up in our meshes, and down in Mitsuba's: 1 - v
     uvs = uvs[used_vertices] * (1.0, -1.0) + (0.0, 1.0)
     normal_sign = -1.0 if shape.get("flip_normals") else 1.0
     # NaN where a face has no area
     normals = np.nan_to_num(normals)[used_vertices] * normal_sign
-    # summed over the corners of all faces, weighted by area
+    # positive if the faces' fronts are where the normals point: summed over the corners
+    # of all faces, weighted by area
     agreement = np.einsum(
         "fk,fck->", compute_area_vectors(vertices[faces]), normals[faces]
     )
@@ -170,6 +158,30 @@ def _select_vertices(
         key: values[index] if key.startswith("vertex_") else values
         for key, values in attributes.items()
     }
+
+
+def _separate_faces(
+    buffers: Buffers,
+) -> tuple[Float64Array, IntArray, Float64Array, Float64Array, dict[str, Float32Array]]:
+    """Return buffers in which every corner of a face is a vertex of its own.
+
+    Normals that are missing become those of the faces, and texture coordinates that are
+    missing `DEFAULT_FACE_UVS`.
+    """
+    corners = buffers.faces.reshape(-1)
+    vertices = buffers.vertices[corners]
+    faces = np.arange(len(corners)).reshape(-1, 3)
+    if buffers.normals is None:
+        face_normals = _normalize(compute_area_vectors(vertices[faces]))
+        normals = face_normals.repeat(3, axis=0)
+    else:
+        normals = buffers.normals[corners]
+    if buffers.uvs is None:
+        uvs = np.tile(DEFAULT_FACE_UVS, (len(faces), 1))
+    else:
+        uvs = buffers.uvs[corners]
+    attributes = _select_vertices(buffers.attributes, corners)
+    return vertices, faces, normals, uvs, attributes
 
 
 def _load_buffers(shape: Mapping[str, object], name: str) -> Buffers:
@@ -202,16 +214,28 @@ def _load_buffers(shape: Mapping[str, object], name: str) -> Buffers:
         )
     normals = get_rows(NORMALS, 3) if mesh.has_vertex_normals() else None
     uvs = get_rows(TEXCOORDS, 2) if mesh.has_vertex_texcoords() else None
+    attributes = _read_attributes(parameters, len(vertices), len(faces))
+    return Buffers(vertices, faces, normals, uvs, attributes)
+
+
+def _read_attributes(
+    parameters: Any, n_vertices: int, n_faces: int
+) -> dict[str, Float32Array]:
+    """Return the attributes (vertices or faces, c) of a mesh, such as colors, by name.
+
+    Names of attributes begin with what they belong to, such as "vertex_color"; so do
+    Mitsuba's own arrays. Parameters of the mesh's surface and light have a dot in
+    their names.
+    """
     attributes: dict[str, Float32Array] = {}
-    counts = {"vertex": len(vertices), "face": len(faces)}
+    count_by_prefix = {"vertex": n_vertices, "face": n_faces}
     for key in parameters.keys():
-        # Names of attributes begin with what they belong to, such as "vertex_color".
-        count = counts.get(key.split("_")[0], 0)
+        count = count_by_prefix.get(key.split("_")[0], 0)
         is_attribute = key not in (POSITIONS, NORMALS, TEXCOORDS) and "." not in key
         if count and is_attribute:
             values = np.array(parameters[key], np.float32)
             attributes[str(key)] = values.reshape(count, -1)
-    return vertices, faces, normals, uvs, attributes
+    return attributes
 
 
 def _normalize(vectors: Float64Array) -> Float64Array:
@@ -239,16 +263,18 @@ def _tessellate(kind: str, shape: Mapping[str, object], name: str) -> Buffers:
     elif kind == "cylinder":
         shape_pose = _compute_cylinder_pose(shape)
     # without faces that have no area, such as those at a pole
-    faces = faces[np.linalg.norm(compute_area_vectors(vertices[faces]), axis=1) > 1e-9]
+    areas = np.linalg.norm(compute_area_vectors(vertices[faces]), axis=1)
+    faces = faces[areas > 1e-9]
     matrix = get_pose(shape) @ shape_pose
     if not abs(np.linalg.det(matrix[:3, :3])) > 0.0:
         raise InputError(
             f"object {name}: expected a {kind} of some size, got one "
             "without extent; change its numbers"
         )
-    # normals are transformed by the inverse transpose
-    normals = _normalize(normals @ np.linalg.inv(matrix[:3, :3]))
-    return vertices @ matrix[:3, :3].T + matrix[:3, 3], faces, normals, uvs, {}
+    posed_vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
+    # rows times the inverse: normals are transformed by the inverse transpose
+    posed_normals = _normalize(normals @ np.linalg.inv(matrix[:3, :3]))
+    return Buffers(posed_vertices, faces, posed_normals, uvs, attributes={})
 
 
 def _make_unit_shape(
@@ -259,8 +285,8 @@ def _make_unit_shape(
     Returns:
         Vertices (V, 3), faces (F, 3), normals (V, 3) and texture coordinates (V, 2).
     """
-    fractions = np.linspace(0.0, 1.0, ROUND_SEGMENTS + 1)
-    normals = None
+    fractions = np.linspace(0.0, 1.0, ROUND_SEGMENTS + 1)  # of a turn, for a round kind
+    normals = None  # up, for a flat kind
     if kind == "sphere":
         # half as many segments from pole to pole as around
         uvs, faces = _make_grid(fractions, fractions[::2])
@@ -274,7 +300,8 @@ def _make_unit_shape(
         uvs, faces = _make_grid(fractions, np.array([0.0, 1.0]))
         vertices = np.stack([*_compute_circle_points(uvs[:, 0]), uvs[:, 1]], axis=1)
         normals = vertices * (1.0, 1.0, 0.0)
-    elif kind == "disk":  # u is the radius, which needs few segments
+    elif kind == "disk":
+        # u is the radius, along which it is flat: an eighth of the segments is enough
         uvs, faces = _make_grid(fractions[::8], fractions)
         vertices = np.stack(
             [*(uvs[:, 0] * _compute_circle_points(uvs[:, 1])), np.zeros(len(uvs))],
@@ -305,9 +332,9 @@ def _compute_cylinder_pose(shape: Mapping[str, object]) -> Float64Array:
     length = float(np.linalg.norm(end - start))
     axis = (end - start) / max(length, 1e-30)  # not by 0
     x, y, z = axis
+    # two axes perpendicular to it, as in Mitsuba's `coordinate_system` (Duff et al.
+    # 2017), which has float32 alone; the sign keeps the divisor away from 0
     sign = np.copysign(1.0, z)
-    # axes as in Mitsuba's `coordinate_system` (Duff et al. 2017), which has float32
-    # alone
     factor = -1.0 / (sign + z)
     x_axis = np.array([1.0 + sign * x * x * factor, sign * x * y * factor, -sign * x])
     y_axis = np.array([x * y * factor, sign + y * y * factor, -y])
@@ -405,14 +432,16 @@ def _read_haze_medium(
     """
     density = _parse_numbers(medium.get("sigma_t", 1.0))
     scale = _parse_numbers(medium.get("scale", 1.0))
-    # how many lengths of the object one length of the scene has
-    # (the cube root of the determinant is the scale of lengths)
-    object_size = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
-    extinction = density * scale / object_size
-    # one value for all channels, and in range
-    is_grey = 0.0 < float(extinction.min()) == float(extinction.max()) <= MAX_EXTINCTION
+    # The cube root of the determinant is the scale of lengths, from the scene's to
+    # those of the object. What is per length becomes smaller by it.
+    length_scale = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
+    extinction = density * scale / length_scale
+    # one value for all channels
+    is_grey = float(extinction.min()) == float(extinction.max())
+    is_in_range = 0.0 < float(extinction.min()) <= MAX_EXTINCTION
     albedo = np.broadcast_to(_parse_numbers(medium.get("albedo", 0.75)), (3,)).tolist()
-    if not (is_grey and MIN_ALBEDO <= min(albedo) and max(albedo) <= 1.0):
+    has_albedo = MIN_ALBEDO <= min(albedo) and max(albedo) <= 1.0
+    if not (is_grey and is_in_range and has_albedo):
         return None
     red, green, blue = albedo
     return float(extinction[0]), (red, green, blue)
@@ -422,10 +451,13 @@ def _find_haze_plugins(named: Plugins) -> tuple[str, str] | None:
     """Return the names of the ball and of the medium of a haze; None without one.
 
     The only medium of the scene is homogeneous and isotropic, cameras stand in it, and
-    a single sphere with no surface is filled with it.
+    a single sphere with no surface is filled with it. Both have no entries that a haze
+    cannot have, `_OF_BALL` and `_OF_MEDIUM`.
     """
+    # only cameras name a medium that they stand in
     camera_media = {_get_reference(plugin.get("medium")) for plugin in named.values()}
     camera_media.discard(None)
+    # spheres that are filled with it
     ball_names = [
         name
         for name, plugin in named.items()
@@ -437,20 +469,22 @@ def _find_haze_plugins(named: Plugins) -> tuple[str, str] | None:
         for name, plugin in named.items()
         if plugin["type"] in ("homogeneous", "heterogeneous")
     ]
-    if len(camera_media) != 1 or len(ball_names) != 1 or len(medium_names) != 1:
+    if not len(camera_media) == len(ball_names) == len(medium_names) == 1:
         return None
-    ball = named[ball_names[0]]
-    medium = named[medium_names[0]]
+    (ball_name,) = ball_names
+    (medium_name,) = medium_names
+    ball = named[ball_name]
+    medium = named[medium_name]
     isotropic_phase = {"type": "isotropic"}
-    is_haze = (
-        set(ball) <= _OF_BALL
-        and set(medium) <= _OF_MEDIUM
+    is_plain_ball = set(ball) <= _OF_BALL and ball.get("bsdf") == {"type": "null"}
+    is_plain_medium = (
+        set(medium) <= _OF_MEDIUM
         and medium["type"] == "homogeneous"
-        and ball.get("bsdf") == {"type": "null"}
         and medium.get("phase", isotropic_phase) == isotropic_phase
-        and camera_media == {medium_names[0]}
     )
-    return (ball_names[0], medium_names[0]) if is_haze else None
+    if not (is_plain_ball and is_plain_medium and camera_media == {medium_name}):
+        return None
+    return ball_name, medium_name
 
 
 def _get_reference(plugin: object) -> str | None:
@@ -461,19 +495,22 @@ def _get_reference(plugin: object) -> str | None:
 
 
 def _parse_numbers(value: object) -> Float64Array:
-    """Return a number (1,), or the three of a color; NaN for anything else."""
+    """Return a number (1,), or the three of a color; NaN (1,) for anything else."""
+    not_understood = np.full(1, np.nan)
     if isinstance(value, Mapping):
         is_constant = value.get("type") in ("rgb", "uniform", "spectrum", "srgb")
         value = value.get("value") if is_constant else None
+    # NumPy would read both as numbers
     if isinstance(value, (str, bool)):
-        value = None  # which becomes NaN
+        return not_understood
     try:
         numbers = np.atleast_1d(np.asarray(value, np.float64))
     except (TypeError, ValueError):  # such as pairs of wavelength and value
-        return np.full(1, np.nan)
-    if numbers.shape in ((1,), (3,)) and np.isfinite(numbers).all():
+        return not_understood
+    is_number_or_color = numbers.shape in ((1,), (3,))
+    if is_number_or_color and np.isfinite(numbers).all():
         return numbers
-    return np.full(1, np.nan)
+    return not_understood
 
 
 # ---- The surface of a Mitsuba shape: its base color, which is searched; all the rest
@@ -551,6 +588,7 @@ def read_surface(bsdf: Mapping[str, object]) -> ShapeSurface:
     is_constant = linear.shape[:2] == (CONSTANT_SIZE, CONSTANT_SIZE) and not bool(
         np.ptp(linear, axis=(0, 1)).any()
     )
+    # whether it looks different on a mesh with other texture coordinates
     is_bound = any(
         plugin["type"] in MESH_BOUND_PLUGINS or ANISOTROPIC_ENTRIES & set(plugin)
         for plugin in iterate_plugins(surface)
@@ -575,7 +613,7 @@ def _take_base_color(bsdf: Mapping[str, object]) -> tuple[Plugin, _Color | None]
     base: _Color | None = None
 
     def replace_color(plugin: Mapping[str, object]) -> Plugin:
-        """Return a plugin whose base color, if it is the first, is stored and replaced."""
+        """Return a plugin, and store and replace its base color if it is the first."""
         nonlocal base
         key = BASE_COLOR_KEYS.get(str(plugin["type"]))
         if key is not None and base is None:
@@ -592,7 +630,7 @@ def _describe_surface(surface: Plugin, linear: Float32Array) -> list[str]:
 
     `linear` are the linear values of its base color, of any shape.
     """
-    notes = []
+    clauses = []
     types = {str(plugin["type"]) for plugin in iterate_plugins(surface)}
     if BASE_COLOR not in types:
         kinds = sorted(types & {"mesh_attribute", "volume"})
@@ -600,24 +638,24 @@ def _describe_surface(surface: Plugin, linear: Float32Array) -> list[str]:
             reason = f"its colour is a {kinds[0]}"
         else:
             reason = f"a {surface['type']} has none"
-        notes.append(
+        clauses.append(
             f"it has no base colour that can be searched ({reason}): not for "
             "texture, patch and material"
         )
     # with a tolerance for rounding; NaN is out of range too
     if not (linear.min() >= 0.0 and linear.max() <= 1.0 + 1e-4):
-        notes.append("its base colour is cut to reflectances from 0 to 1")
-    return notes
+        clauses.append("its base colour is cut to reflectances from 0 to 1")
+    return clauses
 
 
 def _apply_uv_transform(
     surface: Plugin, transform: object
 ) -> tuple[Plugin, Float64Array]:
-    """Apply a base color's transform of texture coordinates.
+    """Apply a base color's transform of texture coordinates to those of the mesh.
 
-    The mesh's texture coordinates can be transformed where that can be undone, and
-    where tangents along u stay as they are. Otherwise the base color keeps its
-    transform.
+    All other textures of the surface get the inverse before theirs. That is possible
+    only if the transform can be undone, and if tangents along u stay as they are where
+    the surface uses them. Otherwise the base color keeps its transform.
 
     Returns:
         The surface with changed transforms, and the (3, 3) transform of the mesh's
@@ -628,7 +666,7 @@ def _apply_uv_transform(
         plugin["type"] in ("normalmap", "hair") or ANISOTROPIC_ENTRIES & set(plugin)
         for plugin in iterate_plugins(surface)
     )
-    # u grows along the same direction as before
+    # v does not depend on u, which grows in the same direction as before
     keeps_tangents = to_uv[1, 0] == 0.0 and to_uv[0, 0] > 0.0
     is_invertible = abs(np.linalg.det(to_uv)) > 1e-12
     if not is_invertible or (uses_tangents and not keeps_tangents):
@@ -682,17 +720,7 @@ def _parse_base_color(value: object) -> _Color | None:
     if not isinstance(value, Mapping):
         return None
     if value["type"] == "checkerboard":
-        first_color = parse_constant_color(value.get("color0", 0.4))
-        second_color = parse_constant_color(value.get("color1", 0.2))
-        unknown = set(value) - {"type", "id", "color0", "color1", "to_uv"}
-        if first_color is None or second_color is None or unknown:
-            return None
-        checkerboard = np.array(
-            [[first_color, second_color], [second_color, first_color]], np.float32
-        )
-        return _Color(
-            _repeat_texels(checkerboard), {"filter_type": "nearest"}, value.get("to_uv")
-        )
+        return _parse_checkerboard(value)
     pixels = _read_pixels(value) if value["type"] == "bitmap" else None
     if pixels is None:
         return None
@@ -702,12 +730,32 @@ def _parse_base_color(value: object) -> _Color | None:
     return _Color(pixels, options, value.get("to_uv"))
 
 
+def _parse_checkerboard(plugin: Mapping[str, object]) -> _Color | None:
+    """Return a checkerboard as a base color; None if its fields are textures.
+
+    Also None for a plugin with entries that are not known here.
+    """
+    # the defaults are Mitsuba's
+    first_color = parse_constant_color(plugin.get("color0", 0.4))
+    second_color = parse_constant_color(plugin.get("color1", 0.2))
+    unknown = set(plugin) - {"type", "id", "color0", "color1", "to_uv"}
+    if first_color is None or second_color is None or unknown:
+        return None
+    checkerboard = np.array(
+        [[first_color, second_color], [second_color, first_color]], np.float32
+    )
+    return _Color(
+        _repeat_texels(checkerboard), {"filter_type": "nearest"}, plugin.get("to_uv")
+    )
+
+
 def _repeat_texels(texture: Float32Array) -> Float32Array:
     """Enlarge a texture by repeating texels, to at least `MIN_NEAREST_SIZE` a side.
 
     It is for textures that are not interpolated: a control may keep the texture's size
     and interpolate, which then blurs only the borders of texels.
     """
+    # rounded up
     row_repeats, column_repeats = (
         -(-MIN_NEAREST_SIZE // size) for size in texture.shape[:2]
     )

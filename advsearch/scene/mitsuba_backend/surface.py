@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -34,6 +34,8 @@ RAY_PATTERN = ((0.125, 0.375), (0.375, 0.875), (0.625, 0.125), (0.875, 0.625))
 It is a rotated grid, which samples upright and level edges at four positions.
 """
 RAYS_PER_PIXEL = len(RAY_PATTERN)
+# channels of the kernel's result before those of the layers: radiance and coverage
+N_IMAGE_CHANNELS = 4
 # fraction of a ray's light below which what is behind a cut-out does not count
 MIN_TRANSMITTANCE = 1e-3
 
@@ -135,7 +137,10 @@ class ViewTracer:
         model: CameraModel | None,
         center: Float32Array,
     ) -> None:
-        """Prepare the tables of all surfaces and of the lens for the kernel."""
+        """Prepare the tables of all surfaces and of the lens for the kernel.
+
+        Arguments are those of the class.
+        """
         self._scene = scene
         self._grids = tuple(grids)
         self._widths = tuple(widths)
@@ -198,26 +203,27 @@ class ViewTracer:
                 tables: Any,
                 cameras: Any,
                 lens: Any,
-                *maps: Any,
+                texels: Any,
+                sky: Any,
+                blurred: Any,
             ) -> Any:
-                recorded_lit = LightMaps(
-                    maps[0], maps[1], lit.sky_shape, maps[2], lit.blurred_shape
-                )
+                light_maps = replace(lit, texels=texels, sky=sky, blurred=blurred)
                 return self._trace(
-                    mitsuba_scene, lane, tables, cameras, lens, recorded_lit
+                    mitsuba_scene, lane, tables, cameras, lens, light_maps
                 )
 
             recording = self._recordings.get_or_record(
                 (count, lit.sky_shape, lit.blurred_shape), trace, []
             )
+            # the kernel's argument cannot be empty
             lens = np.zeros(1, np.float32) if self._lens is None else self._lens
             arrays = [
                 mi.Float(values)
                 for values in (self._lobe_tables, camera_rows.ravel(), lens)
             ]
             lane = dr.arange(mi.UInt32, count * height * width * RAYS_PER_PIXEL)
-            # A recording takes its size from its arguments; without the lanes it would
-            # be that of the scene's map.
+            # A recording takes its size from its evaluated arguments; without the lanes
+            # it would be that of the scene's map.
             dr.eval(lane)
             channels = recording(
                 self._scene._scene, lane, *arrays, lit.texels, lit.sky, lit.blurred
@@ -262,22 +268,21 @@ class ViewTracer:
         coverage = mi.Float(0.0)
         transmittance = mi.Float(1.0)
         for layer in range(n_layers + 1):
+            # camera rays are coherent: neighbours take similar paths
             si = mitsuba_scene.ray_intersect(ray, ray_flags, layer == 0, active)
             is_hit = active & si.is_valid()
+            # fraction of the light of the whole ray; the last layer stops what is left
+            stopped_fraction = transmittance
             if layer < n_layers:
-                stopped_fraction = transmittance * (
-                    1.0 - texel_rays.eval_transmittance(si, is_hit)
-                )
-            else:
-                stopped_fraction = transmittance
+                opacity = 1.0 - texel_rays.eval_transmittance(si, is_hit)
+                stopped_fraction = transmittance * opacity
             surface_radiance, diffuse, side = self._shade(
                 mitsuba_scene, si, is_hit, direction, tables, lit
             )
             radiance += dr.select(is_hit, stopped_fraction * surface_radiance, 0.0)
             escapes = active & ~si.is_valid()
-            radiance += dr.select(
-                escapes, transmittance * _look_up_sky(lit, direction, to_local), 0.0
-            )
+            sky_radiance = _look_up_sky(lit, direction, to_local)
+            radiance += dr.select(escapes, transmittance * sky_radiance, 0.0)
             coverage += dr.select(is_hit, stopped_fraction / RAYS_PER_PIXEL, 0.0)
             texture_channels += [
                 si.uv.x,
@@ -299,9 +304,7 @@ class ViewTracer:
         """Return the ray of each lane, and whether the lens has one there.
 
         A lane is (view, row, column, ray of the pixel), the last fastest. `cameras` and
-        `lens` are as for `_trace`. A camera's 16 numbers, see `_make_camera_numbers`: 0
-        to 8 are its axes to the left, up and forward, 9 to 11 its position; for a
-        pinhole 12 and 13 are half its extent at distance 1, and 14 and 15 its center.
+        `lens` are as for `_trace`; for a camera's numbers see `_make_camera_numbers`.
         """
         height, width = self._scene.resolution
         pixel = lane // RAYS_PER_PIXEL
@@ -313,12 +316,16 @@ class ViewTracer:
             dr.gather(mi.Float, cameras, view * CAMERA_SIZE + index)
             for index in range(CAMERA_SIZE)
         ]
+        # three numbers for each axis: to the left, up and forward
+        left, up, forward = (camera[start : start + 3] for start in (0, 3, 6))
+        position = camera[9:12]
         if self._lens is None:
+            half_width, half_height, center_x, center_y = camera[12:]
             # in pixels from the left and from the top; x goes to the left, y up
             column = mi.Float(pixel % width) + x_offset
             row = mi.Float(pixel // width) + y_offset
-            x = (camera[14] - 2.0 * column / width) * camera[12]
-            y = (camera[15] - 2.0 * row / height) * camera[13]
+            x = (center_x - 2.0 * column / width) * half_width
+            y = (center_y - 2.0 * row / height) * half_height
             z = mi.Float(1.0)
             active = mi.Bool(True)
         else:
@@ -328,12 +335,10 @@ class ViewTracer:
             y = dr.gather(mi.Float, lens, entry + 1)
             z = dr.gather(mi.Float, lens, entry + 2)
             active = dr.gather(mi.Float, lens, entry + 3) > 0.0
-        direction = [
-            camera[axis] * x + camera[3 + axis] * y + camera[6 + axis] * z
-            for axis in range(3)
-        ]
-        origin = mi.Point3f(*camera[9:12])
-        return mi.Ray3f(origin, dr.normalize(mi.Vector3f(*direction))), active
+        direction = mi.Vector3f(
+            *(left[axis] * x + up[axis] * y + forward[axis] * z for axis in range(3))
+        )
+        return mi.Ray3f(mi.Point3f(*position), dr.normalize(direction)), active
 
     def _shade(
         self,
@@ -372,7 +377,7 @@ class ViewTracer:
         diffuse_radiance = self._look_up_diffuse(si, masks, lit, to_local)
         side = mi.Float(0.0)
         for grid, mask in zip(self._grids, masks, strict=True):
-            if grid.warp is None:  # the searched texture's, not the ground's
+            if not grid.is_ground:  # it is one of the searched texture
                 side = dr.select(mask, -1.0 if grid.side < 0 else 1.0, side)
         radiance = dr.select(
             side != 0.0, 0.0, diffuse_radiance * dr.select(valid, diffuse, 1.0)
@@ -390,16 +395,16 @@ class ViewTracer:
 
         Between its entries a table is interpolated linearly. `masks` tell for each
         surface whether it was hit; where none was, the values are those of the first
-        surface.
+        surface. `tables` are those of all surfaces, one after the other, flat.
 
         Returns:
             One value for each of `LOBE_TABLES`.
         """
         n_tables = len(texel_rays.LOBE_TABLES)
-        table_start = mi.UInt32(0)
+        surface_start = mi.UInt32(0)  # where the tables of the surface begin
         for index, mask in enumerate(masks):
             first_entry = mi.UInt32(index * n_tables * texel_rays.N_ANGLES)
-            table_start = dr.select(mask, first_entry, table_start)
+            surface_start = dr.select(mask, first_entry, surface_start)
         # entry i is for the cosine (i + 0.5) / N_ANGLES
         position = dr.clip(
             cosine * texel_rays.N_ANGLES - 0.5, 0.0, texel_rays.N_ANGLES - 1.0
@@ -408,7 +413,7 @@ class ViewTracer:
         fraction = position - mi.Float(lower)
         values = []
         for index in range(n_tables):
-            entry = table_start + index * texel_rays.N_ANGLES + lower
+            entry = surface_start + index * texel_rays.N_ANGLES + lower
             lower_value = dr.gather(mi.Float, tables, entry)
             upper_value = dr.gather(mi.Float, tables, entry + 1)
             values.append(lower_value + fraction * (upper_value - lower_value))
@@ -442,50 +447,38 @@ class ViewTracer:
         """
         _, up, along, core, tail = lobe
         to_local = texel_rays.world_to_map(self._scene)
-        n_layers = texel_rays.count_cut_out_layers(self._scene)
-        # 1e-8: a ray straight down has no direction along the surface
+        # The part of d along the surface. 1e-8: a ray along the normal has none, and
+        # normalising zeros would give NaN.
         tangent = dr.normalize(d + n * cosine + 1e-8)
-        reflected_direction = dr.normalize(n * up + tangent * along)
-        reflected_hit = texel_rays.find_opaque_hits(
+        direction = dr.normalize(n * up + tangent * along)
+        hit = texel_rays.find_opaque_hits(
             mitsuba_scene,
-            mi.Ray3f(si.p + n * texel_rays.RAY_OFFSET, reflected_direction),
-            n_layers,
+            mi.Ray3f(si.p + n * texel_rays.RAY_OFFSET, direction),
+            texel_rays.count_cut_out_layers(self._scene),
             active=active,
         )
-        reflected_masks = texel_rays.find_hit_grids(
-            mitsuba_scene, self._grids, reflected_hit, reflected_direction
-        )
-        map_direction = self._correct_parallax(si, reflected_direction)
+        masks = texel_rays.find_hit_grids(mitsuba_scene, self._grids, hit, direction)
+        map_direction = self._correct_parallax(si, direction)
+        # half of the gloss is in the core of the lobe, half in its tail
         blurred = 0.5 * sum(
             _look_up_blurred(lit, map_direction, to_local, spread, self._widths)
             for spread in (core, tail)
         )
-        texel = self._look_up_texel(reflected_hit, reflected_masks, lit)
+        texel = self._look_up_texel(hit, masks, lit)
 
+        is_ground = mi.Bool(False)
+        for grid, mask in zip(self._grids, masks, strict=True):
+            is_ground |= mask & grid.is_ground
         # On the ground one ray meets a single place: the wider the lobe, the more
         # counts what surrounds the object, which is darker where the ground is darker
         # there than far off.
         far_ground = mi.UInt32(self._grids[-1].first_cell + self._grids[-1].n_cells)
         darkening = texel / _gather_color(lit.texels, far_ground)
-        is_ground = mi.Bool(False)
-        for grid, mask in zip(self._grids, reflected_masks, strict=True):
-            is_ground |= mask & (grid.warp is not None)
-        spread = dr.sqrt(0.5 * (core * core + tail * tail))
-        wideness = dr.clip(
-            (spread - MIN_BLENDED_SPREAD) / (MAX_BLENDED_SPREAD - MIN_BLENDED_SPREAD),
-            0.0,
-            1.0,
-        )
-        ground_radiance = self._look_up_diffuse(
-            reflected_hit, reflected_masks, lit, to_local
-        )
-        blended_ground = ground_radiance + wideness * (
-            blurred * darkening - ground_radiance
-        )
+        ground = self._look_up_diffuse(hit, masks, lit, to_local)
+        wideness = _compute_wideness(core, tail)
+        blended_ground = ground + wideness * (blurred * darkening - ground)
         return dr.select(
-            reflected_hit.is_valid(),
-            dr.select(is_ground, blended_ground, texel),
-            blurred,
+            hit.is_valid(), dr.select(is_ground, blended_ground, texel), blurred
         )
 
     def _correct_parallax(self, si: Any, direction: Any) -> Any:
@@ -497,7 +490,7 @@ class ViewTracer:
         same point. A direction that is level or goes up, or a scene without ground,
         needs no correction.
         """
-        if all(grid.warp is None for grid in self._grids):
+        if not any(grid.is_ground for grid in self._grids):
             return direction
         distance = si.p.z / dr.maximum(-direction.z, 1e-3)
         from_center = si.p + direction * distance - mi.Point3f(*self._center)
@@ -514,7 +507,7 @@ class ViewTracer:
         if self._photograph_height is not None:
             below = dr.normalize(si.p - mi.Point3f(0.0, 0.0, self._photograph_height))
             for grid, mask in zip(self._grids, masks, strict=True):
-                if grid.warp is not None:
+                if grid.is_ground:
                     photograph = _look_up_sky(lit, below, to_local)
                     radiance = dr.select(mask, radiance * photograph, radiance)
         return radiance
@@ -571,21 +564,19 @@ def _fetch(channels: Sequence[Any], size: tuple[int, int, int]) -> ViewSamples:
     """Copy what the kernel has computed into memory of torch.
 
     `channels` are those of `ViewTracer._trace`: three of radiance, coverage, and then
-    u, v and weight for each layer. `size` is the number of cameras, rows and columns.
-    Samples without weight are left out.
+    u, v and weight for each layer of cut-outs, where a negative weight is one on the
+    back. `size` is the number of cameras, rows and columns. Samples without weight are
+    left out.
     """
     with mitsuba_lock:
-        # Three channels for each layer, after the four of the image. Each becomes
-        # (rays x layers,), all layers of a ray side by side.
-        u, v, weight = (
-            np.stack(
-                [layer.numpy() for layer in channels[first_channel::3]], axis=1
-            ).ravel()
-            for first_channel in (4, 5, 6)
-        )
-        (hits,) = np.nonzero(weight)  # index of ray times layers plus the layer
-        n_layers = len(weight) // (math.prod(size) * RAYS_PER_PIXEL)
         radiance = np.stack([channel.numpy() for channel in channels[:3]], axis=-1)
+        layer_channels = [channel.numpy() for channel in channels[N_IMAGE_CHANNELS:]]
+        n_layers = len(layer_channels) // 3
+        # each (rays x layers,), all layers of a ray side by side
+        u, v, weight = (
+            np.stack(layer_channels[index::3], axis=1).ravel() for index in range(3)
+        )
+        (hits,) = np.nonzero(weight)  # index of the ray times layers, plus the layer
         return ViewSamples(
             radiance=torch.from_numpy(radiance).reshape(*size, 3),
             coverage=torch.from_numpy(channels[3].numpy().copy()).reshape(*size, 1),
@@ -615,6 +606,7 @@ def _look_up_bilinear(
         y, x: row and column, integers at the centers of cells.
         wraps: columns go round; otherwise the grid ends at its border.
     """
+    # beyond the border the cells at the border count
     y = dr.clip(y, 0.0, mi.Float(n_rows) - 1.0)
     upper = mi.UInt32(y)
     y_fraction = y - dr.floor(y)
@@ -641,8 +633,25 @@ def _look_up_bilinear(
     return look_up_row(upper) * (1.0 - y_fraction) + look_up_row(lower) * y_fraction
 
 
+def _compute_wideness(core: Any, tail: Any) -> Any:
+    """Return how wide a lobe is, from 0 at `MIN_BLENDED_SPREAD` to 1 at the maximum.
+
+    `core` and `tail` are the angles of `Lobes`; the spread of both halves together is
+    compared.
+    """
+    spread = dr.sqrt(0.5 * (core * core + tail * tail))
+    return dr.clip(
+        (spread - MIN_BLENDED_SPREAD) / (MAX_BLENDED_SPREAD - MIN_BLENDED_SPREAD),
+        0.0,
+        1.0,
+    )
+
+
 def _gather_color(values: Any, index: Any) -> Any:
-    """Return three numbers; gathering four at once is fastest on the processor."""
+    """Return the color that begins at each index of a flat array.
+
+    Four numbers are gathered, which is faster on the processor than three.
+    """
     return mi.Color3f(*dr.gather(mi.Vector4f, values, index)[:3])
 
 
@@ -654,6 +663,7 @@ def _look_up_sky(lit: LightMaps, direction: Any, to_local: Any) -> Any:
     """
     n_rows, n_columns = lit.sky_shape
     x, y = texel_rays.compute_map_position(direction, to_local)
+    # without the two copies, of which the one at the left is column 0
     column = x * (n_columns - 2) + 0.5
     row = y * (n_rows - 1)
     return _look_up_bilinear(

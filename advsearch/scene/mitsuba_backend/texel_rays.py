@@ -25,6 +25,7 @@ Ints = npt.NDArray[np.int32]
 Grids: TypeAlias = "Sequence[TexelGrid]"
 RAY_OFFSET = 1e-4  # how far from a surface rays begin, object sizes
 RAYS_PER_LAUNCH = 1 << 20  # rays of one launch of `trace_texel_rays`
+N_OUTSIDE_RAYS = 1 << 13  # rays of `is_visible_from_behind`: enough for a percent
 # cut-outs that a ray goes through; what comes after them is taken for opaque
 MAX_CUT_OUT_LAYERS = 4
 # fraction of hits from outside on the backs of a shape's faces above which backs count
@@ -43,6 +44,11 @@ class TexelGrid:
     # + scale sinh(rate s), s in [-1, 1]
     warp: tuple[float, float, float, float] | None = None
     side: int = 0  # side of the faces that it lies on: 1 the front, -1 the back, 0 both
+
+    @property
+    def is_ground(self) -> bool:
+        """Whether it lies over a ground, and not over texture coordinates."""
+        return self.warp is not None
 
     @property
     def n_cells(self) -> int:
@@ -73,16 +79,11 @@ def trace_texel_rays(
         seed: seed of the shifts.
 
     Returns:
-        (n, n_rays) indices of cells of all grids; from the number of those on, of cells
-        of the environment; or -1 where there is no light: the back of a surface that
-        has texels, or a shape that has none.
+        (n, n_rays) indices of what rays meet. The cells of all grids are counted first,
+        then those of the environment; -1 is where there is no light: the back of a
+        surface that has texels, or a shape that has none.
     """
-    # The additive recurrence of the plastic number, which fills a square evenly
-    # (Roberts 2018, The unreasonable effectiveness of quasirandom sequences).
-    increments = np.array([0.7548776662466927, 0.5698402909980532])
-    points = _to_drjit_points(
-        mi.Point2f, (np.arange(1, n_rays + 1)[:, None] * increments) % 1.0
-    )
+    points = _to_drjit_points(mi.Point2f, _spread_points(n_rays))
     n_texels = len(positions)
     shifts = np.random.default_rng(seed).random((n_texels, 2), dtype=np.float32)
     met_cells = np.empty((n_texels, n_rays), dtype=np.int32)
@@ -107,6 +108,17 @@ def trace_texel_rays(
         )
         met_cells[batch] = met.numpy().reshape(-1, n_rays)
     return met_cells
+
+
+def _spread_points(count: int) -> Float64Array:
+    """Return points (count, 2) that fill the unit square evenly.
+
+    They are the additive recurrence of the plastic number (Roberts 2018, The
+    unreasonable effectiveness of quasirandom sequences).
+    """
+    # 1 / p and 1 / p^2, where p^3 = p + 1
+    increments = np.array([0.7548776662466927, 0.5698402909980532])
+    return np.asarray((np.arange(1, count + 1)[:, None] * increments) % 1.0)
 
 
 def _find_sky_cell(
@@ -165,8 +177,8 @@ def _trace_batch(
     # What stops meets a texel, or a shape that has no light.
     masks = find_hit_grids(mitsuba_scene, grids, si, direction)
     for grid, is_hit in zip(grids, masks, strict=True):
-        if grid.warp is None and grid.side == 0:
-            # Only fronts of such a surface have texels: its backs are dark.
+        if not grid.is_ground and grid.side == 0:
+            # Of a surface with one grid only fronts have texels: its backs are dark.
             is_hit &= dr.dot(si.n, direction) < 0.0
         met = dr.select(is_hit, _find_nearest_cell(grid, si), met)
     return met
@@ -188,7 +200,7 @@ def compute_visible_cosines(
     Returns:
         (n, k) cosines; 0 where something is in between.
     """
-    # the transpose turns back
+    # a row times the rotation is turned by its inverse: from the map to the world
     world_directions = (directions @ np.array(world_to_map(scene))).astype(np.float32)
     lane = dr.arange(mi.UInt32, len(positions) * len(world_directions))
     texel = lane // len(world_directions)
@@ -225,24 +237,30 @@ def is_visible_from_behind(
     at the positions (n, 3), which lie on the shape; more than `MIN_BACK_FRACTION` of
     those that hit the shape have to hit a back.
     """
-    generator = np.random.default_rng(0)
-    n_rays = RAYS_PER_LAUNCH >> 7  # enough for a fraction to a percent
-    directions = generator.standard_normal((n_rays, 3))  # from targets to origins
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    directions[:, 2] = np.abs(directions[:, 2])
-    targets = positions[generator.integers(len(positions), size=len(directions))]
-    # outside of the shape from each of its points
-    distance = 2.0 * float(np.ptp(positions, axis=0).max())
-    inwards = _to_drjit_points(mi.Vector3f, (-directions).astype(np.float32))
-    origins = (targets + distance * directions).astype(np.float32)
-    ray = mi.Ray3f(_to_drjit_points(mi.Point3f, origins), inwards)
+    ray = _sample_outside_rays(positions)
     n_layers = count_cut_out_layers(scene)
-    thresholds = _sample_chances(n_layers, len(directions), (0,))
-    si = find_opaque_hits(scene._scene, ray, n_layers, thresholds)
-    grid = TexelGrid(name, 0, (1, 1))
-    (is_hit,) = find_hit_grids(scene._scene, [grid], si, inwards)
-    is_back = np.asarray((is_hit & (dr.dot(si.n, inwards) > 0.0)).numpy())
-    return bool(is_back.sum() > MIN_BACK_FRACTION * np.asarray(is_hit.numpy()).sum())
+    chances = _sample_chances(n_layers, N_OUTSIDE_RAYS, (0,))
+    si = find_opaque_hits(scene._scene, ray, n_layers, chances)
+    # a grid of both sides, whose cells play no part
+    grid = TexelGrid(name, first_cell=0, shape=(1, 1))
+    (is_hit,) = find_hit_grids(scene._scene, [grid], si, ray.d)
+    is_back = is_hit & (dr.dot(si.n, ray.d) > 0.0)
+    n_hits = np.asarray(is_hit.numpy()).sum()
+    return bool(np.asarray(is_back.numpy()).sum() > MIN_BACK_FRACTION * n_hits)
+
+
+def _sample_outside_rays(positions: Float32Array) -> Any:
+    """Return `N_OUTSIDE_RAYS` random rays onto positions (n, 3), from above outside."""
+    generator = np.random.default_rng(0)
+    to_origin = generator.standard_normal((N_OUTSIDE_RAYS, 3))
+    to_origin /= np.linalg.norm(to_origin, axis=1, keepdims=True)
+    to_origin[:, 2] = np.abs(to_origin[:, 2])
+    targets = positions[generator.integers(len(positions), size=N_OUTSIDE_RAYS)]
+    # so far that the origins are outside of the shape
+    distance = 2.0 * float(np.ptp(positions, axis=0).max())
+    origins = (targets + distance * to_origin).astype(np.float32)
+    inwards = _to_drjit_points(mi.Vector3f, (-to_origin).astype(np.float32))
+    return mi.Ray3f(_to_drjit_points(mi.Point3f, origins), inwards)
 
 
 def count_cut_out_layers(scene: MitsubaScene) -> int:
@@ -256,8 +274,9 @@ def find_opaque_hits(
     """Return the first hits of rays that light does not pass.
 
     A ray goes on through up to `n_layers` cut-outs, as long as the fraction of light
-    that passes all it has met is larger than its chance in [0, 1]: a random chance lets
-    rays pass as often as light does, and 0.5 lets them pass where most light does.
+    that passes all that it has met is larger than `chance`, a number in [0, 1]: random
+    ones let rays pass as often as light does, and 0.5 lets them pass where most light
+    does.
     """
     si = mitsuba_scene.ray_intersect(ray, mi.RayFlags.UV, False, active)
     transmittance = mi.Float(1.0)
@@ -391,7 +410,7 @@ class Lobes:
 
     @classmethod
     def make_diffuse(cls) -> Lobes:
-        """Return those of a diffuse surface."""
+        """Return the tables of a diffuse surface: no gloss, at any angle of view."""
         ones = np.ones(N_ANGLES, dtype=np.float32)
         zeros = np.zeros(N_ANGLES, dtype=np.float32)
         return cls(
@@ -447,15 +466,17 @@ def measure_lobes(
         no_gloss, -np.sqrt(1.0 - cosine**2), mean_x / np.maximum(length, 1e-12)
     )
     up = np.where(no_gloss, cosine, mean_z / np.maximum(length, 1e-12))
-    # the square of the chord, which is that of the angle where it is small
+    # Squared distance of unit vectors, 2 - 2 cos, which is the squared angle where that
+    # is small: from each sample to the mean direction.
     squared_angle = 2.0 * np.maximum(
         0.0, 1.0 - samples.x * along[:, None] - samples.z * up[:, None]
     )
     core, tail = _measure_spreads(samples.weight, squared_angle)
-    # the base colors were 0.5 and 0: their difference is what the color reflects
-    diffuse = (
-        np.maximum(samples.grey.mean(axis=1) - samples.black.mean(axis=1), 0.0) / 0.5
-    )
+    # The base colors were 0.5 and 0: what reflects more with the grey one is the
+    # diffuse part, and per base color it is twice that.
+    by_color = samples.grey.mean(axis=1) - samples.black.mean(axis=1)
+    diffuse = np.maximum(by_color, 0.0) / 0.5
+    # the viewer is at positive x, and `Lobes.along` is away from the viewer
     tables = (diffuse, gloss, up, -along, core, tail)
     return Lobes(*(table.astype(np.float32) for table in tables))
 
@@ -474,6 +495,7 @@ def _sample_bsdf(
     those of an opaque surface. The same random numbers serve both base colors.
     """
     n_samples = N_ANGLES * N_LOBE_SAMPLES
+    # one lane for each sample, angle by angle
     cosine = dr.repeat(mi.Float(cosines.astype(np.float32)), N_LOBE_SAMPLES)
     # in the frame of the surface, whose z is the normal
     to_viewer = mi.Vector3f(dr.sqrt(1.0 - cosine * cosine), 0.0, cosine)
@@ -484,33 +506,15 @@ def _sample_bsdf(
     cosine_direction = mi.warp.square_to_cosine_hemisphere(sample2)
     context = mi.BSDFContext()
 
-    def hit_surface(base_color: float) -> Any:
-        """Return the hit as seen from each angle, with a base color set."""
-        key = f"{grid.name}.base_color"
-        changed = dict(inputs)
-        if key in scene.input_names:
-            changed[key] = torch.full_like(scene.get_base_value(key), base_color)
-        mitsuba_scene = scene.set_inputs(changed)
-        # A ray onto the point from just above makes the hit; then its viewer is
-        # replaced.
-        start = mi.Point3f([float(x) for x in position + 1e-3 * normal])
-        ray = mi.Ray3f(start, mi.Vector3f([float(-x) for x in normal]))
-        first_lane = dr.zeros(mi.UInt32, n_samples)
-        si = mitsuba_scene.ray_intersect(dr.gather(mi.Ray3f, ray, first_lane))
-        si.wi = to_viewer
-        return si
-
-    def eval_opacity(si: Any) -> Any:
-        """Return the fraction of light that a cut-out stops."""
-        return dr.maximum(1.0 - eval_transmittance(si, True), 1e-3)
-
-    si = hit_surface(0.5)
-    opacity = eval_opacity(si)
+    mitsuba_scene = _set_base_color(scene, inputs, grid.name, 0.5)
+    si = _hit_point(mitsuba_scene, position, normal, to_viewer)
+    opacity = _eval_opacity(si)
     grey = dr.mean(si.bsdf().eval(context, si, cosine_direction) / opacity)
 
-    si = hit_surface(0.0)
+    mitsuba_scene = _set_base_color(scene, inputs, grid.name, 0.0)
+    si = _hit_point(mitsuba_scene, position, normal, to_viewer)
     bsdf = si.bsdf()
-    opacity = eval_opacity(si)
+    opacity = _eval_opacity(si)
     black = dr.mean(bsdf.eval(context, si, cosine_direction) / opacity)
     # What is transmitted, below the surface, is no gloss.
     bsdf_sample, bsdf_weight = bsdf.sample(context, si, sample1, sample2)
@@ -518,6 +522,7 @@ def _sample_bsdf(
     weight = dr.select(is_reflected, dr.mean(bsdf_weight) / opacity, 0.0)
     weight = dr.select(dr.isfinite(weight), weight, 0.0)
 
+    # with which the directions of `grey` and `black` were sampled
     density = _to_table(cosine_direction.z.numpy() / math.pi)
     return _BsdfSamples(
         grey=_to_table(grey.numpy()) / density,
@@ -526,6 +531,43 @@ def _sample_bsdf(
         x=_to_table(bsdf_sample.wo.x.numpy()),
         z=_to_table(bsdf_sample.wo.z.numpy()),
     )
+
+
+def _set_base_color(
+    scene: MitsubaScene, inputs: Mapping[str, Tensor], name: str, grey: float
+) -> Any:
+    """Set a scene's inputs with one grey as the base color of a shape, if it has one.
+
+    Returns Mitsuba's scene. `name` is that of the shape.
+    """
+    key = f"{name}.base_color"
+    changed = dict(inputs)
+    if key in scene.input_names:
+        changed[key] = torch.full_like(scene.get_base_value(key), grey)
+    return scene.set_inputs(changed)
+
+
+def _hit_point(
+    mitsuba_scene: Any, position: Float32Array, normal: Float32Array, to_viewer: Any
+) -> Any:
+    """Return the surface interaction at a point (3,), as seen by viewers.
+
+    A ray onto the point from just above makes it; then its viewer is replaced.
+    `to_viewer` are unit vectors in the frame of the surface, one for each lane.
+    """
+    # 1e-3: so near that nothing else is in between
+    start = mi.Point3f([float(x) for x in position + 1e-3 * normal])
+    ray = mi.Ray3f(start, mi.Vector3f([float(-x) for x in normal]))
+    # the same ray in every lane
+    first_lane = dr.zeros(mi.UInt32, dr.width(to_viewer))
+    si = mitsuba_scene.ray_intersect(dr.gather(mi.Ray3f, ray, first_lane))
+    si.wi = to_viewer
+    return si
+
+
+def _eval_opacity(si: Any) -> Any:
+    """Return the fraction of light that a surface stops, at least 0.001."""
+    return dr.maximum(1.0 - eval_transmittance(si, True), 1e-3)
 
 
 def _measure_spreads(
@@ -540,6 +582,8 @@ def _measure_spreads(
     weight = np.take_along_axis(weight, order, axis=1)
     squared_angle = np.take_along_axis(squared_angle, order, axis=1)
     total = weight.sum(axis=1, keepdims=True)
+    # of the samples with smaller angles; a sample counts for the first half as far as
+    # half of the total is left for it
     weight_before = weight.cumsum(axis=1) - weight
     inner_weight = np.clip(0.5 * total - weight_before, 0.0, weight)
     half_weight = np.maximum(0.5 * total[:, 0], 1e-12)

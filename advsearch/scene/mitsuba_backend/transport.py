@@ -21,7 +21,8 @@ kernel, which also makes the image itself and what guides its denoiser.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -118,34 +119,61 @@ def collect_paths(
         weight = dr.select(_find_hits(scene, ray, unseen), 0.0, weight)
     first_hit, emitted, bounces = _trace_paths(scene, ray, weight, noise, depth)
 
-    # The BSDFs are evaluated once more with the base color larger by `COLOR_STEP`:
-    # their differences are the derivatives. For a projector, its light is evaluated
-    # alone, with a white image.
-    texture = mi.TensorXf(parameters[key])
-    slopes = [(0.0, 0.0)] * len(bounces)
-    projected = list[tuple[Any, Any]]()
-    try:
-        if projector is None:
-            parameters[key] = texture + COLOR_STEP
-            parameters.update()
-            slopes = [bounce.compute_slopes() for bounce in bounces]
-        else:
-            parameters[key] = dr.full(mi.TensorXf, 1.0, texture.shape)
-            parameters.update()
-            projected = [bounce.eval_projector(scene, projector) for bounce in bounces]
-    finally:
-        parameters[key] = texture
-        parameters.update()
-
-    L, vertices = _accumulate_radiance(bounces, emitted, slopes)
-    if projector is not None:
-        vertices = [
-            (uv, bounce.throughput * light, bounce.sharp)
-            for bounce, (uv, light) in zip(bounces, projected, strict=True)
-        ]
+    if projector is None:
+        slopes = _compute_slopes(parameters, key, bounces)
+        L, vertices = _accumulate_radiance(bounces, emitted, slopes)
+    else:
+        vertices = _light_by_projector(scene, parameters, key, projector, bounces)
+        L, _ = _accumulate_radiance(bounces, emitted, [(0.0, 0.0)] * len(bounces))
     L = dr.select(dr.isfinite(L), L, 0.0)
     channels = [*(L + emitted[0]), *first_hit]
     return _fetch_paths(channels, vertices, size, spp)
+
+
+def _compute_slopes(
+    parameters: Any, key: str, bounces: Sequence[Bounce]
+) -> list[tuple[Any, Any]]:
+    """Return for each bounce the derivatives of both BSDF values by the base color.
+
+    The BSDFs are evaluated once more with all texels larger by `COLOR_STEP`. For the
+    first two arguments see `_set_texture`.
+    """
+    larger_color = mi.TensorXf(parameters[key]) + COLOR_STEP
+    with _set_texture(parameters, key, larger_color):
+        return [bounce.compute_slopes() for bounce in bounces]
+
+
+def _light_by_projector(
+    scene: Any, parameters: Any, key: str, projector: Any, bounces: Sequence[Bounce]
+) -> list[tuple[Any, Any, Any]]:
+    """Return the vertices of paths as a projector with a white image lights them.
+
+    They are as those of `_accumulate_radiance`, with texture coordinates in the image
+    of the projector, whose key is `key`. Other light does not count.
+    """
+    white = dr.full(mi.TensorXf, 1.0, mi.TensorXf(parameters[key]).shape)
+    with _set_texture(parameters, key, white):
+        projected = [bounce.eval_projector(scene, projector) for bounce in bounces]
+    return [
+        (uv, bounce.throughput * light, bounce.sharp)
+        for bounce, (uv, light) in zip(bounces, projected, strict=True)
+    ]
+
+
+@contextmanager
+def _set_texture(parameters: Any, key: str, value: Any) -> Iterator[None]:
+    """Set a texture of Mitsuba's scene inside the `with`.
+
+    `parameters` are what `mi.traverse` returns, and `key` is that of the texture.
+    """
+    texture = mi.TensorXf(parameters[key])
+    try:
+        parameters[key] = value
+        parameters.update()
+        yield
+    finally:
+        parameters[key] = texture
+        parameters.update()
 
 
 def _find_hits(scene: Any, ray: Any, shape: Any) -> Any:
@@ -287,12 +315,12 @@ class Bounce:
     throughput: Any  # throughput of the path before it
     sharp: Any  # no vertex before it scatters light
     wo_em: Any  # direction to the light that was sampled
-    active_em: Any  # active em in which lanes there is one
+    active_em: Any  # in which lanes there is one
     # radiance from there over the density, with its MIS weight against BSDF sampling
     em_weight: Any
     bsdf_value_em: Any  # the BSDF times the cosine for the direction to the light
     bsdf_sample: Any  # the path's direction
-    active_bsdf: Any  # active bsdf in which lanes it has a density
+    active_bsdf: Any  # in which lanes it has a density
     # the same for the path's direction over its density: the throughput of the vertex
     bsdf_weight: Any
 
@@ -371,8 +399,7 @@ def _trace_paths(
 ) -> tuple[list[Any], list[Any], list[Bounce]]:
     """Trace paths from camera rays; rays of weight 0 see nothing.
 
-    Emission that the vertex before has sampled too counts by its MIS weight. All paths
-    have `depth` segments at most; there is no Russian roulette.
+    All paths have `depth` segments at most; there is no Russian roulette.
 
     Returns:
         What the camera sees, channel by channel in the order of the images of `Paths`
@@ -380,7 +407,6 @@ def _trace_paths(
         reflects light, but for the last.
     """
     count = dr.width(ray.o)
-    mis_weight = mi.ad.integrators.common.mis_weight
     active = dr.any(weight > 0.0) & dr.full(mi.Bool, True, count)
     sharp = dr.full(mi.Bool, True, count)  # no vertex so far scatters light
     throughput = mi.Spectrum(1.0)
@@ -398,13 +424,7 @@ def _trace_paths(
     for segment in range(depth):
         si = scene.ray_intersect(ray, active)
 
-        # Emission of what was hit. The vertex before may have sampled the same light,
-        # so the two share it.
-        ds = mi.DirectionSample3f(scene, si, prev_si)
-        em_pdf = scene.pdf_emitter_direction(prev_si, ds, active & ~prev_delta)
-        mis = dr.select(prev_delta, 1.0, mis_weight(prev_pdf, em_pdf))
-        emission = mis * si.emitter(scene, active).eval(si, active)
-        emitted.append(dr.select(active, emission, 0.0))
+        emitted.append(_eval_emission(scene, si, prev_si, prev_pdf, prev_delta, active))
 
         # What the camera sees first; through cut-outs it sees what is behind them.
         bsdf = si.bsdf(ray)
@@ -440,6 +460,29 @@ def _trace_paths(
     return images, emitted, bounces
 
 
+def _eval_emission(
+    scene: Any, si: Any, prev_si: Any, prev_pdf: Any, prev_delta: Any, active: Any
+) -> Any:
+    """Return the light that a hit emits towards the vertex before it.
+
+    That vertex may have sampled the same light, so the two share it by MIS weights.
+
+    Args:
+        scene: Mitsuba's scene.
+        si, prev_si: the hit, and the vertex before.
+        prev_pdf: density with which the vertex before has sampled the direction.
+        prev_delta: whether it reflects in one direction alone, so that it cannot sample
+            lights.
+        active: lanes that count.
+    """
+    mis_weight = mi.ad.integrators.common.mis_weight
+    ds = mi.DirectionSample3f(scene, si, prev_si)
+    em_pdf = scene.pdf_emitter_direction(prev_si, ds, active & ~prev_delta)
+    mis = dr.select(prev_delta, 1.0, mis_weight(prev_pdf, em_pdf))
+    emission = mis * si.emitter(scene, active).eval(si, active)
+    return dr.select(active, emission, 0.0)
+
+
 def _sample_bounce(
     scene: Any,
     si: Any,
@@ -462,7 +505,8 @@ def _sample_bounce(
     context = mi.BSDFContext()
     mis_weight = mi.ad.integrators.common.mis_weight
 
-    # Light that a BSDF sample can't meet (a point) has all of the weight.
+    # Towards a light. One that a BSDF sample can't meet, a point, has all of the
+    # weight.
     ds, em_weight = scene.sample_emitter_direction(
         si, noise.next_2d(active), True, active
     )
@@ -472,6 +516,7 @@ def _sample_bounce(
     mis = dr.select(ds.delta, 1.0, mis_weight(ds.pdf, bsdf_pdf_em))
     em_weight = dr.select(active_em, em_weight * mis, 0.0)
 
+    # Along the path.
     bsdf_sample, bsdf_weight = bsdf.sample(
         context, si, noise.next_1d(active), noise.next_2d(active), active
     )
@@ -511,42 +556,69 @@ def find_first_hits(scene: Any, sensor: Any, resolution: tuple[int, int]) -> Sur
     eye = to_world @ mi.Point3f(0.0)  # rays begin at the near clipping plane
     forward = dr.normalize(to_world @ mi.Vector3f(0.0, 0.0, 1.0))
     active = dr.any(mi.Spectrum(weight) > 0.0) & dr.full(mi.Bool, True, count)
-    shape_id = dr.zeros(mi.UInt32, count)
-    face = dr.zeros(mi.UInt32, count)
-    depth = dr.full(mi.Float, dr.inf, count)
-    z_depth = dr.full(mi.Float, dr.inf, count)
-    normal = dr.zeros(mi.Normal3f, count)
-    uv = dr.zeros(mi.Point2f, count)
-    shapes = scene.shapes()
+    layers = _SurfaceLayers(scene.shapes(), count)
     while dr.any(active):
         si = scene.ray_intersect(ray, active)
         active &= si.is_valid()
         passes_through = _passes_camera_ray(scene, si, active)
-        is_stopped = active & ~passes_through
-        for index, shape in enumerate(shapes, 1):
-            shape_id[is_stopped & (si.shape == mi.ShapePtr(shape))] = mi.UInt32(index)
-        face[is_stopped] = si.prim_index
-        depth[is_stopped] = dr.norm(si.p - eye)
-        z_depth[is_stopped] = dr.dot(si.p - eye, forward)
-        normal[is_stopped] = mi.Normal3f(si.sh_frame.n)
-        # Mitsuba's rows of a texture begin at the top
-        uv[is_stopped] = mi.Point2f(si.uv.x, 1.0 - si.uv.y)
+        layers.put(si, eye, forward, active & ~passes_through)
         ray = si.spawn_ray(ray.d)
         active = passes_through
+    return layers.to_surfaces(resolution)
 
-    def to_image(value: Any) -> Tensor:
-        image: Tensor = value.torch().reshape(height, width).cpu()
-        return image
 
-    return Surfaces(
-        names=tuple(shape.id() for shape in shapes),
-        id=to_image(shape_id).long(),
-        depth=to_image(depth),
-        z_depth=to_image(z_depth),
-        normal=torch.stack([to_image(axis) for axis in normal], dim=-1),
-        uv=torch.stack([to_image(axis) for axis in uv], dim=-1),
-        face=to_image(face).long(),
-    )
+class _SurfaceLayers:
+    """What the camera sees first in each pixel, layer by layer of `Surfaces`.
+
+    Args:
+        shapes: Mitsuba's shapes of the scene.
+        count: number of pixels, in which nothing is seen yet.
+    """
+
+    def __init__(self, shapes: Sequence[Any], count: int) -> None:
+        self._shapes = shapes
+        self._shape_id = dr.zeros(mi.UInt32, count)  # 0: no shape
+        self._face = dr.zeros(mi.UInt32, count)
+        self._depth = dr.full(mi.Float, dr.inf, count)
+        self._z_depth = dr.full(mi.Float, dr.inf, count)
+        self._normal = dr.zeros(mi.Normal3f, count)
+        self._uv = dr.zeros(mi.Point2f, count)
+
+    def put(self, si: Any, eye: Any, forward: Any, mask: Any) -> None:
+        """Store hits in the pixels of a mask.
+
+        Args:
+            si: the hits.
+            eye: position of the camera.
+            forward: unit direction in which it looks.
+            mask: whether each pixel's hit is what the camera sees first.
+        """
+        for index, shape in enumerate(self._shapes, 1):
+            is_shape = si.shape == mi.ShapePtr(shape)
+            self._shape_id[mask & is_shape] = mi.UInt32(index)
+        self._face[mask] = si.prim_index
+        self._depth[mask] = dr.norm(si.p - eye)
+        self._z_depth[mask] = dr.dot(si.p - eye, forward)
+        self._normal[mask] = mi.Normal3f(si.sh_frame.n)
+        # Mitsuba's rows of a texture begin at the top
+        self._uv[mask] = mi.Point2f(si.uv.x, 1.0 - si.uv.y)
+
+    def to_surfaces(self, resolution: tuple[int, int]) -> Surfaces:
+        """Return the layers as images of a height and a width."""
+
+        def to_image(value: Any) -> Tensor:
+            image: Tensor = value.torch().reshape(resolution).cpu()
+            return image
+
+        return Surfaces(
+            names=tuple(shape.id() for shape in self._shapes),
+            id=to_image(self._shape_id).long(),
+            depth=to_image(self._depth),
+            z_depth=to_image(self._z_depth),
+            normal=torch.stack([to_image(axis) for axis in self._normal], dim=-1),
+            uv=torch.stack([to_image(axis) for axis in self._uv], dim=-1),
+            face=to_image(self._face).long(),
+        )
 
 
 def _sample_center_rays(sensor: Any, resolution: tuple[int, int]) -> tuple[Any, Any]:
@@ -575,6 +647,7 @@ def _passes_camera_ray(scene: Any, si: Any, active: Any) -> Any:
     bsdf = si.bsdf()
     shining = dr.max(si.emitter(scene, active).eval(si, active)) > 0.0
     is_clear = dr.max(bsdf.eval_null_transmission(si, active)) > 0.5
+    # it reflects nothing
     only_passes = ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
     return (
         active

@@ -95,14 +95,15 @@ def record_on_first_use(
 ) -> Callable[..., Any]:
     """Return a function that Dr.Jit records on first use and replays later.
 
-    Nothing may be freed while it records: memory that torch shares and scenes end with
-    a host function, which Dr.Jit 1.5.0 cannot record, and the process ends. So Python's
-    garbage collector waits until after.
+    Nothing may be freed while it records. When a scene is freed, or memory that torch
+    shares, a function of Python is called; Dr.Jit 1.5.0 cannot record that, and the
+    process ends. So Python's garbage collector waits until after.
 
     Args:
         render: the function.
         media: Mitsuba's media that it uses besides its arguments.
     """
+    # `state_fn` names what a recording uses besides its arguments
     frozen = dr.freeze(render, state_fn=(lambda *_, **__: media) if media else None)
 
     def call(*arguments: Any) -> Any:

@@ -82,15 +82,8 @@ def write_scene(
             "camera: stock Mitsuba has no sensor with distortion; export "
             "the run as glTF (.glb) instead"
         )
-    integrator: Plugin = {
-        # not `prbvolpath`, which starts outside of all media
-        "type": "volpath" if scene.is_volumetric else "path",
-        "max_depth": scene.max_depth,
-        "rr_depth": scene.roulette_depth,
-        "hide_emitters": hide_environment,
-    }
     xml_scene: Plugin = {
-        "integrator": integrator,
+        "integrator": _make_integrator(scene, hide_environment),
         **make_scene_dict(description, scene.resolution, filter_name, scene.sampler),
     }
     # inputs that are not in the dictionary yet: `_put_part` takes some of them out
@@ -119,6 +112,17 @@ def write_scene(
         if shape.is_mesh() and shape.id() in xml_scene
     }
     write_xml(path, xml_scene, meshes, note)
+
+
+def _make_integrator(scene: MitsubaScene, hide_environment: bool) -> Plugin:
+    """Return the dictionary of stock Mitsuba's integrator for a scene."""
+    return {
+        # not `prbvolpath`, which starts outside of all media
+        "type": "volpath" if scene.is_volumetric else "path",
+        "max_depth": scene.max_depth,
+        "rr_depth": scene.roulette_depth,
+        "hide_emitters": hide_environment,
+    }
 
 
 def _put_part(
@@ -219,18 +223,19 @@ def _put_input(plugin: Plugin, key_parts: list[str], value: Float32Array) -> boo
     if name.startswith("brdf_") and name not in plugin:
         # Mitsuba calls the surfaces of both sides "brdf_0" and "brdf_1"; in a
         # dictionary they are one, the only inner plugin.
-        inner_names = [
-            inner for inner, entry in plugin.items() if isinstance(entry, Mapping)
-        ]
-        name = inner_names[0] if inner_names else name
-    # A loaded texture has its texels as "data".
-    name = "bitmap" if name == "data" else name
+        inner_names = [key for key in plugin if isinstance(plugin[key], Mapping)]
+        if inner_names:
+            name = inner_names[0]
+    if name == "data":  # what a loaded texture calls its texels
+        name = "bitmap"
     entry = plugin.get(name)
     if isinstance(entry, Mapping):
         # The key leads on into a copy of the inner plugin.
         plugin[name] = dict(entry)
         return bool(inner_parts) and _put_input(plugin[name], inner_parts, value)
-    if inner_parts or (entry is None and name not in OPTIONAL_ENTRIES):
+    is_missing = entry is None and name not in OPTIONAL_ENTRIES
+    # the key leads into a value, or to nothing
+    if inner_parts or is_missing:
         return False
     if name == "bitmap":
         plugin[name] = mi.Bitmap(np.ascontiguousarray(value))
@@ -242,10 +247,11 @@ def _put_input(plugin: Plugin, key_parts: list[str], value: Float32Array) -> boo
 
 
 def _make_mesh(part: parts.MeshPart, remaining_inputs: Plugin) -> Plugin:
-    """Return a mesh's plugin, and take its inputs out of the remaining ones.
+    """Return a mesh's plugin with its inputs, which stop being remaining ones.
 
     Base color, light and the numbers of the surface are set here. Vertices and normals
-    are dropped: the file that is written has them. Other inputs are put back.
+    are dropped: the file that is written has them. Other inputs stay among
+    `remaining_inputs`.
     """
     part_inputs = {
         name.partition(".")[2]: remaining_inputs.pop(name)
@@ -256,25 +262,11 @@ def _make_mesh(part: parts.MeshPart, remaining_inputs: Plugin) -> Plugin:
         linear = torch.from_numpy(part_inputs.pop("base_color"))
         part = replace(part, base_color=linear_to_srgb(linear).numpy())
     if "radiance" in part_inputs:
-        # one color (3,), or a texture (h, w, 3)
         radiance = part_inputs.pop("radiance")
-        size = radiance.shape[-2:] if radiance.ndim > 1 else (1, 3)
-        part = replace(part, emission=radiance.reshape(-1, *size))
-    if part.surface is None:
-        # the surface's parameters, each (1,)
-        numbers = {
-            name: float(part_inputs.pop(name)[0])
-            for name in MATERIAL_INPUTS
-            if name in part_inputs
-        }
-        surface = make_principled(
-            replace(part, material=replace(part.material, **numbers))
-        )
-    else:
-        base_color = part.base_color
-        surface = fill_base_color(
-            part.surface, lambda options: make_base_texture(base_color, options)
-        )
+        if radiance.ndim == 1:  # one color (3,), and no texture (h, w, 3)
+            radiance = radiance.reshape(1, 1, 3)
+        part = replace(part, emission=radiance)
+    surface = _make_surface(part, part_inputs)
     # they are in the file of the mesh
     part_inputs.pop("vertices", None)
     part_inputs.pop("normals", None)
@@ -286,6 +278,21 @@ def _make_mesh(part: parts.MeshPart, remaining_inputs: Plugin) -> Plugin:
     if light:
         mesh["emitter"] = light
     return mesh
+
+
+def _make_surface(part: parts.MeshPart, part_inputs: Plugin) -> Plugin:
+    """Return the surface of a mesh, and take its numbers out of the mesh's inputs."""
+    if part.surface is not None:
+        base_color = part.base_color
+        return fill_base_color(
+            part.surface, lambda options: make_base_texture(base_color, options)
+        )
+    numbers = {
+        name: float(part_inputs.pop(name)[0])  # each (1,)
+        for name in MATERIAL_INPUTS
+        if name in part_inputs
+    }
+    return make_principled(replace(part, material=replace(part.material, **numbers)))
 
 
 def write_xml(path: Path, scene: Plugin, meshes: Mapping[str, Any], note: str) -> None:

@@ -22,6 +22,7 @@ from xml.parsers import expat
 import numpy as np
 
 from advsearch.errors import FileFormatError
+from advsearch.scene.assets import Float64Array
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing.files import (
     damaged,
@@ -79,13 +80,15 @@ def read_scene(path: Path) -> Plugin:
     text.fill_element(root)
     root.set("version", "3.0.0")
     state = _parse_with_mitsuba(path, text, root)
-    referred: set[str] = set()
-    scene = _convert_plugin(path, state, 0, referred)  # 0 is the scene itself
-    # plugins with ids that stand within others, to which the rest of the file may refer
-    for name in sorted(referred):
-        if _make_plain_name(name) not in scene and name in state.id_to_index:
-            index = state.id_to_index[name]
-            scene[_make_plain_name(name)] = _convert_plugin(path, state, index, set())
+    referred_ids: set[str] = set()
+    scene = _convert_plugin(path, state, 0, referred_ids)  # 0 is the scene itself
+    # What is referred to has to stand at the top: plugins within others are put there.
+    for plugin_id in sorted(referred_ids):
+        name = _make_plain_name(plugin_id)
+        if name not in scene and plugin_id in state.id_to_index:
+            index = state.id_to_index[plugin_id]
+            # ids that it refers to in turn are not followed
+            scene[name] = _convert_plugin(path, state, index, referred_ids=set())
     return scene
 
 
@@ -108,11 +111,11 @@ def _parse_with_mitsuba(path: Path, text: _SceneText, root: ElementTree.Element)
                 config, ElementTree.tostring(root, encoding="unicode")
             )
     except RuntimeError as error:
-        position = _ERROR_LINE.match(str(error))
+        line_match = _ERROR_LINE.match(str(error))
         where = ""
-        # lines are the file's as long as nothing is included
-        if position and not text.included:
-            where = f"line {int(position[1]) + text.lines_before}: "
+        # with included files in it, the lines of the text are not those of the file
+        if line_match and not text.included:
+            where = f"line {int(line_match[1]) + text.lines_before}: "
         raise FileFormatError(
             f"{path}: {where}{_ERROR_LINE.sub('', str(error))}; correct it"
         ) from error
@@ -139,10 +142,12 @@ class _SceneText:
     lines_before: int = 0
 
     def parse(self, data: bytes) -> ElementTree.Element:
-        """Parse a file, and return the root of its tree.
+        """Parse the bytes of a file, and return the root of its tree.
 
-        Comments and blanks stay in the tree, so that the numbers of lines stay the
-        same. The sizes of all parsed files count together.
+        The sizes of all parsed files count together.
+
+        Raises:
+            FileFormatError: they are too large, no XML, or a scene of another version.
         """
         self.size += len(data)
         if self.size > scale_limit(MAX_BYTES):
@@ -151,6 +156,21 @@ class _SceneText:
                 f"a scene of at most {scale_limit(MAX_BYTES):,} bytes",
                 f"{self.size:,}",
             )
+        root = self._parse_tree(data)
+        version = root.get("version", "3.0.0")
+        if root.tag == "scene" and not re.match(r"[23]\.", version):
+            raise FileFormatError(
+                f"{self.path}: expected a scene of Mitsuba 2 or 3, got version "
+                f"{format_name(version)}; convert it"
+            )
+        return root
+
+    def _parse_tree(self, data: bytes) -> ElementTree.Element:
+        """Parse bytes as XML, and return the root of the tree.
+
+        Comments and blanks stay in the tree, so that the numbers of lines stay the
+        same.
+        """
         parser = expat.ParserCreate()
         tree = ElementTree.TreeBuilder(insert_comments=True)
         self._set_handlers(parser, tree)
@@ -169,14 +189,7 @@ class _SceneText:
                 "an XML file",
                 f"one in an unknown encoding ({format_name(str(error))})",
             ) from error
-        root = tree.close()
-        version = root.get("version", "3.0.0")
-        if root.tag == "scene" and not re.match(r"[23]\.", version):
-            raise FileFormatError(
-                f"{self.path}: expected a scene of Mitsuba 2 or 3, got version "
-                f"{format_name(version)}; convert it"
-            )
-        return root
+        return tree.close()
 
     def _set_handlers(
         self, parser: expat.XMLParserType, tree: ElementTree.TreeBuilder
@@ -187,7 +200,7 @@ class _SceneText:
         deeper elements than the limits. Texts and comments outside of the root are left
         out.
         """
-        depth = 0
+        depth = 0  # how many elements are open
 
         def refuse(*_: object) -> None:
             raise FileFormatError(
@@ -202,9 +215,10 @@ class _SceneText:
             depth += 1
             self.elements += 1
             if self.elements > scale_limit(MAX_ELEMENTS) or depth > MAX_NESTING:
-                limit = f"at most {scale_limit(MAX_ELEMENTS):,} elements, {MAX_NESTING} deep"
+                max_elements = scale_limit(MAX_ELEMENTS)
                 raise FileFormatError(
-                    f"{self.path}: expected {limit}, got more; split the scene up"
+                    f"{self.path}: expected at most {max_elements:,} elements, "
+                    f"{MAX_NESTING} deep, got more; split the scene up"
                 )
             if tag in ("alias", "path"):
                 where = f"{self.path}: line {parser.CurrentLineNumber}"
@@ -257,6 +271,7 @@ class _SceneText:
         try:
             root = self.parse(self.references.get(name))
         except FileNotFoundError:
+            # why the file that was requested last was refused
             reason = next(reversed(self.references.refused.values()))
             raise FileFormatError(
                 f"{self.path}: includes {format_name(name)}, which {reason}"
@@ -283,8 +298,9 @@ class _SceneText:
                     f"{self.path}: ${name} has no value: no <default> has that name"
                 )
             filled += self.values[piece] if is_name else piece
-            # a <default> may name others twice, and so on
-            if index and len(filled) > MAX_TEXT_LENGTH:
+            # Values may be long: a <default> may name others twice, and those others. A
+            # text that is long by itself, the first piece, is no error.
+            if index > 0 and len(filled) > MAX_TEXT_LENGTH:
                 limit = f"expected at most {MAX_TEXT_LENGTH:,} letters, got more"
                 raise FileFormatError(
                     f"{self.path}: {format_name(text)}: {limit}; write the value out"
@@ -292,31 +308,33 @@ class _SceneText:
         return filled
 
 
-def _convert_plugin(path: Path, state: Any, index: int, referred: set[str]) -> Plugin:
+def _convert_plugin(
+    path: Path, state: Any, index: int, referred_ids: set[str]
+) -> Plugin:
     """Return a parsed plugin with all in it, as `mitsuba.load_dict` takes it.
 
     Args:
         path: path of the file, for errors.
         state: what Mitsuba's parser returns.
         index: index of the plugin in it; 0 is the scene.
-        referred: is extended by the ids that the plugin refers to.
+        referred_ids: is extended by the ids that the plugin refers to.
     """
     types = mi.Properties.Type
     props = state.nodes[index].props
     entries: Plugin = {"type": props.plugin_name()}
-    last_suffix: dict[str, int] = {}
+    last_number: dict[str, int] = {}  # the last number behind each name
 
-    def put(wanted_name: str, entry: object) -> None:
+    def put(plain_name: str, entry: object) -> None:
         """Add an entry, with a number behind its name if there is one already."""
-        name = wanted_name
-        suffix = last_suffix.get(wanted_name, 1)
+        name = plain_name
+        number = last_number.get(plain_name, 1)
         while name in entries:
-            suffix += 1
-            name = f"{wanted_name}-{suffix}"
-        last_suffix[wanted_name] = suffix
+            number += 1
+            name = f"{plain_name}-{number}"
+        last_number[plain_name] = number
         entries[name] = entry
 
-    # Entries are plugins that stand inside, references to others, and plain values.
+    # Entries are inner plugins, references to other plugins, and plain values.
     for key in props.keys():
         kind = props.type(key)
         value = props[key]
@@ -325,21 +343,15 @@ def _convert_plugin(path: Path, state: Any, index: int, referred: set[str]) -> P
         if kind == types.ResolvedReference:
             node = state.nodes[value.index()]
             name = _get_node_name(node, argument, at_top=index == 0)
-            put(
-                _make_plain_name(name),
-                _convert_plugin(path, state, value.index(), referred),
-            )
+            inner_plugin = _convert_plugin(path, state, value.index(), referred_ids)
+            put(_make_plain_name(name), inner_plugin)
         elif kind == types.Reference:
-            referred.add(str(value.id()))
+            referred_ids.add(str(value.id()))
             reference = {"type": "ref", "id": _make_plain_name(str(value.id()))}
             put(argument or "ref", reference)
         else:
-            put(
-                key,
-                _convert_value(
-                    f"{path}: {format_name(key, quoted=False)}", kind, value
-                ),
-            )
+            where = f"{path}: {format_name(key, quoted=False)}"
+            put(key, _convert_value(where, kind, value))
     return entries
 
 
@@ -363,36 +375,47 @@ def _convert_value(where: str, kind: Any, value: Any) -> object:
     transform that is not affine or cannot be inverted.
     """
     types = mi.Properties.Type
-    entry: object = value
-    numbers: Any = value if kind in (types.Float, types.Integer) else ()
-    if kind == types.Color:
-        numbers = list(value)
-        entry = {"type": "rgb", "value": numbers}
-    elif kind == types.Vector:
-        entry = numbers = list(value)
-    elif kind == types.Transform:
-        entry = numbers = np.array(value.matrix, np.float64)
-    elif kind == types.Spectrum:
+    if kind == types.Transform:
+        matrix = np.array(value.matrix, np.float64)
+        _check_finite(where, matrix)
+        _check_affine(where, matrix)
+        return matrix
+    if kind == types.Spectrum:
+        # without wavelengths it is one value for all of them
         pairs = list(zip(value.wavelengths, value.values, strict=False))
-        numbers = pairs or value.values
-        entry = {"type": "spectrum", "value": pairs or value.values[0]}
+        _check_finite(where, pairs or value.values)
+        return {"type": "spectrum", "value": pairs or value.values[0]}
+    if kind in (types.Color, types.Vector):
+        numbers = list(value)
+        _check_finite(where, numbers)
+        return {"type": "rgb", "value": numbers} if kind == types.Color else numbers
+    if kind in (types.Float, types.Integer):
+        _check_finite(where, value)
+    return value
+
+
+def _check_finite(where: str, numbers: Any) -> None:
+    """Raise FileFormatError for a number that is not finite or near float32's limit."""
     # NaN is not below either
     if not (np.abs(np.asarray(numbers, np.float64)) < 1e30).all():
         raise FileFormatError(
             f"{where}: expected a finite number, got "
             f"{format_name(str(np.asarray(numbers)))}; correct it"
         )
-    if kind == types.Transform and not abs(np.linalg.det(numbers[:3, :3])) > 0.0:
+
+
+def _check_affine(where: str, matrix: Float64Array) -> None:
+    """Raise FileFormatError for a matrix (4, 4) not affine or without an inverse."""
+    if not abs(np.linalg.det(matrix[:3, :3])) > 0.0:
         raise FileFormatError(
-            f"{where}: expected a transform that can be undone, got "
-            "one that squashes; correct it"
+            f"{where}: expected a transform that can be undone, got one that squashes; "
+            "correct it"
         )
-    if kind == types.Transform and not np.array_equal(numbers[3], (0.0, 0.0, 0.0, 1.0)):
+    if not np.array_equal(matrix[3], (0.0, 0.0, 0.0, 1.0)):
         raise FileFormatError(
-            f"{where}: expected an affine transform, whose last row "
-            "is 0 0 0 1; correct it"
+            f"{where}: expected an affine transform, whose last row is 0 0 0 1; "
+            "correct it"
         )
-    return entry
 
 
 def _make_plain_name(name: str) -> str:
@@ -467,7 +490,7 @@ class _FileReader:
     """
 
     def __init__(self, path: Path, notes: list[str]) -> None:
-        """Prepare to read the files of a scene file; `notes` gets the readers' remarks."""
+        """Prepare to read a scene file's files; `notes` gets the readers' remarks."""
         self._path = path
         self._notes = notes
         self._references = References(path)
@@ -509,9 +532,8 @@ class _FileReader:
             filename = format_name(str(entries["filename"]))
             raise FileFormatError(
                 f"{self._path}: {kind} names the file {filename}, which only Mitsuba "
-                "reads, without checks; convert it to "
-                "a .ply mesh or a picture, or give the scene as a dictionary from "
-                "Python"
+                "reads, without checks; convert it to a .ply mesh or a picture, or "
+                "give the scene as a dictionary from Python"
             )
         return self._readers[kind](entries)
 
@@ -526,6 +548,7 @@ class _FileReader:
             # checks that the name is allowed; its content is not needed
             self._references.get(str(name))
         except FileNotFoundError:
+            # why the file that was requested last was refused
             refused = self._references.refused
             reason = refused.get(next(reversed(refused)), "is missing")
             raise FileFormatError(

@@ -46,9 +46,9 @@ def import_place(spec: str) -> EnvironmentAsset:
     path = Path(name)
     with track_opened_files(path):
         file = read_place_file(path)
-        light_name = (
-            next(iter(file.lights)) if requested_light is None else requested_light
-        )
+        light_name = requested_light
+        if light_name is None:
+            light_name = next(iter(file.lights))
         if light_name not in file.lights:
             raise UnknownNameError(
                 f"light of {path}:",
@@ -64,21 +64,20 @@ def import_place(spec: str) -> EnvironmentAsset:
             environment = import_environment(resolve_sibling_path(path, light.map))
     candelas = None
     if light.lux is not None:
-        illuminance = compute_irradiance(
-            torch.from_numpy(environment.radiance.copy())
-        ) @ torch.tensor(LUMINANCE)
-        if float(illuminance) <= 0.0:
+        illuminance = _compute_illuminance(environment)
+        if illuminance <= 0.0:
             raise InputError(
                 f"{path}: lights.{light_name}: expected a map with light for its lux, "
-                f"got {light.map}, which is black "
-                "where the sky is; leave lux out"
+                f"got {light.map}, which is black where the sky is; leave lux out"
             )
-        candelas = light.lux / float(illuminance)
+        candelas = light.lux / illuminance
+    asset_name = place.name
+    if requested_light is not None:
+        # `.x` is taken for the suffix of a file, and left out
+        asset_name = make_safe_name(Path(f"{place.name}-{light_name}.x"))
     return replace(
         environment,
-        name=place.name
-        if requested_light is None
-        else make_safe_name(Path(f"{place.name}-{light_name}.x")),
+        name=asset_name,
         source=spec,
         warnings=(*environment.warnings, *place.notes),
         photographed=False,
@@ -86,3 +85,12 @@ def import_place(spec: str) -> EnvironmentAsset:
         candelas=candelas,
         place=place,
     )
+
+
+def _compute_illuminance(environment: EnvironmentAsset) -> float:
+    """Return the luminance of the light on level ground under the open sky.
+
+    In the environment's own unit: its radiance has none.
+    """
+    radiance = torch.from_numpy(environment.radiance.copy())
+    return float(compute_irradiance(radiance) @ torch.tensor(LUMINANCE))

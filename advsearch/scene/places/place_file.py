@@ -115,8 +115,8 @@ def read_place(path: Path, file: PlaceFile, variant: str | None) -> Place:
     """
     parts, notes = read_place_meshes(resolve_sibling_path(path, file.mesh), variant)
     names = [part.name for part in parts]
-    for kind in (file.ground, file.lamps):
-        for name in kind:
+    for stated_names in (file.ground, file.lamps):
+        for name in stated_names:
             if name not in names:
                 raise UnknownNameError(
                     f"mesh of {file.mesh}:", name, names, f"It stands in {path}."
@@ -126,21 +126,11 @@ def read_place(path: Path, file: PlaceFile, variant: str | None) -> Place:
         for entry in file.solids
         for outline in entry.list_footprints()
     )
+    parts = [replace(part, is_ground=part.name in file.ground) for part in parts]
     # the solids of the place go with its first mesh
-    marked = [
-        replace(
-            part,
-            is_ground=part.name in file.ground,
-            solids=solids if index == 0 else (),
-        )
-        for index, part in enumerate(parts)
-    ]
-    return Place(
-        make_safe_name(Path(os.path.abspath(path)).parent),
-        file,
-        tuple(marked),
-        tuple(notes),
-    )
+    parts[0] = replace(parts[0], solids=solids)
+    directory = Path(os.path.abspath(path)).parent
+    return Place(make_safe_name(directory), file, tuple(parts), tuple(notes))
 
 
 @lru_cache(maxsize=8)
@@ -177,11 +167,12 @@ def make_place_parts(
     for part in place.parts:
         emission = part.emission
         if part.name in place.file.lamps:
-            emission = (
-                np.array([[place.file.lamps[part.name]]], np.float32)
-                if are_lamps_on
-                else None
-            )
+            emission = None
+            if are_lamps_on:
+                # one texel of the color that the file states
+                emission = np.array([[place.file.lamps[part.name]]], np.float32)
+        if emission is not None:
+            emission = emission / radiance_unit
         solids = tuple(
             Solid(name, Footprint(outline / metres, low / metres, high / metres))
             for name, (outline, low, high) in part.solids
@@ -193,7 +184,7 @@ def make_place_parts(
                 place=place,
                 mesh=mesh,
                 solids=solids,
-                emission=None if emission is None else emission / radiance_unit,
+                emission=emission,
             )
         )
     return tuple(scene_parts)

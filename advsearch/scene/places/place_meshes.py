@@ -233,7 +233,7 @@ def _note_left_out(
 
 
 def _find_variant(path: Path, header: Header, variant: str) -> int:
-    """Return the index of a variant; raises UnknownNameError if the file has none such."""
+    """Return the index of a variant; raises UnknownNameError without one such."""
     extension = _read_extension(path, _Variants, _get_extension(header, VARIANTS))
     names = [entry.name for entry in extension.variants]
     if variant not in names:
@@ -262,16 +262,11 @@ def _select_material(
     return primitive.material
 
 
-def _list_posed_meshes(
-    header: Header,
-) -> list[tuple[int, Float64Array]]:
-    """Return the mesh and the pose of each node that shows one, in order of the
-    nodes.
-    """
+def _list_posed_meshes(header: Header) -> list[tuple[int, Float64Array]]:
+    """Return mesh and pose of each node that has a mesh, in the order of nodes."""
     posed_meshes = []
-    for node, pose in sorted(
-        gltf_skeleton.iterate_poses(header), key=lambda item: item[0]
-    ):
+    posed_nodes = sorted(gltf_skeleton.iterate_poses(header), key=lambda item: item[0])
+    for node, pose in posed_nodes:
         mesh = header.nodes[node].mesh
         if mesh is not None:
             posed_meshes.append((mesh, pose))
@@ -302,14 +297,13 @@ def _read_primitives(
     for mesh, pose in posed_meshes:
         for index, primitive in enumerate(header.meshes[mesh].primitives):
             piece = pieces.get((mesh, index))
-            if piece is not None:
-                part = transform_part(
-                    _fit_uvs(piece.part, *fitted[piece.material][1:]), pose
-                )
-                primitives.append(
-                    PosedPrimitive(primitive.material, piece.material, part)
-                )
-    return primitives, {material: fit[0] for material, fit in fitted.items()}
+            if piece is None:  # it is no triangles
+                continue
+            _, uv_scale, uv_shift = fitted[piece.material]
+            part = transform_part(_fit_uvs(piece.part, uv_scale, uv_shift), pose)
+            primitives.append(PosedPrimitive(primitive.material, piece.material, part))
+    surfaces = {material: surface for material, (surface, _, _) in fitted.items()}
+    return primitives, surfaces
 
 
 def _fit_uvs(
@@ -382,8 +376,8 @@ def _check_materials(path: Path, count: int) -> None:
     """Raise InputError if a file has more than `MAX_MESHES` materials."""
     if count > MAX_MESHES:
         raise InputError(
-            f"{path}: expected at most {MAX_MESHES} materials, got "
-            f"{count}; join some of them"
+            f"{path}: expected at most {MAX_MESHES} materials, got {count}; join some "
+            "of them"
         )
 
 
@@ -398,29 +392,34 @@ def _count_texels(surface: ImportedSurface) -> int:
 def _group_by_material(
     header: Header, primitives: Sequence[PosedPrimitive]
 ) -> dict[NameAndMaterial, list[ImportedPart]]:
-    """Return the primitives of each mesh, by its name and the material in the variant.
+    """Group primitives to meshes of one material each, in the order of materials.
 
-    A mesh has the name of its own material, also where the variant changes all that has
-    that material. Where the variant changes only some of it, that is a mesh of its own
-    with the name of the other material. Sorted by the index of the variant's material.
+    A mesh is named by its own material, also where the variant gives another one to all
+    that has it. Where the variant does so for a part only, that part becomes a mesh of
+    its own, with the name of the other material.
+
+    Returns:
+        The parts of each mesh, by its name and the index of its material in the
+        variant.
     """
+    # for each material, those that the variant puts in its place
     variant_materials: dict[int | None, set[int | None]] = {}
     for primitive in primitives:
         materials = variant_materials.setdefault(primitive.material, set())
         materials.add(primitive.variant_material)
     parts_by_mesh: dict[NameAndMaterial, list[ImportedPart]] = {}
     for material, variant_material, part in primitives:
-        # the variant changes a part of what has this material
         is_split = len(variant_materials[material]) > 1
-        is_covered = is_split and variant_material != material
-        name = _name_material(header, variant_material if is_covered else material)
+        naming_material = variant_material if is_split else material
+        name = _name_material(header, naming_material)
         parts_by_mesh.setdefault((name, variant_material), []).append(part)
 
-    def get_material_order(item: tuple[NameAndMaterial, list[ImportedPart]]) -> int:
-        (_, material), _ = item
+    def get_order(mesh: NameAndMaterial) -> int:
+        """Return the index of a mesh's material; below all others without one."""
+        _, material = mesh
         return -1 if material is None else material
 
-    return dict(sorted(parts_by_mesh.items(), key=get_material_order))
+    return {mesh: parts_by_mesh[mesh] for mesh in sorted(parts_by_mesh, key=get_order)}
 
 
 def _name_material(header: Header, index: int | None) -> str:
@@ -466,11 +465,8 @@ def _with_finish(
 ) -> MeshPart:
     """Return a mesh with the specular and the clear coat of its material.
 
-    The file has an index of refraction n, and the reflectance of a surface that faces
-    the light is ((n - 1) / (n + 1))^2; our specular of 1 is one of `REFLECTANCE`, so
-    that the quotient is the specular. The gloss of a coat can only be set in a surface
-    in Mitsuba's words; a mesh with cut-outs or bumps has none, and its coat has
-    Mitsuba's own gloss.
+    The gloss of a coat can only be set in a surface in Mitsuba's words, which a mesh
+    with cut-outs or bumps cannot have: its coat has Mitsuba's own gloss.
 
     Args:
         path: the file, for messages.
@@ -480,6 +476,8 @@ def _with_finish(
     """
     entry = MaterialEntry() if index is None else header.materials[index]
     finish = _read_extension(path, _Finish, entry.extensions)
+    # Of a surface that faces the light, by its index of refraction. Our specular of 1
+    # reflects `REFLECTANCE`.
     ior = finish.KHR_materials_ior.ior
     facing_reflectance = (
         finish.KHR_materials_specular.specularFactor * ((ior - 1.0) / (ior + 1.0)) ** 2
@@ -491,8 +489,8 @@ def _with_finish(
     is_plain = part.opacity is None and part.normal_map is None
     if coat.clearcoatFactor == 0.0 or not is_plain:
         return part
-    # Mitsuba's width of the lobe goes from `DULL_COAT` at gloss 0 to `GLOSSY_COAT` at
-    # 1; glTF's is the square of the roughness
+    # The width of the coat's lobe is the square of glTF's roughness; Mitsuba's goes
+    # from `DULL_COAT` at a gloss of 0 to `GLOSSY_COAT` at 1.
     gloss = (DULL_COAT - coat.clearcoatRoughnessFactor**2) / (DULL_COAT - GLOSSY_COAT)
     principled = {
         "type": "principled",

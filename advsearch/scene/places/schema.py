@@ -80,8 +80,8 @@ class SolidEntry(_Entry):
         has_outline = self.outline is not None
         if has_positions != has_radius or has_radius == has_outline:
             raise ValueError(
-                "expected either an outline, or a radius and the "
-                "positions that it is at"
+                "expected either an outline, or a radius and the positions that it is "
+                "at"
             )
         if self.heights[0] >= self.heights[1]:
             raise ValueError("heights: expected the lower one first")

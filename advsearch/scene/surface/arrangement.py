@@ -78,27 +78,28 @@ class SurfaceView:
     ) -> None:
         """Make the sparse matrix from light on the surface to the pixels of one camera.
 
-        Its rows are the pixels, its columns the cells of the fine grid (`shape`); with
-        two `sides`, those of the back follow those of the front. Each ray that hits
-        adds four entries to its pixel's row: the weights of a bilinear look-up times
-        the ray's own.
+        Its rows are the pixels, its columns the cells of the fine grid. Each ray that
+        hits the surface adds four entries to its pixel's row: the weights of a bilinear
+        look-up times the ray's own. Arguments are those of the class.
         """
         self.base_radiance = samples.radiance[camera_index]
         self.coverage = samples.coverage[camera_index]
         height, width = self.base_radiance.shape[:2]
         n_cells = shape[0] * shape[1]
+        # The rays of all cameras are counted on, and those of the samples rise: the
+        # camera's are between the first ray of it and of the next one.
         n_rays = height * width * RAYS_PER_PIXEL
-        first_sample = camera_index * n_rays
-        bounds = torch.tensor([camera_index, camera_index + 1]) * n_rays
-        start, end = torch.searchsorted(samples.sample, bounds).tolist()
-        pixel = (samples.sample[start:end] - first_sample) // RAYS_PER_PIXEL
-        # (n, 4) cells and weights of the bilinear look-ups; those on the back are in
-        # the second half of the columns.
+        first_rays = torch.tensor([camera_index, camera_index + 1]) * n_rays
+        start, end = torch.searchsorted(samples.sample, first_rays).tolist()
+        ray = samples.sample[start:end] - camera_index * n_rays
+        pixel = ray // RAYS_PER_PIXEL
+        # (n, 4) cells and weights of the bilinear look-ups; with two sides those on the
+        # back are in the second half of the columns
         columns, fractions = find_bilinear_weights(samples.uv[start:end].numpy(), shape)
         is_back = samples.is_back[start:end].numpy()
         columns += np.int32(n_cells) * is_back[:, None]
         weights = fractions * samples.weight[start:end].numpy()[:, None]
-        # Samples are in the order of pixels, with four entries each.
+        # samples are in the order of pixels, with four entries each
         row_starts = np.searchsorted(pixel.numpy(), np.arange(height * width + 1)) * 4
         self.matrix = scipy.sparse.csr_matrix(
             (weights.ravel(), columns.ravel(), row_starts.astype(np.int32)),
@@ -209,7 +210,10 @@ class Arrangement:
         texture: tuple[int, int],
         seed: int,
     ) -> None:
-        """Lay texels over all surfaces, trace what they see, and measure how they look."""
+        """Lay texels over all surfaces, trace what they see, and measure how they look.
+
+        Arguments are those of the class.
+        """
         scene = renderer.scene
         self._scene = scene
         self.inputs = {
@@ -223,23 +227,53 @@ class Arrangement:
         charts = rasterize_charts(description.meshes[OBJECT].mesh, OBJECT_TEXELS)
         surfaces = self._make_object_texels(charts, vertices, normals)
         self.n_sides = len(surfaces)
-        # The ground goes on from the center of the object; a photographed one shows
-        # what was taken from `capture_height`.
-        photograph = description.photograph
         self._has_ground = description.get_number("ground.size") > 0.0
+        # from which a photographed ground was taken; None of any other ground
+        self._capture_height = (
+            None if description.photograph is None else description.capture_height
+        )
         if self._has_ground:
-            ground_center = (float(object_center[0]), float(object_center[1]))
-            reach = self._compute_ground_reach(photograph is not None)
-            surfaces.append(
-                texels.make_ground_texels(GROUND_NAME, 0.0, reach, ground_center)
-            )
+            surfaces.append(self._make_ground_texels(object_center))
         self.texels: texels.LitTexels = texels.join_texels(surfaces)
         self._refine(texture)
 
-        # What texels see of the sky and of each other, as matrices; and matrices from
-        # the light on the object's texels to the fine grid, side by side.
-        met_cells = trace_texel_rays(
-            scene,
+        # what texels see of the sky and of each other
+        met_cells = self._trace_texels(seed)
+        self._view_matrices = texels.make_view_matrices(
+            met_cells, self.texels.texel_of_cell, len(self.texels.positions)
+        )
+        # for each side, from the light on the object's texels to the fine grid
+        self._to_fine = [
+            texels.make_lookup_matrix(
+                surfaces[side],
+                charts,
+                self.fine_shape,
+                vertices,
+                normals if side == 0 else -normals,
+                self._find_buried(met_cells, side),
+            )
+            for side in range(self.n_sides)
+        ]
+        if self._has_ground:
+            self._smooth = self._make_ground_smoothing(surfaces[-1], met_cells)
+        # both sides of the object have the same gloss, and the ground has none
+        self.lobes = [self._measure_object()] * self.n_sides
+        self.lobes += [Lobes.make_diffuse()] * (len(surfaces) - self.n_sides)
+        self.world_to_map = torch.tensor(world_to_map(scene), dtype=torch.float32)
+        self._ground_below = self._find_ground_below(object_center)
+        self._views = self._make_view_tracer(object_center)
+
+    def _make_ground_texels(self, object_center: Float32Array) -> texels.LitTexels:
+        """Return the texels of the ground, which goes on from below the object (3,)."""
+        is_photographed = self._scene.definition[0].photograph is not None
+        reach = self._compute_ground_reach(is_photographed)
+        center = (float(object_center[0]), float(object_center[1]))
+        return texels.make_ground_texels(GROUND_NAME, 0.0, reach, center)
+
+    def _trace_texels(self, seed: int) -> Ints:
+        """Trace rays from all texels, and return the cells (n, rays) that they meet."""
+        return trace_texel_rays(
+            self._scene,
             self.texels.grids,
             sky_shape=texels.SKY_SHAPE,
             positions=self.texels.positions,
@@ -247,36 +281,14 @@ class Arrangement:
             n_rays=RAYS_PER_TEXEL,
             seed=seed,
         )
-        self._view_matrices = texels.make_view_matrices(
-            met_cells, self.texels.texel_of_cell, len(self.texels.positions)
-        )
-        self._to_fine = []
-        for side in range(self.n_sides):
-            self._to_fine.append(
-                texels.make_lookup_matrix(
-                    surfaces[side],
-                    charts,
-                    self.fine_shape,
-                    vertices,
-                    normals if side == 0 else -normals,
-                    self._find_buried(met_cells, side),
-                )
-            )
-        if self._has_ground:
-            self._smooth = self._make_ground_smoothing(surfaces[-1], met_cells)
-        # Gloss: both sides of the object have the same, and the ground has none.
-        self.lobes = [self._measure_object()] * self.n_sides
-        self.lobes += [Lobes.make_diffuse()] * (len(surfaces) - self.n_sides)
-        self._capture_height = (
-            None if photograph is None else description.capture_height
-        )
-        self.world_to_map = torch.tensor(world_to_map(scene), dtype=torch.float32)
-        self._ground_below = self._find_ground_below(object_center)
-        model = description.camera_model
+
+    def _make_view_tracer(self, object_center: Float32Array) -> ViewTracer:
+        """Return what traces rays through cameras, with the lens of the inputs."""
+        model = self._scene.definition[0].camera_model
         if model is not None and "camera.lens" in self.inputs:
             model = model.with_numbers(self.inputs["camera.lens"])
-        self._views = ViewTracer(
-            scene,
+        return ViewTracer(
+            self._scene,
             self.texels.grids,
             self.lobes,
             widths=texels.BLUR_WIDTHS,
@@ -353,11 +365,13 @@ class Arrangement:
         """
         cells = met_cells[self.texels.select_grid(side)]
         if self.n_sides == 1:
-            return np.asarray((cells < 0).mean(axis=1) > BURIED_FRACTION)
+            is_back = cells < 0
+            return np.asarray(is_back.mean(axis=1) > BURIED_FRACTION)
         back_grid = self.texels.grids[1]
         is_back = (cells >= back_grid.first_cell) & (
             cells < back_grid.first_cell + back_grid.n_cells
         )
+        # cells of the sky follow those of texels
         sees_sky = (cells >= len(self.texels.texel_of_cell)).any(axis=1)
         return np.asarray((is_back.mean(axis=1) > BURIED_FRACTION) & ~sees_sky)
 
@@ -389,17 +403,20 @@ class Arrangement:
     def _find_ground_below(self, center: Float32Array) -> tuple[Tensor, Tensor]:
         """Find where the ground is in the blurred maps, seen from the object's center.
 
+        A photographed ground has the color of the map in the direction in which the
+        camera that took the photograph sees the same point.
+
         Returns:
-            (h, w) whether the ground is seen in each direction; and (h, w, 3) where a
-            photographed ground takes its color from: the direction from the camera that
-            took the photograph to the same point, in the map's axes. Both mean nothing
-            without a ground.
+            (h, w) whether the ground is seen in each direction; and (h, w, 3) that
+            direction from the camera, in the map's axes. Without a ground it is seen
+            nowhere, and the directions mean nothing.
         """
         directions = texels.compute_directions(texels.BLURRED_SHAPE)
         world_directions = directions @ self.world_to_map
         if not self._has_ground:
             return torch.zeros(texels.BLURRED_SHAPE, dtype=torch.bool), directions
-        # directions that do not go down: the point is far off, and left out below
+        # for directions that do not go down the point means nothing: they are left out
+        # below
         distance = float(center[2]) / (-world_directions[..., 2]).clamp_min(1e-6)
         points = (
             torch.from_numpy(center).float() + world_directions * distance[..., None]
@@ -438,11 +455,9 @@ class Arrangement:
         differentiable.
         """
         flat_color = color.reshape(-1, 3)
-        return (
-            flat_color
-            if self._upsampling is None
-            else multiply_sparse(self._upsampling, flat_color)
-        )
+        if self._upsampling is None:  # the texture is as fine
+            return flat_color
+        return multiply_sparse(self._upsampling, flat_color)
 
     def compute_light(self, padded: Tensor, color: Tensor) -> ArrangementLight:
         """Return the light of an environment, for a base color of the object.
@@ -548,21 +563,25 @@ class Arrangement:
         """Return which fraction (n, 3) of even light each texel reflects.
 
         That is the base color times the diffuse fraction, plus the fraction of the
-        gloss.
+        gloss. Arguments are those of `compute_light`.
         """
-        n_rows, n_columns = self.texels.grids[0].shape
-        fine = self.upsample(color).reshape(*self.fine_shape, 3).permute(2, 0, 1)[None]
-        pooled = functional.adaptive_avg_pool2d(fine, (n_rows, n_columns))[0]
-        pooled = pooled.permute(1, 2, 0).reshape(-1, 3)
-        object_cells = torch.from_numpy(self.texels.cells[self.texels.select_grid(0)])
-        colors = [pooled[object_cells]] * self.n_sides
+        colors = [self._compute_object_color(color)] * self.n_sides
         if self._has_ground:
             colors.append(self._compute_ground_color(padded))
         reflectances = []
-        for surface_color, surface in zip(colors, self.lobes, strict=True):
-            diffuse, gloss = torch.tensor(surface.mean_reflectances)
+        for surface_color, lobes in zip(colors, self.lobes, strict=True):
+            diffuse, gloss = torch.tensor(lobes.mean_reflectances)
             reflectances.append(surface_color * diffuse + gloss)
         return torch.cat(reflectances)
+
+    def _compute_object_color(self, color: Tensor) -> Tensor:
+        """Return the mean of a base color (h, w, 3) in each texel (n, 3) of a side."""
+        fine = self.upsample(color).reshape(*self.fine_shape, 3).permute(2, 0, 1)[None]
+        pooled = functional.adaptive_avg_pool2d(fine, self.texels.grids[0].shape)[0]
+        cell_colors = pooled.permute(1, 2, 0).reshape(-1, 3)
+        return cell_colors[
+            torch.from_numpy(self.texels.cells[self.texels.select_grid(0)])
+        ]
 
     def _compute_ground_color(self, padded: Tensor) -> Tensor:
         """Return the base color (n, 3) of the ground's texels.

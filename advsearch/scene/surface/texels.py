@@ -59,7 +59,7 @@ class LitTexels:
     cells: IntArray  # (n,) index of the cell of all grids that each lies in
     # (cells of all grids,) index of the texel whose light each cell has, the nearest
     texel_of_cell: IntArray
-    # First texels of each grid its first texel, and the number of all.
+    # index of the first texel of each grid, and last the number of all texels
     first_texels: tuple[int, ...]
 
     def select_grid(self, grid_index: int) -> slice:
@@ -72,6 +72,7 @@ def join_texels(surfaces: Sequence[LitTexels]) -> LitTexels:
 
     Cells and texels are numbered on from one surface to the next.
     """
+    # index of each surface's first texel and first cell, and last the number of all
     texel_bounds = np.cumsum([0] + [len(texels.positions) for texels in surfaces])
     cell_bounds = np.cumsum([0] + [texels.grids[0].n_cells for texels in surfaces])
     grids = []
@@ -109,7 +110,8 @@ def make_mesh_texels(
         side: side of its faces, as `TexelGrid` has it.
     """
     position, normal = _interpolate(charts, vertices, normals)
-    # number of the texel in each covered cell: row by row; elsewhere it means nothing
+    # index of the texel in each covered cell, which are counted row by row; in other
+    # cells it means nothing
     texel_of_covered = np.cumsum(charts.is_covered.ravel()) - 1
     rows, columns = np.nonzero(charts.is_covered)
     return LitTexels(
@@ -127,7 +129,8 @@ def make_ground_texels(
 ) -> LitTexels:
     """Return the texels over a level plane, small under the object and large far off.
 
-    An axis position p from -1 to 1 lies `scale * sinh(rate * p)` from the center.
+    Along each axis of the grid, the position p from -1 to 1 lies at the distance
+    `scale * sinh(rate * p)` from the center.
 
     Args:
         name: name of the ground.
@@ -136,7 +139,7 @@ def make_ground_texels(
         center: x and y of the object's center.
     """
     reach = min(reach, MAX_GROUND_REACH)
-    # the ratio of an even texel's width to that at the center, `MIN_TEXEL_WIDTH`
+    # by how much even texels would be wider than `MIN_TEXEL_WIDTH`, that at the center
     rate = _find_warp_rate(reach / (MIN_TEXEL_WIDTH * GROUND_TEXELS / 2.0))
     scale = reach / math.sinh(rate)
     axis_position = (np.arange(GROUND_TEXELS) + 0.5) * 2.0 / GROUND_TEXELS - 1.0
@@ -163,11 +166,12 @@ def make_ground_texels(
 def _find_warp_rate(ratio: float) -> float:
     """Find the rate with sinh(rate) / rate = ratio, by bisection.
 
-    A ratio of 1 or less gives the lower end, 0.001: a grid that is all but even.
+    A ratio of 1 or less has no such rate: the result is then the lower bound, 0.001,
+    for which a grid is all but even.
     """
     lower = 1e-3
     upper = 20.0
-    for _ in range(60):
+    for _ in range(60):  # halved so often, the interval is below rounding
         rate = 0.5 * (lower + upper)
         if math.sinh(rate) / rate < ratio:
             lower = rate
@@ -201,7 +205,8 @@ def _weigh_neighbours(
     """
     y, x = grid_position
     n_rows, n_columns = charts.is_covered.shape
-    # (rows, columns) texel of each cell: covered cells are counted row by row
+    # (rows, columns) index of the texel in each cell, -1 outside of the charts: covered
+    # cells are counted row by row
     texel_at = np.cumsum(charts.is_covered.ravel()).reshape(n_rows, n_columns) - 1
     texel_at = np.where(charts.is_covered, texel_at, -1)
 
@@ -211,7 +216,8 @@ def _weigh_neighbours(
         offset = texels.positions[texel] - points
         distance = (offset**2).sum(axis=1) / (2.0 * (SPACE_SIGMA * texel_width) ** 2)
         cosine = (texels.normals[texel] * normals).sum(axis=1)
-        # a neighbour that faces elsewhere, round an edge, has other light
+        # A neighbour round an edge, which faces elsewhere, has other light. The power
+        # lets it count for half at 24 degrees, and for nothing at a right angle.
         similarity = np.clip(cosine, 0.0, 1.0) ** 8
         weight = np.exp(-grid_distance - distance) * similarity
         is_used = (texel >= 0) & ~buried[texel]
@@ -235,10 +241,10 @@ def _use_nearest_texel(
     texel_index: IntArray,
     weights: Float64Array,
 ) -> None:
-    """Give all the weight to the nearest texel where no neighbour has any.
+    """Give all the weight to the nearest texel where no neighbour of a point has any.
 
-    The first columns of `texel_index` and `weights`, the results of
-    `_weigh_neighbours`, are overwritten in these rows. Other arguments are those of
+    The first columns of `texel_index` and `weights` (N, neighbours), the results of
+    `_weigh_neighbours`, are overwritten for these points. Other arguments are those of
     `_weigh_neighbours`.
     """
     y, x = grid_position
@@ -276,7 +282,8 @@ def make_lookup_matrix(
     Returns:
         Sparse, (cells of the finer grid, texels of the first surface).
     """
-    buried = buried & ~buried.all()  # if all are buried, none counts as such
+    if buried.all():
+        buried = np.zeros_like(buried)  # then none counts as such
     fine_charts = rasterize_charts(charts.mesh, shape)
     position, normal = _interpolate(fine_charts, vertices, normals)
     rows, columns = np.nonzero(fine_charts.distance <= BORDER_TEXELS)
@@ -368,12 +375,15 @@ def make_smoothing_matrix(ground: LitTexels, sees_sky: BoolArray) -> Tensor:
         Sparse, (cells, texels).
     """
     width = ground.grids[0].shape[0]
-    # if no texel sees the sky, all of `~sees_sky` is true
-    is_used = (sees_sky if sees_sky.any() else ~sees_sky).reshape(width, width)
+    if not sees_sky.any():
+        sees_sky = np.ones_like(sees_sky)
+    is_used = sees_sky.reshape(width, width)
     nearest_used = _find_nearest(is_used)
+    # along one axis: each texel and two neighbours on each side
     axis_weights = scipy.sparse.diags_array(
         BINOMIAL, offsets=range(-2, 3), shape=(width, width), dtype=np.float64
     )
+    # along both; columns of texels that are not used are 0, and rows add up to 1
     weights = scipy.sparse.csr_array(
         scipy.sparse.kron(axis_weights, axis_weights)
         @ scipy.sparse.diags_array(is_used.ravel().astype(float))
@@ -462,11 +472,13 @@ def prepare_sky(padded: Tensor) -> SkyLight:
     radiance = padded[:, 1:-1].detach()
     n_rows, n_columns = radiance.shape[:2]
     polar = torch.linspace(0.0, math.pi, n_rows)
-    # the solid angle of a texel; at the poles it is not zero
+    # The solid angle of a texel goes by this, and is 1 at the horizon. The texels at
+    # the poles reach half a texel from it: they take the sine in the middle of that.
     sine = polar.sin().clamp_min(math.sin(0.25 * math.pi / n_rows))
     sine = sine[:, None].expand(n_rows, n_columns)
     luminance = radiance @ LUMINANCE_WEIGHTS
     mean_luminance = float((luminance * sine).sum() / sine.sum())
+    # the part of each texel's light that is above the limit
     hot_fraction = (
         1.0 - HOT_FACTOR * mean_luminance / luminance.clamp_min(1e-12)
     ).clamp_min(0.0)
@@ -495,7 +507,8 @@ def _sample_hot(radiance: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
 
     Args:
         radiance: (H, W, 3) of what is hot.
-        power: (H, W) luminance times solid angle.
+        power: (H, W) luminance times solid angle, in the solid angle of a texel at the
+            horizon.
 
     Returns:
         (k, 3) unit directions in the map's axes, and (k, 3) radiance times solid angle;
@@ -514,6 +527,7 @@ def _sample_hot(radiance: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
     column_offset = _to_tent((index * HOT_LATTICE[1] % HOT_RAYS + 0.5) / HOT_RAYS)
     polar = ((row + row_offset) * (math.pi / (n_rows - 1))).clamp(0.0, math.pi)
     azimuth = (column + 0.5 + column_offset) * (2.0 * math.pi / n_columns)
+    # of a texel at the horizon
     solid_angle = math.pi / (n_rows - 1) * 2.0 * math.pi / n_columns
     power_per_ray = float(power.sum()) * solid_angle / HOT_RAYS
     color = _normalize_luminance(radiance[row, column])
@@ -561,8 +575,7 @@ def blur_map(radiance: Tensor) -> Tensor:
 
     A width is the root mean square angle over both directions, hence each direction has
     it divided by the square root of 2. Columns are blurred first, by a Gaussian over
-    the polar angle. Rows go round, and are blurred in the frequency domain: by more
-    columns towards the poles, where a row is short.
+    the polar angle; then rows, by a Gaussian over the angle along them.
 
     Returns:
         (widths, h, w, 3).
@@ -577,6 +590,8 @@ def blur_map(radiance: Tensor) -> Tensor:
         # rows near the poles have less solid angle, and count less
         column_kernel = torch.exp(-exponent) * polar.sin()[None, :]
         column_kernel = column_kernel / column_kernel.sum(dim=1, keepdim=True)
+        # A row goes round, and is blurred in the frequency domain, by a Gaussian too:
+        # over more columns towards the poles, where a row is short.
         row_filter = torch.exp(
             -0.5 * (frequency[None, :] * sigma / polar.sin()[:, None]).square()
         )
@@ -628,10 +643,11 @@ def compute_irradiance(
 def make_view_matrices(
     met_cells: npt.NDArray[np.int32], texel_of_cell: IntArray, n_texels: int
 ) -> tuple[Tensor, Tensor]:
-    """Return the sparse matrices that `compute_irradiance` needs, from what rays met.
+    """Return the matrices from radiance to irradiance, by what the rays of texels met.
 
-    A texel's rays have the density of the cosine, so that its irradiance is pi times
-    the mean radiance of what they meet.
+    They are sparse: from the sky's cells (n, cells), and from texels (n, n_texels). A
+    texel's rays have the density of the cosine, so that its irradiance is pi times the
+    mean radiance of what they meet.
 
     Args:
         met_cells: (n, rays) of `trace_texel_rays`: a cell of the grids, from

@@ -102,17 +102,14 @@ class Lighting:
 def find_lighting(renderer: Renderer) -> Lighting:
     """Find the groups of coordinates that change only light and the finished image.
 
-    Each group is varied alone, the others staying in the middle between the start and
-    the center of the unit cube, and the scene inputs are compared: so it holds for
-    whatever sets them. Some lights of a Mitsuba scene are no inputs. They cannot be
-    switched off, and would count again in the image of every single light; with such
-    lights only the groups are returned that change the finished image alone.
+    Each group is varied alone, and the scene inputs are compared: so it holds for
+    whatever sets them.
 
-    Returns:
-        The inputs that each group changes, the groups that add spherical harmonics to
-        the environment, and the coordinates with which each other group makes the
-        environment brightest.
+    Some lights of a Mitsuba scene are no inputs. They cannot be switched off, and would
+    count again in the image of each light that is traced by itself; with such lights
+    only the groups are returned that change nothing but the finished image.
     """
+    # other groups stay half way between the start and the center of the unit cube
     reference = 0.5 * renderer.start + 0.25
     groups = {}
     harmonic_groups = set()
@@ -121,11 +118,10 @@ def find_lighting(renderer: Renderer) -> Lighting:
         base_inputs = renderer.scene.assembly(renderer.space.inputs(reference))
         for group in renderer.space.groups:
             effect = _measure_effect(renderer, group, reference, base_inputs)
-            # the group changes something else than light
-            if effect is None:
+            if effect is None:  # the group changes more than light
                 continue
-            # it changes light, not only the finished image
-            if not effect.changed <= IMAGE_INPUTS and has_fixed_lights(renderer):
+            changes_light = not effect.changed <= IMAGE_INPUTS
+            if changes_light and has_fixed_lights(renderer):
                 continue
             groups[group.name] = effect.changed
             if effect.is_harmonic:
@@ -147,15 +143,15 @@ class _Effect(NamedTuple):
 def _measure_effect(
     renderer: Renderer, group: Group, reference: Tensor, base_inputs: Inputs
 ) -> _Effect | None:
-    """Return which inputs a group changes; None if that is more than light.
+    """Return what a group of coordinates changes; None if that is more than light.
 
     Several configurations, which differ from `reference` in this group alone, are
-    compared with `base_inputs`, the scene inputs at `reference`. The brightest is the
-    one whose environment has most light.
+    compared with `base_inputs`, the scene inputs at `reference`. The brightest one has
+    the environment with most light.
     """
     changed: set[str] = set()
     is_harmonic = False
-    max_power = -1.0
+    max_power = -1.0  # below that of any environment
     brightest = reference
     for configuration in _sample_configurations(group, reference):
         inputs = renderer.scene.assembly(renderer.space.inputs(configuration))
@@ -186,7 +182,7 @@ def _sample_configurations(group: Group, reference: Tensor) -> Iterator[Tensor]:
     """
     fractions = list(PROBE_FRACTIONS)
     if group.options:
-        stride = -(-group.options // MAX_OPTIONS)
+        stride = -(-group.options // MAX_OPTIONS)  # the quotient rounded up
         options = range(0, group.options, stride)
         fractions = [(option + 0.5) / group.options for option in options]
     values = [torch.full((group.size,), fraction) for fraction in fractions]
@@ -228,7 +224,7 @@ def _find_change(
         return _Change.OTHER
     if _is_explained(before[None], after):
         return _Change.POWER
-    if n_coordinates == 1:  # one number adds no harmonics of a choice
+    if n_coordinates == 1:  # harmonics are added by several numbers
         return _Change.OTHER
     harmonic_basis = torch.cat([before[None], _make_harmonic_maps(before)])
     # rejects most other changes in a tenth of the time
@@ -257,14 +253,14 @@ def _is_explained(basis: Tensor, target: Tensor) -> bool:
 def _make_harmonic_maps(like: Tensor) -> Tensor:
     """Return spherical harmonics of degrees 0 to 2 as maps (9, H, W, 3).
 
-    Each is lifted to at least zero by a multiple of the first, which is constant, since
-    light cannot be negative. Size and mean are those of the map `like`, with its copied
-    columns at both ends.
+    Light cannot be negative: each harmonic is lifted to at least zero by a multiple of
+    the first, which is constant. Size and mean are those of the map `like`, with its
+    copied columns at both ends.
     """
     basis = compute_real_harmonics(like.shape[0], like.shape[1] - 2)
     # (9, H, W): the last column before the first, and the first after the last
     padded = torch.cat([basis[:, -1:], basis, basis[:, :1]], dim=1).permute(2, 0, 1)
-    # The first is 1 everywhere, so that subtracting the minimum adds a multiple of it.
+    # the first is 1 everywhere: to subtract the minimum is to add a multiple of it
     lifted = padded - padded.amin(dim=(1, 2), keepdim=True).clamp_max(0.0)
     scaled = lifted * float(like.mean().clamp_min(1e-12))
     return scaled[..., None].expand(-1, -1, -1, 3).contiguous()
@@ -285,9 +281,11 @@ class BasisMaps:
         """
         flat_target = target.permute(2, 0, 1).reshape(3, -1, 1)
         if len(self.maps) == 1:
-            # of each channel; the quotient at one texel is the factor of all
+            # A proportional target is the map times one factor in each channel: the
+            # quotient at any texel, of which the brightest has the least rounding.
             texel, brightness = self._brightest
-            return (flat_target[..., 0].gather(1, texel) / brightness.clamp_min(TINY)).T
+            target_value = flat_target[..., 0].gather(1, texel)
+            return (target_value / brightness.clamp_min(TINY)).T
         weights: Tensor = (self._inverse @ flat_target)[..., 0].T
         return weights
 
@@ -305,8 +303,13 @@ class BasisMaps:
 
     @cached_property
     def _inverse(self) -> Tensor:
-        """(3, k, H W): the pseudo-inverse of each channel, weighted by solid angle."""
+        """(3, k, H W) matrices from a map to the weights of the basis maps.
+
+        Of each channel it is the pseudo-inverse of the basis maps, weighted by solid
+        angle: the least squares fit.
+        """
         count, height, width, _ = self.maps.shape
+        # the solid angle of a texel goes by the sine of its angle from straight up
         polar = (torch.arange(height) + 0.5) * torch.pi / height
         sine = torch.sin(polar)[:, None].expand(height, width).reshape(-1)
         channel_maps = self.maps.permute(3, 0, 1, 2).reshape(3, count, -1).double()
@@ -337,10 +340,7 @@ class LightBasis:
     def __init__(self, renderer: Renderer, lighting: Lighting, inputs: Inputs) -> None:
         """Split the light of scene inputs into lights of which each has its own image.
 
-        The first is what does not change (with the patterns of projectors); then comes
-        each lamp that changes, with a power of 1; then the basis maps of a changing
-        environment. For each `inputs_of_light` has the inputs with which it shines
-        alone.
+        Arguments and what is set are those of the class.
         """
         patterns = {
             name for name in renderer.scene.input_names if name.endswith(PATTERN_SUFFIX)
@@ -364,13 +364,12 @@ class LightBasis:
         }
         self._lamps = sorted(changed_names & names - {ENVIRONMENT_INPUT})
         changes_environment = ENVIRONMENT_INPUT in changed_names
-        # Without any light at all there is one, which is dark.
-        self._has_fixed_light = bool(fixed_values) or not (
-            self._lamps or changes_environment
-        )
-        self.inputs_of_light: list[Inputs] = (
-            [{**dark, **fixed_values}] if self._has_fixed_light else []
-        )
+        is_unlit = not (fixed_values or self._lamps or changes_environment)
+        # without any light at all there is one, which is dark
+        self._has_fixed_light = bool(fixed_values) or is_unlit
+        self.inputs_of_light = list[Inputs]()
+        if self._has_fixed_light:
+            self.inputs_of_light.append({**dark, **fixed_values})
         self.inputs_of_light += [{**dark, name: torch.ones(3)} for name in self._lamps]
         self._basis_maps: BasisMaps | None = None
         if changes_environment:
@@ -381,7 +380,7 @@ class LightBasis:
             ]
 
     def compute_weights(self, inputs: Inputs) -> Tensor:
-        """Return the factor (lights, 3) of each light in scene inputs; differentiable."""
+        """Return the factor (lights, 3) of each light, differentiable in the inputs."""
         weights = [torch.ones(1, 3)] if self._has_fixed_light else []
         weights += [inputs[name].reshape(1, 3) for name in self._lamps]
         if self._basis_maps is not None:
@@ -399,7 +398,8 @@ def _make_basis_maps(renderer: Renderer, lighting: Lighting, first: Tensor) -> T
         return first[None]
     start_inputs = renderer.scene.assembly(renderer.space.inputs(renderer.start))
     start_map = start_inputs[ENVIRONMENT_INPUT]
-    # harmonics are added where the environment is not cut off at zero
+    # Harmonics are added where the environment is not cut off at zero. A texel that is
+    # black at the start too counts as one that is not.
     is_added = first > 0.0
     if start_map.shape == first.shape:
         is_added = is_added | (start_map <= 0.0)
@@ -445,29 +445,37 @@ class BasisRenderer(Predictor):
                 brightest[coordinates] = values
             inputs = traced.scene.assembly(traced.space.inputs(brightest))
             self._lights = LightBasis(traced, changing, inputs)
-            set_inputs = traced.scene.assembly(traced.space.inputs(u)).keys()
-            linear = set_inputs & find_linear_inputs(traced)
-            # patterns of projectors shine in the first light alone
-            base_colors = {name for name in linear if not name.endswith(PATTERN_SUFFIX)}
-            self._renderers: list[LinearRenderer] = []
-            for index, light_inputs in enumerate(self._lights.inputs_of_light):
-                noise_seed = seeds.stream(seed, "light", index)
-                self._renderers.append(
-                    LinearRenderer(
-                        traced,
-                        u,
-                        noise_seed,
-                        tick,
-                        names=linear if index == 0 else base_colors,
-                        light=light_inputs,
-                    )
-                )
+            self._renderers = self._trace_lights(traced, u, seed, tick)
         self.non_finite = sum(renderer.non_finite for renderer in self._renderers)
 
     @property
     def n_traced_images(self) -> int:
         """Number of basis images, each traced with its matrices."""
         return len(self._renderers)
+
+    def _trace_lights(
+        self, traced: Renderer, u: Tensor, seed: int, tick: ProgressCallback
+    ) -> list[LinearRenderer]:
+        """Trace image and matrices under each light; arguments as of the class."""
+        set_inputs = traced.scene.assembly(traced.space.inputs(u)).keys()
+        linear_names = set_inputs & find_linear_inputs(traced)
+        # patterns of projectors shine in the first light alone
+        base_colors = {
+            name for name in linear_names if not name.endswith(PATTERN_SUFFIX)
+        }
+        renderers = []
+        for index, light_inputs in enumerate(self._lights.inputs_of_light):
+            renderers.append(
+                LinearRenderer(
+                    traced,
+                    u,
+                    seeds.stream(seed, "light", index),
+                    tick,
+                    names=linear_names if index == 0 else base_colors,
+                    light=light_inputs,
+                )
+            )
+        return renderers
 
     @property
     def n_entries(self) -> int:
@@ -524,7 +532,7 @@ def find_refusal(renderer: Renderer, varying: Collection[str] = ()) -> Refusal |
             name.startswith(haze_prefixes) for name in changed_inputs
         )
         if group.estimator == "image" or group.name in light_groups or is_haze:
-            continue
+            continue  # needs no matrix of base colors
         if changed_inputs & find_light_inputs(renderer) and has_fixed_lights(renderer):
             return Refusal(
                 f"{group.name} changes light, and the scene has other lights of its own"
@@ -532,6 +540,18 @@ def find_refusal(renderer: Renderer, varying: Collection[str] = ()) -> Refusal |
         if group.estimator != "adjoint" or not changed_inputs <= linear_inputs:
             allowed = "base colours" if varying else "base colours and light"
             return Refusal(f"{group.name} changes more than {allowed}")
+    return _find_general_refusal(renderer, searched_groups, light_groups)
+
+
+def _find_general_refusal(
+    renderer: Renderer,
+    searched_groups: Sequence[Group],
+    light_groups: Mapping[str, object],
+) -> Refusal | None:
+    """Return why images cannot be predicted though each searched group allows it.
+
+    `light_groups` has what the groups change that change light, by their names.
+    """
     if not any(
         renderer.routes.get(group.name) or light_groups.get(group.name)
         for group in searched_groups
@@ -572,10 +592,12 @@ def count_samples(renderer: Renderer) -> int:
     Each light needs the samples of all its matrices, or without a matrix those of one
     image.
     """
-    inputs: set[str] = set()
+    changed_inputs: set[str] = set()
     for group in renderer.plan.groups:
-        inputs |= renderer.routes.get(group.name, frozenset())
-    n_matrices = len(inputs & find_linear_inputs(renderer))
-    samples, n_passes = plan_passes(renderer, COLLECTED_SPP)
-    per_light = samples * n_passes * n_matrices if n_matrices else COLLECTED_SPP
-    return count_lights(renderer) * per_light
+        changed_inputs |= renderer.routes.get(group.name, frozenset())
+    n_matrices = len(changed_inputs & find_linear_inputs(renderer))
+    samples_per_light = COLLECTED_SPP
+    if n_matrices:
+        samples, n_passes = plan_passes(renderer, COLLECTED_SPP)
+        samples_per_light = samples * n_passes * n_matrices
+    return count_lights(renderer) * samples_per_light

@@ -19,6 +19,7 @@ rows and by columns, so that a product with it is one call.
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -118,7 +119,8 @@ class ColoredRows:
 
         Packed, an entry has a fraction (2 bytes) and its column, a row its start (4)
         and color (6). If it is not small, the unpacked matrix and its transpose are
-        kept as well, 10 bytes more for each entry, and float32 colors.
+        stored as well: 10 bytes more for each entry, float32 colors (12), and the
+        starts of the transpose's rows (4).
         """
         n_rows, n_columns = self._shape
         packed = (2 + self._column_type.itemsize) * self.entries + (4 + 6) * n_rows
@@ -133,21 +135,23 @@ class ColoredRows:
         fractions: Float32Array,
         weights: Float32Array,
     ) -> None:
-        """Add entries.
+        """Add samples of rows, each with fractions of k columns and a color.
+
+        A row has the sum of its samples' colors, and the mean of their fractions,
+        weighted by the mean of each color's channels.
 
         Args:
-            rows: (n,) ascending.
-            columns: (n, k) that take part in each; several may be the same.
+            rows: (n,) row of each sample, ascending.
+            columns: (n, k) columns of each; several may be the same.
             fractions: (n, k) fractions of the columns.
-            weights: (n, 3) colors. Their mean weighs the fractions against those of
-                other entries of the row, and their sum is the row's color.
+            weights: (n, 3) colors.
         """
         if not len(rows):
             return
         # Rows are ascending, so that entries are in the order of compressed rows
-        # already; each has k columns.
-        first_entries = np.searchsorted(rows, np.arange(self._shape[0] + 1))
-        first_entries = first_entries * columns.shape[1]
+        # already: of each row the first sample, and so its first entry.
+        first_samples = np.searchsorted(rows, np.arange(self._shape[0] + 1))
+        first_entries = first_samples * columns.shape[1]
         entry_weights = (
             fractions * np.abs(weights).mean(axis=1, keepdims=True)
         ).ravel()
@@ -177,15 +181,17 @@ class ColoredRows:
             smooth: removes the noise from the image of all rows' colors.
         """
         row_sums = np.asarray(self._sum.sum(axis=1)).ravel()
-        normalizers = np.where(row_sums > 0.0, 1.0 / np.maximum(row_sums, 1e-30), 0.0)
-        fractions = self._sum.data * np.repeat(normalizers, np.diff(self._sum.indptr))
-        if self._small:
+        # a row without entries stays empty
+        row_scales = np.where(row_sums > 0.0, 1.0 / np.maximum(row_sums, 1e-30), 0.0)
+        entries_per_row = np.diff(self._sum.indptr)
+        fractions = self._sum.data * np.repeat(row_scales, entries_per_row)
+        if self._small:  # in 16 bits, unpacked for each product
             self._packed = _PackedRows(
                 fractions.astype(np.float16),
                 self._sum.indices.astype(self._column_type),
                 self._sum.indptr,
             )
-        else:
+        else:  # ready, with its transpose
             matrix = scipy.sparse.csr_matrix(
                 (fractions, self._sum.indices, self._sum.indptr), self._shape
             )
@@ -248,10 +254,10 @@ class TextureTransport:
         """
         self._image_shape = image_shape
         self._texture_shape = texture_shape
-        # rounded up: the last cells of rows and columns may have fewer texels
+        # the last cells of rows and columns may have fewer texels
         self._cell_shape = (
-            -(-texture_shape[0] // CELL_SIZE),
-            -(-texture_shape[1] // CELL_SIZE),
+            math.ceil(texture_shape[0] / CELL_SIZE),
+            math.ceil(texture_shape[1] / CELL_SIZE),
         )
         cell_heights = _compute_cell_sizes(texture_shape[0], self._cell_shape[0])
         cell_widths = _compute_cell_sizes(texture_shape[1], self._cell_shape[1])
@@ -302,7 +308,7 @@ class TextureTransport:
             column = np.floor(uv[:, 0] * n_columns).astype(np.int64)
             row = np.floor(uv[:, 1] * n_rows).astype(np.int64)
             cell = row.clip(0, n_rows - 1) * n_columns + column.clip(0, n_columns - 1)
-            cell = cell[:, None]
+            cell = cell[:, None]  # (n, 1): one for each vertex, of weight 1
             self._scattered.add(
                 scattered.pixel.numpy(),
                 cell,
@@ -311,12 +317,12 @@ class TextureTransport:
             )
 
     def finish(self, smooth: Smooth | None = None) -> None:
-        """Get ready to multiply.
+        """Get both matrices ready to multiply; nothing may be added afterwards.
 
         Args:
-            smooth: removes the noise from an image: the change of the image when all
-                texels change by one is such an image. None leaves the colors of the
-                rows as they were sampled.
+            smooth: removes the noise from the colors of a matrix's rows, which are an
+                image: the change of the image when all texels change by one. None
+                leaves the noise in them.
         """
         self._sharp.finish(self._image_shape, smooth)
         self._scattered.finish(self._image_shape, smooth)
@@ -332,30 +338,34 @@ class TextureTransport:
         return radiance
 
     def multiply(self, change: Tensor) -> Tensor:
-        """Return J times a change of the base color (h, w, 3), as (H, W, 3).
+        """Return the change of radiance (H, W, 3) for one of the base color (h, w, 3).
 
-        A cell has the mean of its texels; the last cells of rows and columns may have
-        fewer.
+        What a pixel sees sharply changes by texels, scattered light by the means of
+        cells.
         """
+        sharp_change = self._sharp.multiply(change.reshape(-1, 3))
+        cell_means = self._average_cells(change)
+        scattered_change = self._scattered.multiply(cell_means.reshape(-1, 3))
+        radiance = sharp_change.add_(scattered_change)
+        return radiance.reshape(*self._image_shape, 3)
+
+    def _average_cells(self, values: Tensor) -> Tensor:
+        """Return the mean of texels (h, w, 3) in each cell, (rows, columns, 3)."""
         n_rows, n_columns = self._cell_shape
-        # the texels that the last cells lack; they are filled with zeros
+        # the texels that the last cells lack are filled with zeros
         bottom = CELL_SIZE * n_rows - self._texture_shape[0]
         right = CELL_SIZE * n_columns - self._texture_shape[1]
-        padded = change
+        padded = values
         if right or bottom:
-            padded = functional.pad(change, (0, 0, 0, right, 0, bottom))
+            padded = functional.pad(values, (0, 0, 0, right, 0, bottom))
         row_sums = padded.reshape(n_rows * CELL_SIZE, n_columns, CELL_SIZE, 3).sum(
             dim=2
         )
         cell_sums = row_sums.reshape(n_rows, CELL_SIZE, n_columns, 3).sum(dim=1)
-        cell_means = cell_sums / self._texels_in_cell
-        radiance = self._sharp.multiply(change.reshape(-1, 3)).add_(
-            self._scattered.multiply(cell_means.reshape(-1, 3))
-        )
-        return radiance.reshape(*self._image_shape, 3)
+        return cell_sums / self._texels_in_cell
 
     def multiply_transposed(self, cotangent: Tensor) -> Tensor:
-        """Return the transpose of J times (H, W, 3), as (h, w, 3).
+        """Return the transposed map of a cotangent (H, W, 3), as (h, w, 3).
 
         What a cell gets is spread evenly over its texels.
         """
@@ -367,14 +377,14 @@ class TextureTransport:
             *self._cell_shape, 3
         )
         cell_values = cell_values / self._texels_in_cell
+        # each cell's value in all of its texels
         spread_cells = cell_values[:, None, :, None].expand(
             -1, CELL_SIZE, -1, CELL_SIZE, -1
         )
         spread_cells = spread_cells.reshape(self._cell_shape[0] * CELL_SIZE, -1, 3)
-        return (
-            texel_values
-            + spread_cells[: self._texture_shape[0], : self._texture_shape[1]]
-        )
+        # without what the last cells have beyond the texture
+        n_rows, n_columns = self._texture_shape
+        return texel_values + spread_cells[:n_rows, :n_columns]
 
 
 def _compute_cell_sizes(n_texels: int, n_cells: int) -> Tensor:
@@ -519,7 +529,10 @@ class LinearRenderer(Predictor):
         light: Inputs = MappingProxyType({}),
         collected: LinearizedScene | None = None,
     ) -> None:
-        """Trace the base image and the matrices, unless they were collected elsewhere."""
+        """Trace the base image and the matrices, unless they were collected elsewhere.
+
+        Arguments are those of the class.
+        """
         super().__init__(traced)
         if collected is None:
             with torch.no_grad():
@@ -564,8 +577,8 @@ class LinearRenderer(Predictor):
         """Return radiance (H, W, 3), and coverage as a fourth channel if there is a
         backdrop.
 
-        That is the base image, and for each matrix what the base color's difference
-        from that of the linearisation adds. Coverage stays as it is.
+        Each matrix adds to the base image what its base color changes from where it was
+        linearised. Coverage stays as it is.
         """
         base = self.collected.base_image()
         radiance = base[..., :3]
@@ -602,32 +615,28 @@ def _collect(
 ) -> LinearizedScene:
     """Trace what a `LinearRenderer` needs; arguments as there.
 
-    Inputs that belong to the finished image are set apart. Without a matrix the base
-    image is an ordinary render; otherwise it is the mean of the paths that fill the
-    matrices. With a backdrop, radiance leaves out the background, and coverage is its
-    fourth channel.
+    Without a matrix the base image is an ordinary render; otherwise it is the mean of
+    the paths that fill the matrices. With a backdrop, radiance leaves out the
+    background, and coverage is its fourth channel.
     """
-    non_finite_before = renderer.non_finite
-    inputs = renderer.scene.assembly(renderer.space.inputs(u))
-    scene_inputs = dict(renderer.find_front(inputs))
+    non_finite_before = renderer.non_finite  # a count of pixels so far
+    inputs = renderer.find_front(renderer.scene.assembly(renderer.space.inputs(u)))
+    # those that belong to the finished image, not to the scene
     image_inputs = {
-        name: scene_inputs.pop(name)
-        for name in list(scene_inputs)
-        if name in IMAGE_INPUTS
+        name: value for name, value in inputs.items() if name in IMAGE_INPUTS
+    }
+    scene_inputs = {
+        name: value for name, value in inputs.items() if name not in IMAGE_INPUTS
     }
     scene_inputs |= dict(light)
-    linear_names = find_linear_inputs(renderer) if names is None else names
+    if names is None:
+        names = find_linear_inputs(renderer)
     linearized_at = {
-        name: value.clone()
-        for name, value in scene_inputs.items()
-        if name in linear_names
+        name: value.clone() for name, value in scene_inputs.items() if name in names
     }
+    size = _get_traced_size(renderer)
     transports = {
-        name: TextureTransport(
-            _get_traced_size(renderer),
-            (value.shape[0], value.shape[1]),
-            small=quick,
-        )
+        name: TextureTransport(size, (value.shape[0], value.shape[1]), small=quick)
         for name, value in linearized_at.items()
     }
     has_backdrop = "backdrop.color" in image_inputs
@@ -672,7 +681,9 @@ def _trace_matrices(
     """
     with renderer.scene.limit_window(renderer.window):
         paths = _fill_transports(renderer, transports, scene_inputs, seed, tick, spp)
-    radiance = paths.radiance - paths.background if has_backdrop else paths.radiance
+    radiance = paths.radiance
+    if has_backdrop:  # which takes the place of the environment
+        radiance = radiance - paths.background
     radiance = renderer.replace_non_finite(radiance)
     base, smooth = _make_smooth(renderer, radiance, paths, quick)
     for transport in transports.values():
@@ -725,6 +736,7 @@ def _fill_transports(
             )
             transport.add_pass(paths.vertices, 1.0 / n_passes)
             size = sum(filled.bytes for filled in transports.values())
+            # the base image has up to four channels of 16 bits
             if size + 8 * height * width > scale_limit(MAX_BYTES):
                 raise TransportTooLargeError(
                     f"{TOO_LARGE} {scale_limit(MAX_BYTES) / 2**30:g} GiB"
@@ -739,10 +751,16 @@ def _make_smooth(
 ) -> tuple[Tensor, Smooth | None]:
     """Denoise the base image; also return the function that denoises a matrix's colors.
 
-    The function takes and returns an image (H, W, 3). If quick, it multiplies by the
-    ratio of the denoised and the noisy base image, within a factor `MAX_CORRECTION`
-    either way; else it runs the denoiser, guided by the normals and by where surfaces
-    are. Without a denoiser the image is returned as it is, and None.
+    The function takes and returns an image (H, W, 3). Without a denoiser the base image
+    is returned as it is, and None.
+
+    Args:
+        renderer: renderer of the scene.
+        radiance: (H, W, 3) the base image with its noise.
+        paths: the paths that it is made of, with what guides the denoiser.
+        quick: the function multiplies by the ratio of the denoised and the noisy base
+            image, within a factor `MAX_CORRECTION` either way; otherwise it runs the
+            denoiser, guided by the normals and by where surfaces are.
     """
     if renderer.formation.denoiser != "oidn":
         return radiance, None
@@ -751,6 +769,7 @@ def _make_smooth(
         1.0 / MAX_CORRECTION, MAX_CORRECTION
     )
     is_surface = paths.albedo.sum(dim=-1, keepdim=True) > 0.0
+    # a matrix's colors do not have the pattern of the base color
     even_albedo = is_surface.to(torch.float32).expand(-1, -1, 3).contiguous()
 
     def smooth(image: Tensor) -> Tensor:
@@ -779,4 +798,4 @@ def plan_passes(renderer: Renderer, spp: int) -> tuple[int, int]:
     """Return the samples per pixel of a pass, and the number of passes."""
     height, width = _get_traced_size(renderer)
     samples = max(1, min(spp, SAMPLES_PER_PASS // (height * width)))
-    return samples, -(-spp // samples)
+    return samples, math.ceil(spp / samples)

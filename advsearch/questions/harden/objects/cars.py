@@ -28,18 +28,29 @@ from advsearch.questions.harden.objects.textures import (
     step,
 )
 
-AXLES = (1.29, -1.33)
-WHEEL = 0.33  # radius and width
-TYRE = 0.215
-ARCH = 0.385
+AXLES = (1.29, -1.33)  # x of the front and the rear axle
+WHEEL = 0.33  # radius of a wheel, and the height of its axle
+TYRE = 0.215  # width of a tyre
+RIM = 0.212  # radius of a rim
+ARCH = 0.385  # radius of a wheel arch
 WHEELS = tuple(product(AXLES, (1.0, -1.0)))  # x of the axle, and the side
-MIDDLE = -0.5  # of the cabin
-COLUMNS = 92
+CABIN_X = -0.5  # x of the middle of the cabin
+COLUMNS = 92  # faces around the body
+ELSEWHERE = -1.0
+"""How far points lie inside an opening on another end or side of the car: not at all."""
+FAR = 9.0
+"""Distance of what is on another side of the car, in metres."""
 Height = Callable[[Array, Array, Array], Array]
+"""Returns z from the fraction of the height, x and y, all (N,)."""
 
 
 def _outline(
-    angle: Array, front: float, rear: float, half: float, power: float, middle: float
+    angle: Array,
+    front: float,
+    rear: float,
+    half_width: float,
+    power: float,
+    center_x: float,
 ) -> tuple[Array, Array]:
     """Return x and y, each (N,), of points of a superellipse.
 
@@ -49,53 +60,51 @@ def _outline(
     Args:
         angle: parameters of the points (N,), from -pi to pi; 0 is the front end.
         front, rear: x of its ends.
-        half: its extent along y and -y.
+        half_width: its extent along y and -y.
         power: power of the superellipse.
-        middle: x of its center.
+        center_x: x of its center.
     """
     cosine = np.cos(angle)
     sine = np.sin(angle)
-    half_length = np.where(cosine >= 0.0, front - middle, middle - rear)
+    half_length = np.where(cosine >= 0.0, front - center_x, center_x - rear)
     # x = a |cos|^(2/power) fulfils |x/a|^power + |y/b|^power = 1 with y likewise
     exponent = 2 / power
-    x = middle + half_length * np.sign(cosine) * np.abs(cosine) ** exponent
-    y = half * np.sign(sine) * np.abs(sine) ** exponent
+    x = center_x + half_length * np.sign(cosine) * np.abs(cosine) ** exponent
+    y = half_width * np.sign(sine) * np.abs(sine) ** exponent
     return x, y
 
 
 def _shell(
-    rows: Array, power: float, middle: float, height: Height, corner: float
+    levels: Array, power: float, center_x: float, height: Height, corner: float
 ) -> list[Patch]:
     """Create the painted patches of a stack of superellipses.
 
     Args:
-        rows: (R, 4), for each superellipse the fraction of the height, half the width,
-            and x of the front and of the rear end.
+        levels: (R, 4), a row for each superellipse: its fraction of the height, half
+            its width, and x of its front and its rear end.
         power: power of the superellipses.
-        middle: x of their center.
+        center_x: x of their center.
         height: returns z from fractions of the height, x and y.
         corner: where charts are cut: at this fraction of all columns to both sides of
             the middle of the front and of the rear.
     """
-    angle = _outline_angles(rows, power, middle)
-    points = _shell_points(
-        rows=rows, power=power, middle=middle, height=height, angle=angle
-    )
+    angle = _outline_angles(levels, power, center_x)
+    points = _shell_points(levels, power, center_x, height, angle)
     normals = _shell_normals(points)
-    opposite = COLUMNS // 2  # column 0 is the middle of the rear, this of the front
+    front = COLUMNS // 2  # column 0 is the middle of the rear, this that of the front
     cut = int(COLUMNS * corner)
+    # the rear's left half, a side, the front, the other side, the rear's right half
+    chart_bounds = (0, cut, front - cut, front + cut, COLUMNS - cut, COLUMNS)
     patches = []
-    for first, last in pairwise(
-        (0, cut, opposite - cut, opposite + cut, COLUMNS - cut, COLUMNS)
-    ):
-        part_points = points[:, first : last + 1]
-        u = shapes.mean_lengths(part_points, axis=1)
-        v = shapes.mean_lengths(part_points, axis=0)
+    for first, last in pairwise(chart_bounds):
+        columns = np.s_[:, first : last + 1]
+        u = shapes.mean_lengths(points[columns], axis=1)
+        v = shapes.mean_lengths(points[columns], axis=0)
         patches.append(
             shapes.grid(
                 "paint",
-                part_points,
-                normals[:, first : last + 1],
+                points[columns],
+                normals[columns],
                 size=(float(u[-1]), float(v[-1])),
                 down=v / v[-1],
                 across=u / u[-1],
@@ -104,43 +113,38 @@ def _shell(
     return patches
 
 
-def _outline_angles(rows: Array, power: float, middle: float) -> Array:
-    """Return the angles (C,) of columns that are equally far apart along the widest
-    outline.
+def _outline_angles(levels: Array, power: float, center_x: float) -> Array:
+    """Return angles (C,) of columns that are evenly spaced along the widest outline.
 
     C is `COLUMNS` + 1: the first and the last are the middle of the rear. The arguments
     are those of `_shell`.
     """
-    _, half, front, rear = rows[np.argmax(rows[:, 1])]
-    fine = np.linspace(-np.pi, np.pi, 8001)
+    widest = levels[np.argmax(levels[:, 1])]
+    _, half_width, front, rear = widest
+    fine_angle = np.linspace(-np.pi, np.pi, 8001)
     x, y = _outline(
-        fine,
-        front=front - middle,
-        rear=rear - middle,
-        half=half,
-        power=power,
-        middle=0.0,
+        fine_angle, front - center_x, rear - center_x, half_width, power, center_x=0.0
     )
     arc_length = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
-    return np.interp(np.linspace(0.0, arc_length[-1], COLUMNS + 1), arc_length, fine)
+    # the angles at which the length along the outline is a multiple of the spacing
+    column_length = np.linspace(0.0, arc_length[-1], COLUMNS + 1)
+    return np.interp(column_length, arc_length, fine_angle)
 
 
 def _shell_points(
-    rows: Array, power: float, middle: float, height: Height, angle: Array
+    levels: Array, power: float, center_x: float, height: Height, angle: Array
 ) -> Array:
-    """Return the points (R, C, 3) of a stack of superellipses, one row for each.
+    """Return the points (R, C, 3) of a stack of R superellipses.
 
     `angle` (C,) has the angles of the columns; the other arguments are those of
     `_shell`.
     """
-    points = np.empty((len(rows), COLUMNS + 1, 3))
-    for row, (share, half, front, rear) in zip(points, rows, strict=True):
-        x, y = _outline(
-            angle, front=front, rear=rear, half=half, power=power, middle=middle
-        )
-        row[:, 0] = x
-        row[:, 1] = y
-        row[:, 2] = height(np.full_like(x, share), x, y)
+    points = np.empty((len(levels), COLUMNS + 1, 3))
+    for index, (height_fraction, half_width, front, rear) in enumerate(levels):
+        x, y = _outline(angle, front, rear, half_width, power, center_x)
+        points[index, :, 0] = x
+        points[index, :, 1] = y
+        points[index, :, 2] = height(np.full_like(x, height_fraction), x, y)
     return points
 
 
@@ -165,11 +169,13 @@ def _softest(*fields: Array) -> Array:
 
     It is the smooth minimum -log(sum(exp(-30 d))) / 30, of distances cut to 1 m.
     """
-    return np.asarray(
-        logsumexp(-30.0 * np.clip(np.stack(fields), -1.0, 1.0), axis=0) / -30.0
-    )
+    sharpness = -30.0
+    distances = np.clip(np.stack(fields), -1.0, 1.0)
+    return np.asarray(logsumexp(sharpness * distances, axis=0) / sharpness)
 
 
+# Heights of the lower edge of the body, of the lower edge of the windows, and of the
+# roof, along x.
 _BOTTOM = _line([(-2.2, 0.30), (-1.7, 0.20), (0.0, 0.175), (1.7, 0.185), (2.2, 0.235)])
 _WAIST = _line(
     [
@@ -196,7 +202,7 @@ _ROOF = _line(
         (1.1, 1.2),
     ]
 )
-_BODY = [  # share of the height, half the width, front end, rear end
+_BODY = [  # fraction of the height, half the width, front end, rear end
     (0.0, 0.80, 1.98, -2.0),
     (0.03, 0.835, 2.06, -2.06),
     (0.1, 0.86, 2.1, -2.1),
@@ -210,7 +216,7 @@ _BODY = [  # share of the height, half the width, front end, rear end
     (0.985, 0.82, 1.89, -2.01),
     (1.0, 0.78, 1.79, -1.965),
 ]
-_CABIN = [
+_CABIN = [  # the same of the cabin
     (0.0, 0.795, 1.0, -1.955),
     (0.25, 0.765, 0.79, -1.9),
     (0.5, 0.732, 0.57, -1.83),
@@ -220,7 +226,7 @@ _CABIN = [
     (0.985, 0.58, -0.06, -1.47),
     (1.0, 0.5, -0.22, -1.3),
 ]
-_BODY_POWER = 4.2
+_BODY_POWER = 4.2  # powers of the superellipses
 _CABIN_POWER = 4.6
 
 
@@ -229,64 +235,75 @@ def _deck(x: Array, y: Array) -> Array:
     return np.asarray(_WAIST(x) + 0.045 * (1.0 - (y / 0.8) ** 2))
 
 
-def _body_height(share: Array, x: Array, y: Array) -> Array:
+def _body_height(height_fraction: Array, x: Array, y: Array) -> Array:
     """Return z at a fraction of the height between the body's bottom and its top."""
-    return np.asarray(_BOTTOM(x) + share * (_deck(x, y) - _BOTTOM(x)))
+    bottom = _BOTTOM(x)
+    return np.asarray(bottom + height_fraction * (_deck(x, y) - bottom))
 
 
-def _cabin_height(share: Array, x: Array, y: Array) -> Array:
+def _cabin_height(height_fraction: Array, x: Array, y: Array) -> Array:
     """Return z at a fraction of the height between the deck and the curved roof."""
-    low = _deck(x, y) - 0.03
-    return np.asarray(low + share * (_ROOF(x) + 0.035 * (1.0 - (y / 0.6) ** 2) - low))
+    bottom = _deck(x, y) - 0.03  # inside the body, so that no gap shows
+    roof = _ROOF(x) + 0.035 * (1.0 - (y / 0.6) ** 2)
+    return np.asarray(bottom + height_fraction * (roof - bottom))
 
 
-def _inside(p: Array) -> dict[str, Array]:
-    """Return about how far points (N, 3) lie inside each opening, by its name in
-    `OPENINGS`.
+def _inside(points: Array) -> dict[str, Array]:
+    """Return how far points (N, 3) lie inside each opening, by its name in `OPENINGS`.
 
-    The values (N,) are in metres, and below 0 outside. Where an opening is on one end
-    or side of the car only, they are -1 elsewhere. Numbers are measures of the car.
+    The values (N,) are about in metres, and below 0 outside. All numbers are measures
+    of the car.
     """
-    x, y, z = p.T
+    x, y, z = points.T
     abs_y = np.abs(y)
-    cabin_radius = _cabin_radius(x, y)
-    # about half the cabin's width
-    half_width = np.interp(z, [0.93, 1.15, 1.36], [0.795, 0.735, 0.668])
-    sill = _WAIST(x) + 0.04
-    lintel = sill + 0.83 * (_ROOF(x) - sill)
-    # distances behind the slanted line of the windscreen's pillar, and before that of
-    # the rear one
-    pillar = (0.60 - x) * 0.58 - (z - 0.93) * 0.81
-    rear = (x + 1.62) * 0.72 - (z - 0.98) * 0.69
-    lens = _inside_headlight(abs_y, x, z)
+    return {
+        "cabin": 0.72 * (1.0 - _cabin_radius(x, y)),
+        "front arch": _inside_arch(AXLES[0], abs_y, x, z),
+        "rear arch": _inside_arch(AXLES[1], abs_y, x, z),
+        "headlight": np.where(x > 1.2, _inside_headlight(abs_y, x, z), ELSEWHERE),
+        "taillight": np.where(
+            x < -1.0,
+            _softest(abs_y - 0.40, -1.80 - x, z - 0.785, 0.955 - z),
+            ELSEWHERE,
+        ),
+        **_inside_grilles(abs_y, x, z),
+        # the dark lower edge, higher at the back
+        "valance": _BOTTOM(x) + np.where(x < -1.6, 0.13, 0.075) - z,
+        **_inside_windows(abs_y, x, z),
+    }
+
+
+def _inside_grilles(abs_y: Array, x: Array, z: Array) -> dict[str, Array]:
+    """Return how far points lie inside the two grilles, whose edges are slanted."""
     low_grille = _softest(
         0.62 - abs_y, z - 0.24 + 0.02 * abs_y, 0.37 - 0.02 * abs_y - z
     )
     high_grille = _softest(
         0.41 - abs_y, z - 0.5 - 0.04 * abs_y, 0.64 + 0.04 * abs_y - z
     )
-    arches = _inside_arches(abs_y, x, z)
     return {
-        "cabin": 0.72 * (1.0 - cabin_radius),
-        "front arch": arches[0],
-        "rear arch": arches[1],
-        "headlight": np.where(x > 1.2, lens, -1.0),
-        "taillight": np.where(
-            x < -1.0, _softest(abs_y - 0.40, -1.80 - x, z - 0.785, 0.955 - z), -1.0
-        ),
-        "low grille": np.where(x > 1.5, low_grille, -1.0),
-        "high grille": np.where(x > 1.5, high_grille, -1.0),
-        # the dark lower edge, higher at the back
-        "valance": _BOTTOM(x) + np.where(x < -1.6, 0.13, 0.075) - z,
-        "windscreen": np.where(
-            x > 0.0, _softest(0.85 * half_width - abs_y, 1.36 - z), -1.0
-        ),
-        "rear window": np.where(
-            x < -1.5, _softest(0.86 * half_width - abs_y, z - 1.045, 1.325 - z), -1.0
-        ),
-        "side windows": np.where(
-            abs_y > 0.45, _softest(pillar, rear, z - sill, lintel - z), -1.0
-        ),
+        "low grille": np.where(x > 1.5, low_grille, ELSEWHERE),
+        "high grille": np.where(x > 1.5, high_grille, ELSEWHERE),
+    }
+
+
+def _inside_windows(abs_y: Array, x: Array, z: Array) -> dict[str, Array]:
+    """Return how far points lie inside the windows of the cabin."""
+    # about half the cabin's width at each height
+    half_width = np.interp(z, [0.93, 1.15, 1.36], [0.795, 0.735, 0.668])
+    windscreen = _softest(0.85 * half_width - abs_y, 1.36 - z)
+    rear_window = _softest(0.86 * half_width - abs_y, z - 1.045, 1.325 - z)
+    sill = _WAIST(x) + 0.04
+    lintel = sill + 0.83 * (_ROOF(x) - sill)
+    # distances behind the slanted line of the windscreen's pillar, and before that of
+    # the rear one
+    behind_pillar = (0.60 - x) * 0.58 - (z - 0.93) * 0.81
+    before_rear_pillar = (x + 1.62) * 0.72 - (z - 0.98) * 0.69
+    side_windows = _softest(behind_pillar, before_rear_pillar, z - sill, lintel - z)
+    return {
+        "windscreen": np.where(x > 0.0, windscreen, ELSEWHERE),
+        "rear window": np.where(x < -1.5, rear_window, ELSEWHERE),
+        "side windows": np.where(abs_y > 0.45, side_windows, ELSEWHERE),
     }
 
 
@@ -303,24 +320,22 @@ def _inside_headlight(abs_y: Array, x: Array, z: Array) -> Array:
 def _cabin_radius(x: Array, y: Array) -> Array:
     """Return the radius (N,) of points in the superellipse of the cabin, 1 at its edge.
 
-    It is seen from above; x and y are (N,).
+    It is seen from above, and reaches from x = -1.86 to 0.9, and to 0.72 on both sides;
+    x and y are (N,).
     """
-    reach = np.where(x >= MIDDLE, 0.9 - MIDDLE, MIDDLE + 1.86)
-    return (
-        np.abs((x - MIDDLE) / reach) ** _CABIN_POWER + np.abs(y / 0.72) ** _CABIN_POWER
-    ) ** (1 / _CABIN_POWER)
+    half_length = np.where(x >= CABIN_X, 0.9 - CABIN_X, CABIN_X + 1.86)
+    relative_x = np.abs((x - CABIN_X) / half_length)
+    relative_y = np.abs(y / 0.72)
+    return (relative_x**_CABIN_POWER + relative_y**_CABIN_POWER) ** (1 / _CABIN_POWER)
 
 
-def _inside_arches(abs_y: Array, x: Array, z: Array) -> list[Array]:
-    """Return how far points lie inside the front and the rear wheel arch, two arrays
-    (N,).
+def _inside_arch(axle: float, abs_y: Array, x: Array, z: Array) -> Array:
+    """Return how far points lie inside the two wheel arches of an axle.
 
-    The arguments are (N,); `abs_y` is the distance from the middle of the car.
+    Arguments and result are (N,); `axle` is its x, and `abs_y` the distance from the
+    middle of the car.
     """
-    return [
-        np.where(abs_y > 0.4, ARCH - np.hypot(x - axle, z - WHEEL), -1.0)
-        for axle in AXLES
-    ]
+    return np.where(abs_y > 0.4, ARCH - np.hypot(x - axle, z - WHEEL), ELSEWHERE)
 
 
 OPENINGS: dict[str, dict[str, str | None]] = {
@@ -340,145 +355,190 @@ OPENINGS: dict[str, dict[str, str | None]] = {
 
 
 def _opening(name: str) -> shapes.Field:
-    return lambda p: _inside(p)[name]
+    """Return the field of an opening, positive inside it."""
+    return lambda points: _inside(points)[name]
 
 
 def _body_and_cabin() -> list[Patch]:
     """Create the body and the cabin with their openings."""
-    # rows of smaller and smaller outlines at the full height: they close body and cabin
-    # at the top, but for a hole in the body under the cabin
+    # levels of smaller and smaller outlines at the full height: they close body and
+    # cabin at the top, but for a hole in the body under the cabin
     deck = [
-        (1.0, s * 0.78, s * 1.79, s * -1.965) for s in (0.92, 0.81, 0.69, 0.56, 0.43)
+        (1.0, scale * 0.78, scale * 1.79, scale * -1.965)
+        for scale in (0.92, 0.81, 0.69, 0.56, 0.43)
     ]
     roof = [
-        (1.0, s * 0.5, MIDDLE + s * 0.28, MIDDLE - s * 0.8)
-        for s in (0.75, 0.45, 0.15, 0.002)
+        (1.0, scale * 0.5, CABIN_X + scale * 0.28, CABIN_X - scale * 0.8)
+        for scale in (0.75, 0.45, 0.15, 0.002)
     ]
-    body = np.array([*shapes.spline(_BODY, count=23), *deck])
-    cabin = np.array([*shapes.spline(_CABIN, count=16), *roof])
-    parts = {
+    body_levels = np.array([*shapes.spline(_BODY, count=23), *deck])
+    cabin_levels = np.array([*shapes.spline(_CABIN, count=16), *roof])
+    shells = {
         "body": _shell(
-            body, power=_BODY_POWER, middle=0.0, height=_body_height, corner=0.085
+            body_levels, _BODY_POWER, center_x=0.0, height=_body_height, corner=0.085
         ),
         "cabin": _shell(
-            cabin, power=_CABIN_POWER, middle=MIDDLE, height=_cabin_height, corner=0.1
+            cabin_levels,
+            _CABIN_POWER,
+            center_x=CABIN_X,
+            height=_cabin_height,
+            corner=0.1,
         ),
     }
-    for part, openings in OPENINGS.items():
-        for name, tag in openings.items():
-            parts[part] = shapes.carve_patches(parts[part], _opening(name), tag)
-    return parts["body"] + parts["cabin"]
+    for shell_name, openings in OPENINGS.items():
+        for opening, tag in openings.items():
+            shells[shell_name] = shapes.carve_patches(
+                shells[shell_name], _opening(opening), tag
+            )
+    return shells["body"] + shells["cabin"]
 
 
 def _wheels() -> list[Patch]:
-    """Create the four wheels with tyres, rims and hubs. A rim has five forked spokes.
-
-    One wheel is built around the z axis, its outer side up, and copied to its places.
-    """
-    half = TYRE / 2  # z of the outer side; 0 is the middle of the tyre
-    rim = 0.212  # radius
-    tyre = _tyre_profile(rim, half)
-    deep = half - 0.06  # z of the dark ground behind the spokes
-    wheel = shapes.lathe([("rubber", tyre)], columns=28)
-    wheel += shapes.lathe(
-        [
-            (
-                "rim",
-                [(rim, half - 0.008), (rim - 0.014, half - 0.012), (rim - 0.02, deep)],
-            )
-        ],
-        columns=28,
-    )
-    wheel += shapes.lathe([("well", [(rim - 0.02, deep), (0.0, deep)])], columns=24)
-    spoke = np.array(
-        [
-            (0.03, 0.0, half - 0.035),
-            (0.11, 0.0, half - 0.022),
-            (rim - 0.012, 0.0, half - 0.018),
-        ]
-    )
-    section = shapes.rectangle(0.03, 0.03, bevel=0.008, steps=1)
-    for number, side in product(range(5), (-1.0, 1.0)):
-        spoke[:, 1] = side * np.array([0.012, 0.018, 0.04])
-        turn = shapes.rotation("z", 72.0 * number)
-        wheel += shapes.transform_patches(
-            shapes.sweep("rim", spoke, section, (1.0, 1.0, 1.15)), turn
-        )
-    hub = [(0.052, deep), (0.05, half - 0.02), (0.03, half - 0.01), (0.0, half - 0.008)]
-    wheel += shapes.lathe(
-        [("rim", shapes.round_corners(hub, radius=0.008, steps=2))], columns=20
-    )
+    """Create the four wheels: one wheel, copied to its positions."""
+    wheel = _wheel()
     patches = []
     for axle, side in WHEELS:
         # The wheel's axis is laid along y, outwards; then the wheel rolls a little.
         turn = shapes.rotation("y", 17.0 * axle) @ shapes.rotation("x", -90.0 * side)
+        center = (axle, side * (0.852 - TYRE / 2), WHEEL)
+        patches += shapes.transform_patches(wheel, turn, center)
+    return patches
+
+
+def _wheel() -> list[Patch]:
+    """Create a wheel around the z axis, its outer side up: tyre, rim, spokes and hub."""
+    outer_z = TYRE / 2  # of the outer side; 0 is the middle of the tyre
+    ground_z = outer_z - 0.06  # of the dark ground behind the spokes
+    # profiles of points (r, z)
+    rim_edge = [
+        (RIM, outer_z - 0.008),
+        (RIM - 0.014, outer_z - 0.012),
+        (RIM - 0.02, ground_z),
+    ]
+    ground = [(RIM - 0.02, ground_z), (0.0, ground_z)]
+    hub = [
+        (0.052, ground_z),
+        (0.05, outer_z - 0.02),
+        (0.03, outer_z - 0.01),
+        (0.0, outer_z - 0.008),
+    ]
+    round_hub = shapes.round_corners(hub, radius=0.008, steps=2)
+    return [
+        *shapes.lathe([("rubber", _tyre_profile(RIM, outer_z))], columns=28),
+        *shapes.lathe([("rim", rim_edge)], columns=28),
+        *shapes.lathe([("well", ground)], columns=24),
+        *_spokes(outer_z),
+        *shapes.lathe([("rim", round_hub)], columns=20),
+    ]
+
+
+def _spokes(outer_z: float) -> list[Patch]:
+    """Create the five forked spokes of a wheel, each of two bars that move apart.
+
+    Args:
+        outer_z: z of the outer side of the wheel.
+    """
+    bar = np.array(
+        [
+            (0.03, 0.0, outer_z - 0.035),
+            (0.11, 0.0, outer_z - 0.022),
+            (RIM - 0.012, 0.0, outer_z - 0.018),
+        ]
+    )
+    section = shapes.rectangle(0.03, 0.03, bevel=0.008, steps=1)
+    patches = []
+    for number, side in product(range(5), (-1.0, 1.0)):
+        bar[:, 1] = side * np.array([0.012, 0.018, 0.04])
         patches += shapes.transform_patches(
-            wheel, turn, (axle, side * (0.852 - TYRE / 2), WHEEL)
+            shapes.sweep("rim", bar, section, (1.0, 1.0, 1.15)),
+            shapes.rotation("z", 72.0 * number),
         )
     return patches
 
 
-def _tyre_profile(rim: float, half: float) -> list[tuple[float, float]]:
-    """Return the points (r, z) of the profile of a tyre from one side of the rim to the
-    other.
+def _tyre_profile(rim: float, outer_z: float) -> list[tuple[float, float]]:
+    """Return the points (r, z) of a tyre, from its inner side to its outer side.
+
+    Args:
+        rim: radius of the rim.
+        outer_z: z of the outer side; the inner one is at -z.
     """
-    outside = [
-        (rim, half - 0.008),
-        (rim + 0.012, half),
-        (0.29, half + 0.004),
-        (WHEEL - 0.012, half - 0.02),
+    outer_side = [
+        (rim, outer_z - 0.008),
+        (rim + 0.012, outer_z),
+        (0.29, outer_z + 0.004),
+        (WHEEL - 0.012, outer_z - 0.02),
     ]
-    tread = [(WHEEL, half - 0.05), (WHEEL, 0.0), (WHEEL, 0.05 - half)]
-    return [*((r, -z) for r, z in outside), *tread[::-1], *outside[::-1]]
+    inner_side = [(r, -z) for r, z in outer_side]
+    tread = [(WHEEL, 0.05 - outer_z), (WHEEL, 0.0), (WHEEL, outer_z - 0.05)]
+    return [*inner_side, *tread, *outer_side[::-1]]
 
 
 def _wells() -> list[Patch]:
-    """Create the inside of the wheel arches, and the floor of the car.
-
-    Each arch has a curved wall around the wheel, and a flat one towards the middle.
-    """
-    # around the axle: from below it at the front, over the top, to below it at the rear
-    angle = np.radians(np.linspace(-30.0, 210.0, 17))
-    outwards = np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=1)
+    """Create the insides of the four wheel arches, and the floor of the car."""
     patches = []
     for axle, side in WHEELS:
-        inner = np.array([axle, 0.0, WHEEL]) + ARCH * outwards
-        # the edges of the curved wall: in the car's side, and farther in
-        rows = np.stack([inner + np.array([0.0, side * y, 0.0]) for y in (0.79, 0.56)])
-        ring = rows[1]
-        if side > 0:  # so that the faces of both sides look towards the wheel
-            rows = rows[::-1]
-            ring = ring[::-1]
-        normals = np.broadcast_to(-outwards, rows.shape)
-        across = np.linspace(0.0, 1.0, len(angle))
-        patches.append(
-            shapes.grid(
-                "well", rows, normals, (ARCH * 4.2, 0.32), np.array([0.0, 1.0]), across
-            )
-        )
-        patches.append(shapes.cap("well", ring, np.array([0.0, side, 0.0])))
+        patches += _well(axle, side)
     x, y = _outline(
         np.linspace(np.pi, -np.pi, 41)[:-1],
         front=1.97,
         rear=-1.99,
-        half=0.79,
+        half_width=0.79,
         power=_BODY_POWER,
-        middle=0.0,
+        center_x=0.0,
+    )
+    floor = np.stack([x, y, np.full_like(x, 0.2)], axis=1)
+    return [*patches, shapes.cap("well", floor, np.array([0.0, 0.0, -1.0]))]
+
+
+def _well(axle: float, side: float) -> list[Patch]:
+    """Create the inside of a wheel arch: a curved wall, and a flat one farther in.
+
+    Args:
+        axle: x of the axle.
+        side: 1 at +y, -1 at -y.
+    """
+    # around the axle: from below it at the front, over the top, to below it at the rear
+    angle = np.radians(np.linspace(-30.0, 210.0, 17))
+    outwards = np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=1)
+    arc = np.array([axle, 0.0, WHEEL]) + ARCH * outwards
+    # the edges of the curved wall: in the car's side, and farther in
+    outer_edge = arc + np.array([0.0, side * 0.79, 0.0])
+    inner_edge = arc + np.array([0.0, side * 0.56, 0.0])
+    edges = np.stack([outer_edge, inner_edge])
+    if side > 0:  # so that the faces of both sides look towards the wheel
+        edges = edges[::-1]
+        inner_edge = inner_edge[::-1]
+    curved_wall = shapes.grid(
+        "well",
+        edges,
+        np.broadcast_to(-outwards, edges.shape),
+        size=(ARCH * 4.2, 0.32),
+        down=np.array([0.0, 1.0]),
+        across=np.linspace(0.0, 1.0, len(angle)),
+    )
+    return [curved_wall, shapes.cap("well", inner_edge, np.array([0.0, side, 0.0]))]
+
+
+def _fittings() -> list[Patch]:
+    """Create mirrors, plates, badges, door handles and a spoiler."""
+    spoiler = shapes.box(
+        "paint", (0, 0, 0), (0.2, 1.04, 0.035), bevel=0.015, steps=2, cells=2
     )
     return [
-        *patches,
-        shapes.cap(
-            "well",
-            np.stack([x, y, np.full_like(x, 0.2)], axis=1),
-            np.array([0.0, 0.0, -1.0]),
+        *_mirrors(),
+        *_plates_and_badges(),
+        *_door_handles(),
+        *shapes.transform_patches(
+            spoiler, shapes.rotation("y", 9.0), (-1.60, 0.0, 1.364)
         ),
     ]
 
 
-def _fittings() -> list[Patch]:
-    """Create mirrors, plates, badges, door handles and other fittings."""
+def _mirrors() -> list[Patch]:
+    """Create the two mirrors, each a painted shell on a dark arm."""
     patches = []
-    for side in (1.0, -1.0):  # mirrors
+    for side in (1.0, -1.0):
         shell = shapes.box(
             "paint", (0.0, 0.0, 0.0), (0.12, 0.2, 0.125), bevel=0.055, steps=3
         )
@@ -492,11 +552,17 @@ def _fittings() -> list[Patch]:
             bevel=0.012,
             steps=1,
         )
+    return patches
+
+
+def _plates_and_badges() -> list[Patch]:
+    """Create a licence plate and a badge at the front, and the same at the rear."""
     plate = shapes.box("plate", (0, 0, 0), (0.014, 0.52, 0.112), bevel=0.004, steps=1)
     badge = shapes.lathe(
         [("rim", [(0.058, -0.02), (0.058, 0.006), (0.05, 0.012), (0.0, 0.014)])],
         columns=24,
     )
+    patches = []
     for fitting, tilt, position in (
         (plate, -4.0, (2.146, 0.0, 0.428)),
         (plate, 3.0, (-2.138, 0.0, 0.705)),
@@ -506,22 +572,20 @@ def _fittings() -> list[Patch]:
         patches += shapes.transform_patches(
             fitting, shapes.rotation("y", tilt), position
         )
-    for side, x in product((1.0, -1.0), (0.05, -0.92)):  # handles of the doors
+    return patches
+
+
+def _door_handles() -> list[Patch]:
+    """Create the handles of the four doors."""
+    patches = []
+    for side, x in product((1.0, -1.0), (0.05, -0.92)):
         patches += shapes.box(
             "paint", (x, side * 0.889, 0.775), (0.2, 0.032, 0.028), bevel=0.011, steps=1
         )
-    spoiler = shapes.box(
-        "paint", (0, 0, 0), (0.2, 1.04, 0.035), bevel=0.015, steps=2, cells=2
-    )
-    return [
-        *patches,
-        *shapes.transform_patches(
-            spoiler, shapes.rotation("y", 9.0), (-1.60, 0.0, 1.364)
-        ),
-    ]
+    return patches
 
 
-_DOORS = (
+_DOORS = (  # the gaps of the doors as polylines (x, z)
     [(0.86, 1.0), (0.88, 0.6), (0.84, 0.32), (0.78, 0.25), (-0.9, 0.25)],
     [(-0.26, 1.0), (-0.24, 0.6), (-0.27, 0.25)],
     [
@@ -537,97 +601,84 @@ _DOORS = (
 
 @painter
 def _lacquer(t: Texels, color: Array) -> Array:
-    """Paint lacquer, with dark lines for the gaps of doors, hood, tailgate and tank
-    lid.
+    """Paint lacquer, with dark lines for the gaps between parts of the body.
 
     A soft fold runs along both sides of the hood.
     """
     x, y, z = t.xyz.T
-    out = np.abs(y)
+    fold_line = [(0.95, 0.5), (1.9, 0.36)]
+    fold_distance = shapes.distance_to_polylines(x, np.abs(y), fold_line)
+    fold = np.clip(1.0 - fold_distance / 0.05, 0.0, 1.0)
+    is_hood = (x > 0.8) & (z > 0.7)
+    shaded = mix(color, 0.75 * color, 0.4 * np.where(is_hood, fold, 0.0))
+    gap = step(0.005 - _gap_distance(t), 0.0, soft=0.011)
+    return mix(shaded, 0.12 * color, 0.9 * gap)
+
+
+def _gap_distance(t: Texels) -> Array:
+    """Return the distance (N,) to the nearest gap of doors, hood, tailgate or tank lid.
+
+    A gap counts only on its own side of the car; elsewhere it is far away.
+    """
+    x, y, z = t.xyz.T
+    abs_y = np.abs(y)
+    doors = shapes.distance_to_polylines(x, z, *_DOORS)
     hood = shapes.distance_to_polylines(
-        x, out, [(0.9, 0.74), (1.5, 0.70), (1.84, 0.58), (1.95, 0.3), (1.97, 0.0)]
+        x, abs_y, [(0.9, 0.74), (1.5, 0.70), (1.84, 0.58), (1.95, 0.3), (1.97, 0.0)]
     )
-    gate = shapes.distance_to_polylines(
-        out, z, [(0.66, 1.2), (0.70, 0.98), (0.62, 0.66), (0.55, 0.58), (0.0, 0.57)]
+    tailgate = shapes.distance_to_polylines(
+        abs_y, z, [(0.66, 1.2), (0.70, 0.98), (0.62, 0.66), (0.55, 0.58), (0.0, 0.57)]
     )
-    # distance to each gap, where it is on this side of the car; far away elsewhere
+    tank_lid = np.abs(np.hypot(x + 1.52, z - 0.80) - 0.075)  # a circle
     gaps = [
-        np.where(
-            (out > 0.6) & (z < 1.02), shapes.distance_to_polylines(x, z, *_DOORS), 9.0
-        ),
-        np.where((x > 0.8) & (z > 0.6), hood, 9.0),
-        np.where(x < -1.7, gate, 9.0),
-        # the tank's lid
-        np.where(
-            (y < -0.6) & (x < -1.0), np.abs(np.hypot(x + 1.52, z - 0.80) - 0.075), 9.0
-        ),
+        np.where((abs_y > 0.6) & (z < 1.02), doors, FAR),
+        np.where((x > 0.8) & (z > 0.6), hood, FAR),
+        np.where(x < -1.7, tailgate, FAR),
+        np.where((y < -0.6) & (x < -1.0), tank_lid, FAR),
     ]
-    fold = np.clip(
-        1.0 - shapes.distance_to_polylines(x, out, [(0.95, 0.5), (1.9, 0.36)]) / 0.05,
-        0.0,
-        1.0,
-    )
-    shaded = mix(color, 0.75 * color, 0.4 * np.where((x > 0.8) & (z > 0.7), fold, 0.0))
-    return mix(
-        shaded, 0.12 * color, 0.9 * step(0.005 - np.min(gaps, axis=0), 0.0, soft=0.011)
-    )
+    return np.asarray(np.min(gaps, axis=0))
 
 
 def _panes(t: Texels) -> Array:
-    """Paint dark glass with the pillar between the doors, and the seats behind the
-    windscreen.
-    """
+    """Paint dark glass, with a pillar between the doors and seats in the windscreen."""
     x, y, z = t.xyz.T
-    color = mix(
-        parse_hex_color("20272b"),
-        parse_hex_color("414d55"),
-        np.clip((z - 0.95) / 0.5, 0.0, 1.0),
-    )
-    out = np.abs(y)
-    seat = np.minimum(
-        np.hypot((out - 0.36) / 0.24, (z - 1.0) / 0.2),
-        np.hypot((out - 0.36) / 0.11, (z - 1.23) / 0.055),
-    )
-    ahead = np.where(x > 0.0, step(1.0 - seat, 0.0, soft=0.15), 0.0)
-    pillar = np.where(out > 0.55, step(0.035 - np.abs(x + 0.25), 0.0, soft=0.01), 0.0)
-    return mix(color, parse_hex_color("0b0c0d"), np.maximum(pillar, ahead))
+    abs_y = np.abs(y)
+    height_fraction = np.clip((z - 0.95) / 0.5, 0.0, 1.0)  # lighter towards the roof
+    glass = mix(parse_hex_color("20272b"), parse_hex_color("414d55"), height_fraction)
+    backrest = np.hypot((abs_y - 0.36) / 0.24, (z - 1.0) / 0.2)
+    headrest = np.hypot((abs_y - 0.36) / 0.11, (z - 1.23) / 0.055)
+    seat = step(1.0 - np.minimum(backrest, headrest), 0.0, soft=0.15)
+    pillar = step(0.035 - np.abs(x + 0.25), 0.0, soft=0.01)
+    dark = np.maximum(np.where(abs_y > 0.55, pillar, 0.0), np.where(x > 0.0, seat, 0.0))
+    return mix(glass, parse_hex_color("0b0c0d"), dark)
 
 
 def _lamps(t: Texels) -> Array:
     """Paint headlights: two bright lamps on each side, with dark rings around them."""
     _, y, z = t.xyz.T
-    out = np.abs(y)
-    lamp = np.minimum(np.hypot(out - 0.58, z - 0.62), np.hypot(out - 0.71, z - 0.64))
-    base = mix(
-        parse_hex_color("9aa4ab"),
-        parse_hex_color("f4f7f8"),
-        step(0.032 - lamp, 0.0, soft=0.01),
+    abs_y = np.abs(y)
+    # from the middle of the nearer lamp
+    lamp_distance = np.minimum(
+        np.hypot(abs_y - 0.58, z - 0.62), np.hypot(abs_y - 0.71, z - 0.64)
     )
-    return mix(
-        base,
-        parse_hex_color("3a4045"),
-        step(0.01 - np.abs(lamp - 0.039), 0.0, soft=0.008),
-    )
+    lamp = step(0.032 - lamp_distance, 0.0, soft=0.01)
+    ring = step(0.01 - np.abs(lamp_distance - 0.039), 0.0, soft=0.008)
+    lit = mix(parse_hex_color("9aa4ab"), parse_hex_color("f4f7f8"), lamp)
+    return mix(lit, parse_hex_color("3a4045"), ring)
 
 
-def _tail(t: Texels) -> Array:
+def _taillights(t: Texels) -> Array:
     """Paint taillights: dark red with a bright stripe."""
-    z = t.xyz[:, 2]
-    return mix(
-        parse_hex_color("8e0d12"),
-        parse_hex_color("d8392f"),
-        step(0.018 - np.abs(z - 0.87), 0.0, soft=0.01),
-    )
+    stripe = step(0.018 - np.abs(t.xyz[:, 2] - 0.87), 0.0, soft=0.01)
+    return mix(parse_hex_color("8e0d12"), parse_hex_color("d8392f"), stripe)
 
 
 def _slats(t: Texels) -> Array:
     """Paint dark trim, with bright slats in the upper grille."""
     x, _, z = t.xyz.T
-    slat = np.where(
-        (x > 1.9) & (z > 0.48),
-        step(0.006 - np.abs((z % 0.034) - 0.017), 0.0, soft=0.006),
-        0.0,
-    )
+    is_upper_grille = (x > 1.9) & (z > 0.48)
+    from_middle = np.abs((z % 0.034) - 0.017)  # slats are 3.4 cm apart
+    slat = np.where(is_upper_grille, step(0.006 - from_middle, 0.0, soft=0.006), 0.0)
     return mix(parse_hex_color("17181a"), parse_hex_color("8b9095"), slat)
 
 
@@ -637,22 +688,19 @@ def _plate(t: Texels, ground: Array) -> Array:
 
     It has eight cells along y, and the fourth one is empty.
     """
-    # from -1 to 1 over the plate, which is painted before it is moved to its place
+    # from -1 to 1 over the plate, which is painted before it is moved to its position
     y = t.xyz[:, 1] / 0.26
     z = t.xyz[:, 2] / 0.056
-    cell = (y + 0.86) / 0.215
-    field = (
-        (np.abs(y) < 0.86)
-        & (np.abs(z) < 0.62)
-        & (np.floor(cell) != 3)
-        & (t.xyz[:, 0] > -1.0)
-    )
+    cell = (y + 0.86) / 0.215  # 8 cells from -0.86 to 0.86
+    is_within_margin = (np.abs(y) < 0.86) & (np.abs(z) < 0.62)
+    is_filled = np.floor(cell) != 3
+    has_strokes = is_within_margin & is_filled & (t.xyz[:, 0] > -1.0)
     # from the middle of a cell: two upright strokes, and two bars between them
-    cell_fraction = np.abs(cell % 1.0 - 0.5)
-    strokes = (np.abs(cell_fraction - 0.27) < 0.09) | (
-        (cell_fraction < 0.3) & (np.abs(np.abs(z) - 0.5) < 0.13)
-    )
-    return mix(ground, parse_hex_color("16181c"), (field & strokes).astype(np.float64))
+    from_middle = np.abs(cell % 1.0 - 0.5)
+    is_upright = np.abs(from_middle - 0.27) < 0.09
+    is_bar = (from_middle < 0.3) & (np.abs(np.abs(z) - 0.5) < 0.13)
+    strokes = has_strokes & (is_upright | is_bar)
+    return mix(ground, parse_hex_color("16181c"), strokes.astype(np.float64))
 
 
 GLASS = assets.Material(roughness=0.04, specular=0.6)
@@ -673,7 +721,7 @@ FINISHES = {
 def car(sampler: ParameterSampler) -> Instance:
     """Make a car of random proportions and paint."""
     color = sampler.sample_color(
-        "2a5fa8", "b3202a", "d9dadb", "2f6f4f", "e0a02c", "3a3f45", wild=0.2
+        "2a5fa8", "b3202a", "d9dadb", "2f6f4f", "e0a02c", "3a3f45", p_random=0.2
     )
     stretch = np.array(
         [
@@ -683,24 +731,29 @@ def car(sampler: ParameterSampler) -> Instance:
         ]
     )
     patches = [*_body_and_cabin(), *_wheels(), *_wells(), *_fittings()]
-    metal = sampler.sample_color("c4c7ca", "8d9094", "2d2f31", wild=0.0)
+    metal = sampler.sample_color("c4c7ca", "8d9094", "2d2f31", p_random=0.0)
     paints: dict[str, Paint] = {
         "paint": _lacquer(color),
         "glass": _panes,
         "headlight": _lamps,
-        "taillight": _tail,
+        "taillight": _taillights,
         "rubber": solid("1c1c1d"),
         "rim": solid(metal),
         "trim": _slats,
-        "plate": _plate(sampler.sample_color("f2f2ec", "f0d264", wild=0.0)),
+        "plate": _plate(sampler.sample_color("f2f2ec", "f0d264", p_random=0.0)),
         "well": solid("0a0a0b"),
     }
-    detail = {"rubber": 0.3, "well": 0.15, "rim": 0.35, "trim": 0.7, "plate": 3.0}
     return Instance(
         shapes.stretch_patches(patches, stretch),
         paints,
         material=FINISHES["paint"],
-        detail=detail,
+        texel_density={
+            "rubber": 0.3,
+            "well": 0.15,
+            "rim": 0.35,
+            "trim": 0.7,
+            "plate": 3.0,
+        },
         finishes=FINISHES,
         drives=True,
     )

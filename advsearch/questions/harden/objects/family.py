@@ -20,6 +20,8 @@ from advsearch.questions.harden.objects.textures import Paint, ParameterSampler,
 
 DEFAULT_ATLAS_SIZE = 256
 """Default width of the atlas in texels."""
+N_BISECTIONS = 12
+"""Steps by which the largest scale of the charts is found."""
 GUTTER = 2
 """Texels around each chart, on every side."""
 DECIMALS = 6
@@ -55,11 +57,10 @@ class _Shelf:
 def _shelves(
     sizes: Sequence[tuple[float, float]], scale: float, side: int
 ) -> list[AtlasRectangle] | None:
-    """Pack rectangles on shelves of a square, the highest first; None if they do not
-    fit.
+    """Pack rectangles on shelves of a square; None if they do not fit.
 
-    A rectangle goes on the lowest shelf that has room for it, or opens a new shelf on
-    top of the others.
+    The highest comes first. A rectangle goes on the lowest shelf that has room for it,
+    or opens a new shelf on top of the others.
 
     Args:
         sizes: (width, height) of each, width >= height, in object units.
@@ -69,38 +70,41 @@ def _shelves(
     Returns:
         The rectangles in the order of `sizes`, with gutters, in texels.
     """
-    cells = [
-        (
-            int(np.ceil(width * scale)) + 2 * GUTTER,
-            int(np.ceil(height * scale)) + 2 * GUTTER,
-        )
-        for width, height in sizes
+    texel_sizes = [
+        (_to_texels(width, scale), _to_texels(height, scale)) for width, height in sizes
     ]
-    # numbers of the cells by height, then width; of equal ones in their order
-    order = sorted(
-        range(len(cells)), key=lambda index: (-cells[index][1], -cells[index][0], index)
+    # by falling height, then width; equal ones stay in their order
+    highest_first = sorted(
+        range(len(sizes)),
+        key=lambda index: (-texel_sizes[index][1], -texel_sizes[index][0], index),
     )
     rectangles: dict[int, AtlasRectangle] = {}
     shelves: list[_Shelf] = []
     top = 0
-    for index in order:
-        width, height = cells[index]
+    for index in highest_first:
+        width, height = texel_sizes[index]
         if width > side:
             return None
+        # Every shelf is high enough, as the highest rectangles come first.
         fitting = [shelf for shelf in shelves if shelf.filled + width <= side]
-        if fitting:  # The highest come first, so it is high enough.
+        if fitting:
             shelf = fitting[0]
-        else:
-            if top + height > side:
-                return None
-            shelf = _Shelf(top, height, 0)
+        elif top + height <= side:
+            shelf = _Shelf(bottom=top, height=height, filled=0)
             shelves.append(shelf)
             top += height
+        else:
+            return None
         rectangles[index] = AtlasRectangle(
             x=shelf.filled, y=shelf.bottom, width=width, height=height, is_rotated=False
         )
         shelf.filled += width
-    return [rectangles[index] for index in range(len(cells))]
+    return [rectangles[index] for index in range(len(sizes))]
+
+
+def _to_texels(length: float, scale: float) -> int:
+    """Return a length in texels, rounded up, with a gutter at both ends."""
+    return int(np.ceil(length * scale)) + 2 * GUTTER
 
 
 def pack_charts(
@@ -114,20 +118,20 @@ def pack_charts(
     Raises:
         ValueError: there are too many charts for their gutters alone.
     """
-    exact = [
+    exact_sizes = [
         (round(width, DECIMALS), round(height, DECIMALS)) for width, height in sizes
     ]
-    wide = [(max(size), min(size)) for size in exact]
-    lower = 0.0
-    upper = side / max(width for width, _ in wide)
-    best = _shelves(wide, lower, side)  # at scale 0 there are gutters only
-    for _ in range(12):
-        scale = (lower + upper) / 2
-        rectangles = _shelves(wide, scale, side)
+    lying_sizes = [(max(size), min(size)) for size in exact_sizes]
+    lower_scale = 0.0  # nothing but gutters
+    upper_scale = side / max(width for width, _ in lying_sizes)
+    best = _shelves(lying_sizes, lower_scale, side)
+    for _ in range(N_BISECTIONS):
+        scale = (lower_scale + upper_scale) / 2
+        rectangles = _shelves(lying_sizes, scale, side)
         if rectangles is None:
-            upper = scale
+            upper_scale = scale
         else:
-            lower = scale
+            lower_scale = scale
             best = rectangles
     if best is None:
         raise ValueError(
@@ -136,7 +140,7 @@ def pack_charts(
         )
     return [
         replace(rectangle, is_rotated=height > width)
-        for rectangle, (width, height) in zip(best, exact, strict=True)
+        for rectangle, (width, height) in zip(best, exact_sizes, strict=True)
     ]
 
 
@@ -159,10 +163,7 @@ def paint_atlas(
     image = np.zeros((side, side, 3))
     is_used = np.zeros((side, side), dtype=bool)
     for patch, rectangle in zip(patches, rectangles, strict=True):
-        # Coordinates of texels in the rectangle, row by row from the bottom.
-        a = np.tile(_texel_centers(rectangle.width), rectangle.height)
-        b = np.repeat(_texel_centers(rectangle.height), rectangle.width)
-        u, v = (b, 1.0 - a) if rectangle.is_rotated else (a, b)
+        u, v = _chart_coordinates(rectangle)
         color = paints[patch.tag](Texels(patch.rest(u, v), u, v, patch.size))
         area = np.s_[
             rectangle.y : rectangle.y + rectangle.height,
@@ -172,11 +173,21 @@ def paint_atlas(
         is_used[area] = True
     # one color everywhere else, and rounded as machines differ in the last bits
     image[~is_used] = np.round(image[is_used].mean(axis=0), 2)
+    top_down = image[::-1]
     # rounded to 4 decimals first, so that all machines round halves to the same level
-    levels = np.clip(np.round(image[::-1] * 255.0, 4) + 0.5, 0.5, 255.5).astype(
-        np.uint8
-    )
+    stable_levels = np.round(top_down * 255.0, 4)
+    # The conversion to integers cuts: with 1/2 added it rounds.
+    levels = np.clip(stable_levels + 0.5, 0.5, 255.5).astype(np.uint8)
     return np.asarray(levels.astype(np.float32) / np.float32(255.0))
+
+
+def _chart_coordinates(rectangle: AtlasRectangle) -> tuple[Array, Array]:
+    """Return u and v (N,) of the texels in a rectangle, row by row from the bottom."""
+    along_x = np.tile(_texel_centers(rectangle.width), rectangle.height)
+    along_y = np.repeat(_texel_centers(rectangle.height), rectangle.width)
+    if rectangle.is_rotated:
+        return along_y, 1.0 - along_x
+    return along_x, along_y
 
 
 def _texel_centers(count: int) -> Array:
@@ -203,22 +214,19 @@ def join_patches(
         side: side of the atlas, in texels.
     """
     first_vertex = np.cumsum([0] + [len(patch.vertices) for patch in patches[:-1]])
+    all_faces = [
+        patch.faces + first for patch, first in zip(patches, first_vertex, strict=True)
+    ]
+    all_uvs = [
+        _atlas_coordinates(patch, rectangle, side)
+        for patch, rectangle in zip(patches, rectangles, strict=True)
+    ]
+    faces = np.concatenate(all_faces)
+    uvs = np.concatenate(all_uvs)
+    normals = np.concatenate([patch.normals for patch in patches])
     vertices = np.concatenate([patch.vertices for patch in patches])
     origin, extent = assets.find_footing(vertices)
     vertices = (vertices - origin) / extent
-    normals = np.concatenate([patch.normals for patch in patches])
-    uvs = np.concatenate(
-        [
-            _atlas_coordinates(patch, rectangle, side)
-            for patch, rectangle in zip(patches, rectangles, strict=True)
-        ]
-    )
-    faces = np.concatenate(
-        [
-            patch.faces + first
-            for patch, first in zip(patches, first_vertex, strict=True)
-        ]
-    )
     # No triangle uses some vertices at poles.
     used = np.unique(faces)
     renumbered_faces = np.searchsorted(used, faces).astype(np.uint32)
@@ -257,8 +265,8 @@ class Instance:
         patches: the surface.
         paints: a paint for every tag of the patches.
         material: the other surface parameters.
-        detail: width of texels by tag, relative to the rest of the object, for parts
-            that are hardly visible.
+        texel_density: texels per length by tag, relative to the rest of the object:
+            less for parts that are hardly visible.
         finishes: materials by tag, of an object of several materials; its tags are then
             names of materials.
         rig: moves the vertices of all patches, in the order of the patches.
@@ -268,7 +276,7 @@ class Instance:
     patches: Sequence[Patch]
     paints: Mapping[str, Paint]
     material: assets.Material
-    detail: Mapping[str, float] = field(default_factory=dict)
+    texel_density: Mapping[str, float] = field(default_factory=dict)
     finishes: Mapping[str, assets.Material] = field(default_factory=dict)
     rig: assets.MeshRig | None = None
     drives: bool = False
@@ -305,11 +313,7 @@ class ObjectFamily:
         if instance.finishes:
             instance = _sort_by_material(instance)
         patches = instance.patches
-        chart_sizes = []
-        for patch in patches:
-            detail = instance.detail.get(patch.tag, 1.0)
-            chart_sizes.append((patch.size[0] * detail, patch.size[1] * detail))
-        rectangles = pack_charts(chart_sizes, self.texels)
+        rectangles = pack_charts(_scale_charts(instance), self.texels)
         mesh = join_patches(patches, rectangles, self.texels)
         surface = None
         if instance.finishes:
@@ -334,8 +338,21 @@ class ObjectFamily:
         )
 
 
+def _scale_charts(instance: Instance) -> list[tuple[float, float]]:
+    """Return the size of each chart, scaled by the texel density of its patch."""
+    sizes = []
+    for patch in instance.patches:
+        density = instance.texel_density.get(patch.tag, 1.0)
+        width, height = patch.size
+        sizes.append((width * density, height * density))
+    return sizes
+
+
 def _sort_by_material(instance: Instance) -> Instance:
-    """Return the instance with the patches of each material after each other."""
+    """Return the instance with its patches sorted by material.
+
+    Materials come in the order in which they are used first.
+    """
     tags = list(dict.fromkeys(patch.tag for patch in instance.patches))
     patches = sorted(instance.patches, key=lambda patch: tags.index(patch.tag))
     return replace(instance, patches=patches)
@@ -355,8 +372,11 @@ def _faces_by_material(patches: Sequence[Patch]) -> dict[str, assets.IntArray]:
 def family(
     metres: float, texels: int = DEFAULT_ATLAS_SIZE
 ) -> Callable[[Callable[[ParameterSampler], Instance]], ObjectFamily]:
-    """Decorate a function that makes instances into a family with the function's
-    name.
+    """Decorate a function that makes instances into a family of the function's name.
+
+    Args:
+        metres: length of the unit of its instances.
+        texels: width of their texture.
     """
     return lambda make: ObjectFamily(
         make.__name__.replace("_", "-"), make, metres, texels
@@ -369,26 +389,26 @@ def sample_material(
     clearcoat: float = 0.0,
     spread: float = 0.2,
 ) -> assets.Material:
-    """Sample a material: its roughness, sometimes another clearcoat, and rarely a
-        metal.
+    """Sample a material: its roughness, seldom its clearcoat, and rarely a metal.
 
     Args:
         sampler: samples it; the canonical instance has the values that are passed.
         roughness: canonical value.
-        clearcoat: canonical value.
+        clearcoat: canonical value, which most others have, too.
         spread: how far the roughness may be from its canonical value.
     """
     sampled_roughness = sampler(
         roughness, low=roughness - spread, high=roughness + spread
     )
-    sampled_clearcoat = (
-        sampler(clearcoat, low=0.0, high=1.0) if sampler.chance(0.3) else clearcoat
-    )
-    metallic = sampler(0.0, low=0.3, high=0.8) if sampler.chance(0.06) else 0.0
+    if sampler.chance(0.3):
+        clearcoat = sampler(clearcoat, low=0.0, high=1.0)
+    metallic = 0.0
+    if sampler.chance(0.06):
+        metallic = sampler(0.0, low=0.3, high=0.8)
     values = {
         "roughness": min(max(sampled_roughness, 0.12), 0.95),
         "metallic": metallic,
         "specular": sampler(0.5, low=0.3, high=0.7),
-        "clearcoat": sampled_clearcoat,
+        "clearcoat": clearcoat,
     }
     return assets.Material(**{name: round(value, 4) for name, value in values.items()})

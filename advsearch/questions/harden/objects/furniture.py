@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,33 +30,48 @@ from advsearch.questions.harden.objects.textures import (
 )
 
 Point = tuple[float, float, float]
+LEG_INSET = 0.4
+"""Distance from a leg's outside to the edge of the seat."""
+
+
+class _Legs(NamedTuple):
+    """The legs of a chair; posts of its back continue the two at -x upwards.
+
+    Attributes:
+        x, y: position of the top of the leg at +x and +y; the others mirror it.
+        splay: by how much a foot lies farther out than its top, along x and y.
+        radius: radius at the top.
+        foot_radius: radius at the floor.
+        section: (M, 2), for a radius of 1.
+    """
+
+    x: float
+    y: float
+    splay: float
+    radius: float
+    foot_radius: float
+    section: Array
 
 
 def _post(
-    tag: str, low: Point, high: Point, section: Array, ends: tuple[float, float]
+    tag: str, low: Point, high: Point, section: Array, radii: tuple[float, float]
 ) -> list[Patch]:
     """Create a straight post between two points, with slightly beveled ends.
 
     Args:
         tag: tag of its paint.
-        low, high: its ends.
+        low, high: its end points.
         section: (M, 2), for a radius of 1.
-        ends: radii at `low` and at `high`; the radius changes evenly between them.
+        radii: radii at `low` and at `high`; the radius changes evenly between them.
     """
-    t = np.array([0.0, 0.02, 0.5, 0.98, 1.0])
+    t = np.array([0.0, 0.02, 0.5, 0.98, 1.0])  # from `low` to `high`
     path = np.array(low) + t[:, None] * (np.array(high) - np.array(low))
-    # the first and last ring are smaller: the bevel
-    scale = (ends[0] + (ends[1] - ends[0]) * t) * np.array([0.9, 1.0, 1.0, 1.0, 0.9])
-    # the section's first axis must not be along the post
+    bevel = np.array([0.9, 1.0, 1.0, 1.0, 0.9])  # the first and last ring are smaller
+    scale = (radii[0] + (radii[1] - radii[0]) * t) * bevel
+    # `sweep` needs a first axis of the section that is not along the post
     is_lying = abs(high[0] - low[0]) > abs(high[2] - low[2])
-    return shapes.sweep(
-        tag,
-        path,
-        section,
-        scale,
-        first=(0.0, 0.0, 1.0) if is_lying else (1.0, 0.0, 0.0),
-        caps=True,
-    )
+    first_axis = (0.0, 0.0, 1.0) if is_lying else (1.0, 0.0, 0.0)
+    return shapes.sweep(tag, path, section, scale, first=first_axis, caps=True)
 
 
 @family(metres=0.01)
@@ -70,56 +86,19 @@ def chair(sampler: ParameterSampler) -> Instance:
     splay = sampler(1.5, low=0.0, high=6.0)
     lean = sampler(5.0, low=1.0, high=11.0)
     section = _leg_section(sampler)
-    taper = (leg_radius * sampler(0.75, low=0.55, high=1.0), leg_radius)
-    x = depth / 2 - leg_radius - 0.4
-    y = width / 2 - leg_radius - 0.4
-    patches: list[Patch] = []
-    patches += _chair_legs(
-        x=x,
+    legs = _Legs(
+        x=depth / 2 - leg_radius - LEG_INSET,
+        y=width / 2 - leg_radius - LEG_INSET,
         splay=splay,
-        y=y,
-        seat_height=seat_height,
-        seat_thickness=seat_thickness,
+        radius=leg_radius,
+        foot_radius=leg_radius * sampler(0.75, low=0.55, high=1.0),
         section=section,
-        taper=taper,
     )
-    patches += shapes.box(
-        "seat",
-        (0.0, 0.0, seat_height - seat_thickness / 2),
-        (depth, width, seat_thickness),
-        bevel=0.45 * seat_thickness,
-        steps=3,
-        cells=2,
-    )
-    if sampler.chance(0.35):
-        patches += shapes.box(
-            "cushion",
-            (0.5, 0.0, seat_height + 1.4),
-            (depth - 4.0, width - 4.0, 4.4),
-            bevel=2.1,
-            steps=3,
-            cells=2,
-        )
+    patches = _chair_legs(legs, seat_height - seat_thickness)
+    patches += _chair_seat(sampler, (depth, width, seat_thickness), seat_height)
     if sampler.chance(0.55, canonical=True):
-        patches += _chair_rungs(
-            sampler,
-            seat_height=seat_height,
-            splay=splay,
-            x=x,
-            y=y,
-            leg_radius=leg_radius,
-            section=section,
-        )
-    patches += _chair_back(
-        sampler,
-        x=x,
-        y=y,
-        seat_height=seat_height,
-        total_height=total_height,
-        lean=lean,
-        leg_radius=leg_radius,
-        section=section,
-    )
+        patches += _chair_rungs(sampler, legs, seat_height)
+    patches += _chair_back(sampler, legs, seat_height, total_height, lean)
     rotated = shapes.transform_patches(
         patches, shapes.rotation("z", sampler(8.0, low=-25.0, high=25.0))
     )
@@ -132,81 +111,84 @@ def chair(sampler: ParameterSampler) -> Instance:
 
 def _leg_section(sampler: ParameterSampler) -> Array:
     """Sample the section (M, 2) of the legs of a chair: square or round."""
-    square = sampler.chance(0.5, canonical=True)
-    return (
-        shapes.rectangle(2.0, 2.0, bevel=0.5, steps=2)
-        if square
-        else shapes.ellipse(1.0, 1.0, count=16)
-    )
+    if sampler.chance(0.5, canonical=True):
+        return shapes.rectangle(2.0, 2.0, bevel=0.5, steps=2)
+    return shapes.ellipse(1.0, 1.0, count=16)
 
 
-def _chair_legs(
-    x: float,
-    splay: float,
-    y: float,
-    seat_height: float,
-    seat_thickness: float,
-    section: Array,
-    taper: tuple[float, float],
-) -> list[Patch]:
+def _chair_legs(legs: _Legs, seat_bottom: float) -> list[Patch]:
     """Create the four legs of a chair, which stand wider apart at the floor.
 
     Args:
-        x, y: x and y of the top of the leg at +x and +y; the others mirror it.
-        splay: by how much a foot lies farther out than its top, along x and y.
-        seat_height: seat height of the upper side of the seat.
-        seat_thickness: seat thickness of the seat.
-        section: (M, 2), for a radius of 1.
-        taper: radii at the floor and at the top.
+        legs: their position and size.
+        seat_bottom: height of the lower side of the seat.
     """
+    top_z = seat_bottom + 0.5  # inside the seat, so that no gap shows
     patches = list[Patch]()
     for sign_x, sign_y in product((-1.0, 1.0), repeat=2):
-        foot = (sign_x * (x + splay), sign_y * (y + splay), 0.0)
-        patches += _post(
-            "up",
-            foot,
-            (sign_x * x, sign_y * y, seat_height - seat_thickness + 0.5),
-            section,
-            taper,
+        foot = (sign_x * (legs.x + legs.splay), sign_y * (legs.y + legs.splay), 0.0)
+        top = (sign_x * legs.x, sign_y * legs.y, top_z)
+        radii = (legs.foot_radius, legs.radius)
+        patches += _post("up", foot, top, legs.section, radii)
+    return patches
+
+
+def _chair_seat(
+    sampler: ParameterSampler, size: Point, seat_height: float
+) -> list[Patch]:
+    """Create the seat of a chair, sometimes with a cushion on it.
+
+    Args:
+        sampler: decides whether there is a cushion.
+        size: extent of the seat along x, y and z.
+        seat_height: height of its upper side.
+    """
+    depth, width, thickness = size
+    patches = shapes.box(
+        "seat",
+        (0.0, 0.0, seat_height - thickness / 2),
+        size,
+        bevel=0.45 * thickness,
+        steps=3,
+        cells=2,
+    )
+    if sampler.chance(0.35):
+        patches += shapes.box(
+            "cushion",
+            (0.5, 0.0, seat_height + 1.4),
+            (depth - 4.0, width - 4.0, 4.4),
+            bevel=2.1,
+            steps=3,
+            cells=2,
         )
     return patches
 
 
 def _chair_rungs(
-    sampler: ParameterSampler,
-    seat_height: float,
-    splay: float,
-    x: float,
-    y: float,
-    leg_radius: float,
-    section: Array,
+    sampler: ParameterSampler, legs: _Legs, seat_height: float
 ) -> list[Patch]:
     """Create the rungs of a chair: one along each side, and one across between them.
 
     Args:
         sampler: samples their height.
-        seat_height: seat height of the upper side of the seat.
-        splay, x, y, section: as in `_chair_legs`.
-        leg_radius: leg radius of the legs; rungs are thinner.
+        legs: the legs that they connect.
+        seat_height: height of the upper side of the seat.
     """
+    z = seat_height * sampler(0.36, low=0.25, high=0.6)
+    # how far out the splayed legs are at that height
+    spread = legs.splay * (1.0 - z / seat_height)
+    x = legs.x + spread
+    y = legs.y + spread
+    side_radii = (0.55 * legs.radius, 0.55 * legs.radius)
+    cross_radii = (0.5 * legs.radius, 0.5 * legs.radius)
     patches = list[Patch]()
-    low = seat_height * sampler(0.36, low=0.25, high=0.6)
-    # how far out the legs are at that height
-    spread = splay * (1.0 - low / seat_height)
-    front_x = x + spread
-    side_y = y + spread
-    thin = (0.55 * leg_radius, 0.55 * leg_radius)
-    thinner = (0.5 * leg_radius, 0.5 * leg_radius)
-    for sign_y in (-1.0, 1.0):
+    for side_y in (-1.0 * y, 1.0 * y):
         patches += _post(
-            "along",
-            (-front_x, sign_y * side_y, low),
-            (front_x, sign_y * side_y, low),
-            section,
-            thin,
+            "along", (-x, side_y, z), (x, side_y, z), legs.section, side_radii
         )
-    patches += _post("cross", (0.0, -side_y, low), (0.0, side_y, low), section, thinner)
-    return patches
+    return patches + _post(
+        "cross", (0.0, -y, z), (0.0, y, z), legs.section, cross_radii
+    )
 
 
 def _chair_paints(sampler: ParameterSampler, total_height: float) -> dict[str, Paint]:
@@ -217,52 +199,98 @@ def _chair_paints(sampler: ParameterSampler, total_height: float) -> dict[str, P
 
     Args:
         sampler: samples the paints.
-        total_height: total height of the chair.
+        total_height: height of the chair.
     """
     offset = sampler.offset()
     timber = sampler.sample_color(
-        "a86f3d", "c79a63", "6b4226", "3a2418", "d8bc92", wild=0.0
+        "a86f3d", "c79a63", "6b4226", "3a2418", "d8bc92", p_random=0.0
     )
     paint_color = sampler.sample_color(
         "f0ede4", "2f5d7c", "b5442e", "3d6b4a", "22262b", "e0b040"
     )
-    painted = sampler.chance(0.4)
-    wood_paint = paint_or_random(sampler, total_height, solid(paint_color), wild=0.5)
-
-    def grain(axis: int) -> Paint:
-        """Return the paint of a part whose grain, if any, runs along an axis."""
-        return (
-            wood_paint
-            if painted
-            else wood(timber, scale=3.2, offset=offset, axis=axis, contrast=0.36)
-        )
-
-    fabric = sampler.sample_color("8a2f2a", "2f4f6f", "566b3f", "c9b48a", "4a4a4f")
-    cover = sampler.pick(
-        clouded(fabric, factor=0.8, scale=1.5, offset=offset),
-        stripes(fabric, shade(fabric, 1.5), cell=6.0),
-        checks(fabric, parse_hex_color("efe6d4"), cell=4.0),
-        dots(solid(fabric), parse_hex_color("f4efe4"), cell=6.0),
+    is_painted = sampler.chance(0.4)
+    wood_paint = paint_or_random(
+        sampler, total_height, solid(paint_color), p_random=0.5
     )
-    seat_paint = cover if sampler.chance(0.25) else grain(0)
+
+    def wood_along(axis: int) -> Paint:
+        """Return the paint of a wooden part whose grain, if seen, is along an axis."""
+        if is_painted:
+            return wood_paint
+        return wood(timber, scale=3.2, offset=offset, axis=axis, contrast=0.36)
+
+    fabric_color = sampler.sample_color(
+        "8a2f2a", "2f4f6f", "566b3f", "c9b48a", "4a4a4f"
+    )
+    fabric = sampler.pick(
+        clouded(fabric_color, factor=0.8, scale=1.5, offset=offset),
+        stripes(fabric_color, shade(fabric_color, 1.5), cell=6.0),
+        checks(fabric_color, parse_hex_color("efe6d4"), cell=4.0),
+        dots(solid(fabric_color), parse_hex_color("f4efe4"), cell=6.0),
+    )
+    seat_paint = fabric if sampler.chance(0.25) else wood_along(0)
     return {
-        "up": grain(2),
-        "along": grain(0),
-        "cross": grain(1),
+        "up": wood_along(2),
+        "along": wood_along(0),
+        "cross": wood_along(1),
         "seat": seat_paint,
-        "cushion": cover,
+        "cushion": fabric,
     }
+
+
+class _ChairBack(NamedTuple):
+    """The leaning plane between the posts of a chair's back.
+
+    Attributes:
+        bottom, top: heights of the seat, and of the top of the back.
+        bottom_x: x at the height of the seat.
+        lean: by how much the top lies farther back (towards -x) than that.
+        width: width between the posts.
+        board_thickness: thickness of the boards in it.
+    """
+
+    bottom: float
+    top: float
+    bottom_x: float
+    lean: float
+    width: float
+    board_thickness: float
+
+    @property
+    def height(self) -> float:
+        """The height of the back above the seat."""
+        return self.top - self.bottom
+
+    def x_at(self, z: float) -> float:
+        """Return the x of the plane at a height."""
+        return self.bottom_x - self.lean * (z - self.bottom) / (self.top - self.bottom)
+
+    def make_board(
+        self, tag: str, z: float, width: float, height: float, y: float = 0.0
+    ) -> list[Patch]:
+        """Create a board that leans with the back.
+
+        Args:
+            tag: tag of its paint.
+            z, y: height and y of its middle.
+            width, height: its size.
+        """
+        tilt = -float(np.degrees(np.arctan2(self.lean, self.height)))
+        return shapes.transform_patches(
+            shapes.box(
+                tag, (0.0, 0.0, 0.0), (self.board_thickness, width, height), bevel=0.5
+            ),
+            shapes.rotation("y", tilt),
+            (self.x_at(z), y, z),
+        )
 
 
 def _chair_back(
     sampler: ParameterSampler,
-    x: float,
-    y: float,
+    legs: _Legs,
     seat_height: float,
     total_height: float,
     lean: float,
-    leg_radius: float,
-    section: Array,
 ) -> list[Patch]:
     """Create the back of a chair: two posts, and what is between them.
 
@@ -271,118 +299,118 @@ def _chair_back(
 
     Args:
         sampler: samples the kind and its proportions.
-        x, y: x and y of the tops of the legs, which the posts continue upwards.
-        seat_height: seat height of the upper side of the seat.
-        total_height: total height of the top of the back.
+        legs: legs that the posts continue upwards.
+        seat_height: height of the upper side of the seat.
+        total_height: height of the top of the back.
         lean: by how much the top lies farther back than the seat.
-        leg_radius: radius of the posts, at their lower end.
-        section: (M, 2) of the posts, for a radius of 1.
     """
     style = sampler.pick("slats", "ladder", "panel", "arch")
-    patches: list[Patch] = []
-    foot = seat_height - 2.0  # inside the seat
-
-    def back_x(z: float) -> float:
-        """Return the x of the leaning back at a height."""
-        return -x - lean * (z - seat_height) / (total_height - seat_height)
-
-    for sign_y in (-1.0, 1.0):
-        patches += _post(
-            "up",
-            (back_x(foot), sign_y * y, foot),
-            (back_x(total_height), sign_y * y, total_height),
-            section,
-            (leg_radius, 0.85 * leg_radius),
-        )
-    tilt = shapes.rotation(
-        "y", -float(np.degrees(np.arctan2(lean, total_height - seat_height)))
+    back = _ChairBack(
+        bottom=seat_height,
+        top=total_height,
+        bottom_x=-legs.x,
+        lean=lean,
+        width=2 * (legs.y - 0.3 * legs.radius),
+        board_thickness=sampler(1.6, low=1.2, high=2.4),
     )
-    depth = sampler(1.6, low=1.2, high=2.4)
-
-    def slat(
-        tag: str, z: float, width: float, height: float, center_y: float = 0.0
-    ) -> list[Patch]:
-        """Create a board of the back, which leans with it.
-
-        Args:
-            tag: tag of its paint.
-            z: height of its middle.
-            width, height: width and height of the board.
-            center_y: y of its middle.
-        """
-        return shapes.transform_patches(
-            shapes.box(tag, (0.0, 0.0, 0.0), (depth, width, height), bevel=0.5),
-            tilt,
-            (back_x(z), center_y, z),
-        )
-
-    inner_width = 2 * (y - 0.3 * leg_radius)
-    back_height = total_height - seat_height
+    patches = _back_posts(back, legs)
     if style in ("slats", "arch"):
-        patches += slat(
-            "cross", total_height - 0.09 * back_height, inner_width, 0.14 * back_height
+        return patches + _slatted_back(sampler, back, has_lower_rail=style == "slats")
+    if style == "ladder":
+        return patches + _ladder_back(sampler, back)
+    return patches + _panel_back(sampler, back)
+
+
+def _back_posts(back: _ChairBack, legs: _Legs) -> list[Patch]:
+    """Create the two posts of a chair's back, which begin inside the seat."""
+    low_z = back.bottom - 2.0
+    radii = (legs.radius, 0.85 * legs.radius)
+    patches = list[Patch]()
+    for y in (-1.0 * legs.y, 1.0 * legs.y):
+        low = (back.x_at(low_z), y, low_z)
+        high = (back.x_at(back.top), y, back.top)
+        patches += _post("up", low, high, legs.section, radii)
+    return patches
+
+
+def _slatted_back(
+    sampler: ParameterSampler, back: _ChairBack, *, has_lower_rail: bool
+) -> list[Patch]:
+    """Create vertical slats below a rail; without a lower rail they reach the seat."""
+    patches = back.make_board(
+        "cross", back.top - 0.09 * back.height, back.width, 0.14 * back.height
+    )
+    low = back.bottom - 1.0
+    if has_lower_rail:
+        low = back.bottom + 0.22 * back.height
+        patches += back.make_board(
+            "cross", back.bottom + 0.2 * back.height, back.width, 0.09 * back.height
         )
-        if style == "slats":
-            patches += slat(
-                "cross",
-                seat_height + 0.2 * back_height,
-                inner_width,
-                0.09 * back_height,
-            )
-        count = int(sampler.pick(5, 3, 4, 6))
-        low = (
-            seat_height + 0.22 * back_height if style == "slats" else seat_height - 1.0
-        )
-        for i in range(count):
-            top = total_height - 0.15 * back_height
-            patches += slat(
-                "up",
-                (low + top) / 2,
-                inner_width * sampler(0.075, low=0.05, high=0.11),
-                top - low + 1.0,
-                inner_width * ((i + 1) / (count + 1) - 0.5),
-            )
-    elif style == "ladder":
-        count = int(sampler.pick(3, 2, 4))
-        for i in range(count):
-            z = seat_height + back_height * (0.28 + 0.66 * i / max(1, count - 1))
-            patches += slat(
-                "cross", z, inner_width, back_height * sampler(0.15, low=0.1, high=0.2)
-            )
-    else:
-        tall = sampler(0.6, low=0.35, high=0.75) * back_height
-        patches += slat(
-            "cushion" if sampler.chance(0.3) else "up",
-            total_height - tall / 2 - 0.04 * back_height,
-            inner_width,
-            tall,
+    high = back.top - 0.15 * back.height
+    n_slats = int(sampler.pick(5, 3, 4, 6))
+    for i in range(n_slats):
+        patches += back.make_board(
+            "up",
+            (low + high) / 2,
+            back.width * sampler(0.075, low=0.05, high=0.11),
+            high - low + 1.0,
+            y=back.width * ((i + 1) / (n_slats + 1) - 0.5),
         )
     return patches
 
 
-def _shade(
-    sampler: ParameterSampler,
-    low: float,
-    high: float,
-    bottom_radius: float,
-    top_radius: float,
-) -> list[Patch]:
+def _ladder_back(sampler: ParameterSampler, back: _ChairBack) -> list[Patch]:
+    """Create two to four horizontal bars, evenly spaced up to the top."""
+    patches = list[Patch]()
+    n_bars = int(sampler.pick(3, 2, 4))
+    for i in range(n_bars):
+        z = back.bottom + back.height * (0.28 + 0.66 * i / max(1, n_bars - 1))
+        height = back.height * sampler(0.15, low=0.1, high=0.2)
+        patches += back.make_board("cross", z, back.width, height)
+    return patches
+
+
+def _panel_back(sampler: ParameterSampler, back: _ChairBack) -> list[Patch]:
+    """Create a single board, sometimes with the fabric of a cushion."""
+    height = sampler(0.6, low=0.35, high=0.75) * back.height
+    tag = "cushion" if sampler.chance(0.3) else "up"
+    z = back.top - height / 2 - 0.04 * back.height
+    return back.make_board(tag, z, back.width, height)
+
+
+class _ShadeSize(NamedTuple):
+    """The size of a lampshade.
+
+    Attributes:
+        bottom, top: heights of its edges.
+        height: height from edge to edge.
+        bottom_radius, top_radius: radii of its edges.
+    """
+
+    bottom: float
+    top: float
+    height: float
+    bottom_radius: float
+    top_radius: float
+
+
+def _shade(sampler: ParameterSampler, size: _ShadeSize) -> list[Patch]:
     """Create an open lampshade with a thin wall.
 
     Its profile is one closed loop: up the outside, over the rim, down the lining.
 
     Args:
         sampler: samples how much it bulges.
-        low, high: heights of its edges.
-        bottom_radius, top_radius: bottom radius and top radius of its edges.
+        size: the size of the shade.
     """
-    wall = 0.25
-    belly = sampler(0.0, low=-0.1, high=0.12) * bottom_radius
+    wall = 0.25  # thickness
+    bulge = sampler(0.0, low=-0.1, high=0.12) * size.bottom_radius
+    middle_radius = (size.bottom_radius + size.top_radius) / 2 + bulge
     outer = shapes.spline(
         [
-            (bottom_radius, low),
-            ((bottom_radius + top_radius) / 2 + belly, (low + high) / 2),
-            (top_radius, high),
+            (size.bottom_radius, size.bottom),
+            (middle_radius, (size.bottom + size.top) / 2),
+            (size.top_radius, size.top),
         ],
         count=14,
     )
@@ -397,7 +425,11 @@ def _shade(
 
 
 def _lamp_base(
-    sampler: ParameterSampler, style: str, low: float, radius: float, stem_radius: float
+    sampler: ParameterSampler,
+    style: str,
+    height: float,
+    foot_radius: float,
+    stem_radius: float,
 ) -> list[Patch]:
     """Create the base of a lamp, from the table to the bulb.
 
@@ -405,54 +437,80 @@ def _lamp_base(
         sampler: samples its proportions.
         style: "disc" (a flat foot with a thin stem), "body" or "gourd" (a body with a
             waist).
-        low: height of its top.
-        radius: radius of the foot.
-        stem_radius: stem radius of the top.
+        height: height of its top.
+        foot_radius: radius of the foot.
+        stem_radius: radius of the flat top.
     """
-    # profiles of points (r, z): the lower side, and the flat top
-    under = [(0.0, 0.0), (radius - 0.4, 0.0)]
-    top = [(stem_radius, low), (0.0, low)]
     if style == "disc":
-        thick = sampler(2.0, low=1.2, high=3.2)
-        corners = [
-            under[-1],
-            (radius, 0.4),
-            (radius * 0.96, thick),
-            (stem_radius * 2.0, thick * 1.4),
-            (stem_radius, thick * 2.2),
-            top[0],
-        ]
-        side = shapes.subdivide(
-            shapes.round_corners(corners, radius=[0.3, 0.5, 1.0, 1.2], steps=5),
-            longest=1.6,
-        )
-        return shapes.lathe(
-            [("base", under), ("base", side), ("base", top)], columns=44
-        )
-    belly = radius * sampler(1.12, low=0.95, high=1.4)
-    belly_height = sampler(0.38, low=0.28, high=0.6) * low  # height of the belly
-    waist = [(0.45 * belly, 0.72 * low)]
-    if style == "gourd":
-        waist = [(0.55 * belly, 0.6 * low), (0.72 * belly, 0.73 * low)]
-    knots = [
-        (radius * 0.96, 1.2),
-        (radius * 0.8, 2.4),
-        (belly, belly_height),
-        *waist,
-        (stem_radius * 1.5, 0.86 * low),
-        (stem_radius, 0.93 * low),
-    ]
-    body = shapes.spline(knots, count=34)
-    ring = shapes.round_corners(
-        [under[-1], (radius, 0.2), (radius, 1.2), knots[0]], radius=[0.15, 0.3], steps=3
+        return _disc_base(sampler, height, foot_radius, stem_radius)
+    return _body_base(
+        sampler, height, foot_radius, stem_radius, has_waist=style == "gourd"
     )
-    neck = [knots[-1], top[0]]
+
+
+def _disc_base(
+    sampler: ParameterSampler, height: float, foot_radius: float, stem_radius: float
+) -> list[Patch]:
+    """Create a flat foot with a thin stem; see `_lamp_base`."""
+    thickness = sampler(2.0, low=1.2, high=3.2)
+    # profiles of points (r, z)
+    under = [(0.0, 0.0), (foot_radius - 0.4, 0.0)]
+    top = [(stem_radius, height), (0.0, height)]
+    corners = [
+        under[-1],
+        (foot_radius, 0.4),
+        (foot_radius * 0.96, thickness),
+        (stem_radius * 2.0, thickness * 1.4),
+        (stem_radius, thickness * 2.2),
+        top[0],
+    ]
+    side = shapes.round_corners(corners, radius=[0.3, 0.5, 1.0, 1.2], steps=5)
     return shapes.lathe(
         [
             ("base", under),
-            ("foot", ring),
-            ("body", body),
-            ("base", neck),
+            ("base", shapes.subdivide(side, longest=1.6)),
+            ("base", top),
+        ],
+        columns=44,
+    )
+
+
+def _body_base(
+    sampler: ParameterSampler,
+    height: float,
+    foot_radius: float,
+    stem_radius: float,
+    *,
+    has_waist: bool,
+) -> list[Patch]:
+    """Create a body on a foot ring; see `_lamp_base`."""
+    belly = foot_radius * sampler(1.12, low=0.95, high=1.4)
+    belly_height = sampler(0.38, low=0.28, high=0.6) * height
+    above_belly = [(0.45 * belly, 0.72 * height)]
+    if has_waist:
+        above_belly = [(0.55 * belly, 0.6 * height), (0.72 * belly, 0.73 * height)]
+    # profiles of points (r, z)
+    under = [(0.0, 0.0), (foot_radius - 0.4, 0.0)]
+    top = [(stem_radius, height), (0.0, height)]
+    knots = [
+        (foot_radius * 0.96, 1.2),
+        (foot_radius * 0.8, 2.4),
+        (belly, belly_height),
+        *above_belly,
+        (stem_radius * 1.5, 0.86 * height),
+        (stem_radius, 0.93 * height),
+    ]
+    foot_ring = shapes.round_corners(
+        [under[-1], (foot_radius, 0.2), (foot_radius, 1.2), knots[0]],
+        radius=[0.15, 0.3],
+        steps=3,
+    )
+    return shapes.lathe(
+        [
+            ("base", under),
+            ("foot", foot_ring),
+            ("body", shapes.spline(knots, count=34)),
+            ("base", [knots[-1], top[0]]),
             ("base", top),
         ],
         columns=44,
@@ -463,46 +521,44 @@ def _shade_paint(
     sampler: ParameterSampler,
     linen: Color,
     offset: Array,
-    low: float,
-    total_height: float,
+    bottom: float,
+    top: float,
 ) -> Paint:
-    """Sample the paint of a lamp's shade.
+    """Sample the paint of a lamp's shade: its cloth, patterned or with colored edges.
 
     Args:
         sampler: samples the pattern and the color of its second part.
         linen: color of the cloth.
         offset: (3,) into the noise.
-        low, total_height: heights of the shade's lower and upper edge.
+        bottom, top: heights of the shade's edges.
     """
-    weave = clouded(linen, factor=0.93, scale=1.2, offset=offset)
-    kind = sampler.pick("plain", "band", "stripes", "dots", "rings", "gradient")
+    cloth = clouded(linen, factor=0.93, scale=1.2, offset=offset)
+    pattern = sampler.pick("plain", "band", "stripes", "dots", "rings", "gradient")
     accent = sampler.sample_color("b08d3c", "7a1f2b", "23395d", "efe6cf")
-    if kind == "band":
-        for band in (
-            between(0.0, low + 1.4),
-            between(total_height - 1.4, 2 * total_height),
-        ):
-            weave = over(weave, band, solid(accent))
-    elif kind == "stripes":
-        weave = stripes(
+
+    def with_edges(color: Color, width: float) -> Paint:
+        """Return the cloth with both edges of a color, `width` wide."""
+        lower_edge = over(cloth, between(0.0, bottom + width), solid(color))
+        return over(lower_edge, between(top - width, 2 * top), solid(color))
+
+    if pattern == "plain":
+        paint = with_edges(shade(linen, 0.75), 0.5)  # hems
+    elif pattern == "band":
+        paint = with_edges(accent, 1.4)
+    elif pattern == "stripes":
+        paint = stripes(
             linen,
             accent,
             cell=sampler(5.0, low=3.0, high=9.0),
-            share=sampler(0.4, low=0.2, high=0.6),
+            fraction=sampler(0.4, low=0.2, high=0.6),
         )
-    elif kind == "dots":
-        weave = dots(weave, accent, cell=sampler(6.0, low=4.0, high=9.0))
-    elif kind == "rings":
-        weave = rings(linen, accent, period=sampler(6.0, low=3.0, high=10.0))
-    elif kind == "gradient":
-        weave = gradient(linen, shade(linen, 0.6), low=low, high=total_height)
+    elif pattern == "dots":
+        paint = dots(cloth, accent, cell=sampler(6.0, low=4.0, high=9.0))
+    elif pattern == "rings":
+        paint = rings(linen, accent, period=sampler(6.0, low=3.0, high=10.0))
     else:
-        for hem in (
-            between(0.0, low + 0.5),
-            between(total_height - 0.5, 2 * total_height),
-        ):
-            weave = over(weave, hem, solid(shade(linen, 0.75)))
-    return paint_or_random(sampler, total_height, weave, wild=0.3)
+        paint = gradient(linen, shade(linen, 0.6), low=bottom, high=top)
+    return paint_or_random(sampler, top, paint, p_random=0.3)
 
 
 @family(metres=0.01)
@@ -512,80 +568,63 @@ def lamp(sampler: ParameterSampler) -> Instance:
     shade_height = sampler(20.0, low=14.0, high=24.0)
     bottom_radius = sampler(16.5, low=12.0, high=19.0)
     top_radius = bottom_radius * sampler(0.6, low=0.35, high=1.0)
-    low = total_height - shade_height
-    radius = sampler(7.4, low=6.0, high=9.5)
-    stem_radius = sampler(0.8, low=0.6, high=1.3)
-    style = sampler.pick("body", "disc", "gourd")
-    base = _lamp_base(
-        sampler,
-        style=style,
-        low=low + 0.25 * shade_height,
-        radius=radius,
-        stem_radius=stem_radius,
-    )
-    patches = base + _shade(
-        sampler,
-        low=low,
-        high=total_height,
+    size = _ShadeSize(
+        bottom=total_height - shade_height,
+        top=total_height,
+        height=shade_height,
         bottom_radius=bottom_radius,
         top_radius=top_radius,
     )
+    foot_radius = sampler(7.4, low=6.0, high=9.5)
+    stem_radius = sampler(0.8, low=0.6, high=1.3)
+    style = sampler.pick("body", "disc", "gourd")
+    # The base reaches into the shade, to just under the bulb.
+    base_height = size.bottom + 0.25 * shade_height
+    patches = _lamp_base(sampler, style, base_height, foot_radius, stem_radius)
+    patches += _shade(sampler, size)
     patches += shapes.sphere(
         "bulb",
         min(3.0, 0.4 * top_radius),
-        centre=(0.0, 0.0, low + 0.42 * shade_height),
+        center=(0.0, 0.0, size.bottom + 0.42 * shade_height),
         rows=12,
         columns=20,
     )
-    patches += _lamp_frame(
-        total_height=total_height,
-        shade_height=shade_height,
-        top_radius=top_radius,
-        bottom_radius=bottom_radius,
-        low=low,
-    )
-    paints = _lamp_paints(sampler, low, total_height, style)
+    patches += _lamp_frame(size)
     return Instance(
         patches,
-        paints,
+        _lamp_paints(sampler, size.bottom, total_height, style),
         sample_material(sampler, roughness=0.4, clearcoat=0.3),
-        detail={"lining": 0.6},
+        texel_density={"lining": 0.6},
     )
 
 
-def _lamp_frame(
-    total_height: float,
-    shade_height: float,
-    top_radius: float,
-    bottom_radius: float,
-    low: float,
-) -> list[Patch]:
+def _lamp_frame(size: _ShadeSize) -> list[Patch]:
     """Create the rod of a lamp and the three spokes that hold its shade.
 
     Args:
-        total_height: total height of the lamp, which is the upper edge of the shade.
-        shade_height, top_radius, bottom_radius: shade height, top radius and bottom
-            radius of the shade.
-        low: height of the shade's lower edge.
+        size: the size of the shade.
     """
     patches = list[Patch]()
-    ring_z = total_height - 0.12 * shade_height
-    # radius of the shade there
-    inside = top_radius + (bottom_radius - top_radius) * 0.12
+    # The spokes are 12 % below the upper edge of the shade, and end at its wall.
+    spoke_z = size.top - 0.12 * size.height
+    spoke_length = size.top_radius + (size.bottom_radius - size.top_radius) * 0.12
     for angle in (20.0, 140.0, 260.0):
         spoke = shapes.sweep(
             "base",
-            [(0.0, 0.0, ring_z), (inside, 0.0, ring_z)],
+            [(0.0, 0.0, spoke_z), (spoke_length, 0.0, spoke_z)],
             shapes.ellipse(0.22, 0.22, count=8),
         )
         patches += shapes.transform_patches(spoke, shapes.rotation("z", angle))
-    rod = [
-        (0, 0, z)
-        for z in (low + 0.2 * shade_height, ring_z, ring_z + 0.8, ring_z + 1.0)
-    ]
+    # from the bulb up to a small knob above the spokes
+    rod_heights = (
+        size.bottom + 0.2 * size.height,
+        spoke_z,
+        spoke_z + 0.8,
+        spoke_z + 1.0,
+    )
     patches += shapes.sweep(
         "base",
-        rod,
+        [(0, 0, z) for z in rod_heights],
         shapes.ellipse(0.35, 0.35, count=10),
         (1.0, 1.0, 1.6, 0.0),
         first=(1.0, 0.0, 0.0),
@@ -594,22 +633,28 @@ def _lamp_frame(
 
 
 def _lamp_paints(
-    sampler: ParameterSampler, low: float, total_height: float, style: str
+    sampler: ParameterSampler, shade_bottom: float, total_height: float, style: str
 ) -> dict[str, Paint]:
     """Sample the paints of a lamp by the tags of its parts.
 
     Args:
         sampler: samples the paints.
-        low, total_height: heights of the shade's edges.
+        shade_bottom: height of the lower edge of the shade.
+        total_height: height of its upper edge.
         style: style of the base, as for `_lamp_base`.
     """
     offset = sampler.offset()
     linen = sampler.sample_color(
-        "f1e3c4", "f4f1e8", "c9b48a", "b5442e", "2f5d7c", "3d6b4a", "20242a", wild=0.25
+        "f1e3c4",
+        "f4f1e8",
+        "c9b48a",
+        "b5442e",
+        "2f5d7c",
+        "3d6b4a",
+        "20242a",
+        p_random=0.25,
     )
-    cloth = _shade_paint(
-        sampler, linen=linen, offset=offset, low=low, total_height=total_height
-    )
+    cloth = _shade_paint(sampler, linen, offset, shade_bottom, total_height)
     clay = sampler.sample_color(
         "2f6f6a", "23408f", "b5442e", "f2f1ea", "22262b", "8a5a32", "c9a24b"
     )
@@ -617,9 +662,11 @@ def _lamp_paints(
         sampler,
         total_height,
         clouded(clay, factor=1.3, scale=4.0, offset=offset),
-        wild=0.35,
+        p_random=0.35,
     )
-    metal = sampler.sample_color("b08d3c", "2b2d30", "b4b8bd", "8a5a32", wild=0.15)
+    metal = sampler.sample_color("b08d3c", "2b2d30", "b4b8bd", "8a5a32", p_random=0.15)
+    # a flat foot may be painted as a body is
+    is_base_painted = style == "disc" and sampler.chance(0.5)
     return {
         "shade": cloth,
         "rim": solid(shade(linen, 0.8)),
@@ -627,5 +674,5 @@ def _lamp_paints(
         "bulb": solid("fbf6e6"),
         "body": body,
         "foot": solid(metal),
-        "base": body if style == "disc" and sampler.chance(0.5) else solid(metal),
+        "base": body if is_base_painted else solid(metal),
     }

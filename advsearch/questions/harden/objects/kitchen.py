@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 import advsearch.questions.harden.objects.shapes as shapes
+from advsearch.extend import assets
 from advsearch.questions.harden.objects.family import Instance, family, sample_material
 from advsearch.questions.harden.objects.shapes import Array, Patch, Points
 from advsearch.questions.harden.objects.textures import (
+    Color,
     Paint,
     ParameterSampler,
     Texels,
@@ -16,6 +18,7 @@ from advsearch.questions.harden.objects.textures import (
     dots,
     over,
     paint_or_random,
+    painter,
     rings,
     shade,
     solid,
@@ -24,6 +27,11 @@ from advsearch.questions.harden.objects.textures import (
     stripes,
     wood,
 )
+
+SPOUT_POINTS = 18  # points of the path of a spout
+SPOUT_WALL = 0.24  # thickness
+VIEW_DEGREES = 118.0
+"""Rotation about z of teapot and pan, which the default camera sees from the side."""
 
 
 def _spout(sampler: ParameterSampler, radius: float, height: float) -> list[Patch]:
@@ -39,68 +47,70 @@ def _spout(sampler: ParameterSampler, radius: float, height: float) -> list[Patc
     path = _spout_path(sampler, radius, height)
     root_radius = sampler(1.75, low=1.3, high=2.2)
     tip_radius = sampler(0.72, low=0.55, high=0.95)
-    scale = (
-        tip_radius
-        + (root_radius - tip_radius) * (1.0 - np.linspace(0.0, 1.0, 18)) ** 1.3
-    )
-    tangent, first, second = shapes.compute_frames(path, (0.0, 1.0, 0.0))
-    # points of the path that the rings are at: over the lip at the tip (the last point
-    # several times) and back down inside
-    ring_index = np.array([*range(18), 17, 17, 17, 16, 15, 14, 13])
-    inner_radii = scale[[17, 16, 15, 14, 13]] - 0.24  # less the thickness of the wall
-    radii = np.concatenate(
-        [
-            scale,
-            [
-                tip_radius - 0.06,
-                tip_radius - 0.12,
-                inner_radii[0],
-                inner_radii[1],
-                inner_radii[2],
-                inner_radii[3],
-                0.0,
-            ],
-        ]
-    )
-    # the rings of the lip lie a little ahead of the tip, so that it is round
-    ahead = np.zeros(len(ring_index))
-    ahead[18:21] = (0.1, 0.12, 0.06)
-    frame = (tangent[ring_index], first[ring_index], second[ring_index])
+    t = np.linspace(0.0, 1.0, SPOUT_POINTS)  # from the body to the tip
+    outer_radii = tip_radius + (root_radius - tip_radius) * (1.0 - t) ** 1.3
+    ring_index, radii, ahead = _spout_rings(outer_radii)
+    path_frame = shapes.compute_frames(path, (0.0, 1.0, 0.0))
+    tangent, first, second = (axis[ring_index] for axis in path_frame)
     return shapes.sweep(
         "spout",
-        path[ring_index] + ahead[:, None] * tangent[ring_index],
+        path[ring_index] + ahead[:, None] * tangent,
         shapes.ellipse(1.0, 1.0, count=20),
         radii,
-        frame=frame,
+        frame=(tangent, first, second),
     )
+
+
+def _spout_rings(outer_radii: Array) -> tuple[assets.IntArray, Array, Array]:
+    """Return the rings of a spout: its outside, its lip, and its hollow inside.
+
+    Args:
+        outer_radii: radii (`SPOUT_POINTS`,) of the outside at the points of the path.
+
+    Returns:
+        Three arrays (R,) with an entry for each ring: the index of its point of the
+        path, its radius, and how far it lies ahead of that point.
+    """
+    tip = SPOUT_POINTS - 1
+    # Two rings round the lip at the tip; four go back down inside the wall; the last
+    # one closes the hollow.
+    inside = [tip, tip - 1, tip - 2, tip - 3]
+    ring_index = np.array([*range(SPOUT_POINTS), tip, tip, *inside, tip - 4])
+    lip_radii = [outer_radii[tip] - 0.06, outer_radii[tip] - 0.12]
+    inner_radii = outer_radii[inside] - SPOUT_WALL
+    radii = np.concatenate([outer_radii, lip_radii, inner_radii, [0.0]])
+    # The lip and the first ring inside lie a little ahead, so that the lip is round.
+    ahead = np.zeros(len(ring_index))
+    ahead[SPOUT_POINTS : SPOUT_POINTS + 3] = (0.1, 0.12, 0.06)
+    return ring_index, radii, ahead
 
 
 def _spout_path(sampler: ParameterSampler, radius: float, height: float) -> Array:
-    """Sample the path (18, 3) of a spout in the x-z plane, from the body to the tip.
+    """Sample the path of a spout in the x-z plane, from the body to the tip.
 
     A curved one has the shape of an S: it bulges out and downwards in its lower half,
-        and is bent back a little before the tip.
+    and is bent back a little before the tip.
 
     Args:
         sampler: samples its style and its ends.
         radius, height: radius and height of the teapot's body.
+
+    Returns:
+        The path (`SPOUT_POINTS`, 3).
     """
     style = sampler.pick("curved", "straight")
-    start = np.array([radius * 0.72, 0.0, height * sampler(0.34, low=0.26, high=0.42)])
-    tip = np.array(
-        [
-            radius * sampler(1.85, low=1.6, high=2.0),
-            0.0,
-            height * sampler(0.94, low=0.8, high=1.02),
-        ]
-    )
+    start_z = height * sampler(0.34, low=0.26, high=0.42)
+    tip_x = radius * sampler(1.85, low=1.6, high=2.0)
+    tip_z = height * sampler(0.94, low=0.8, high=1.02)
+    start = np.array([radius * 0.72, 0.0, start_z])
+    tip = np.array([tip_x, 0.0, tip_z])
     # how far it departs from a straight line, as a fraction of the radius
     bend = 0.22 if style == "curved" else 0.04
-    middle = (start + tip) / 2 + np.array([bend, 0.0, -0.6 * bend]) * radius * 0.5
-    above = (
-        start + (tip - start) * 0.8 + np.array([-bend * 0.1, 0.0, -0.1 * bend]) * radius
-    )
-    return shapes.spline([start, middle, above, tip], count=18)
+    bulge = np.array([bend, 0.0, -0.6 * bend]) * radius * 0.5
+    bend_back = np.array([-bend * 0.1, 0.0, -0.1 * bend]) * radius
+    middle = (start + tip) / 2 + bulge
+    before_tip = start + (tip - start) * 0.8 + bend_back
+    return shapes.spline([start, middle, before_tip, tip], count=SPOUT_POINTS)
 
 
 @family(metres=0.01)
@@ -109,19 +119,18 @@ def teapot(sampler: ParameterSampler) -> Instance:
     radius = sampler(7.2, low=6.4, high=8.0)
     height = sampler(10.2, low=8.0, high=12.5)
     side, body = _teapot_body(sampler, radius, height)
-    grip = _teapot_handle(sampler, side, radius, height)
+    handle = _teapot_handle(sampler, side, radius, height)
+    opposite = shapes.rotation("z", 180.0)  # of the spout, which is at +x as well
     patches = [
         *body,
         *_spout(sampler, radius, height),
-        *shapes.transform_patches(grip, shapes.rotation("z", 180.0)),
+        *shapes.transform_patches(handle, opposite),
     ]
-    patches = shapes.transform_patches(patches, shapes.rotation("z", 118.0))
-    paints = _teapot_paints(sampler, height)
     return Instance(
-        patches,
-        paints,
+        shapes.transform_patches(patches, shapes.rotation("z", VIEW_DEGREES)),
+        _teapot_paints(sampler, height),
         sample_material(sampler, roughness=0.25, clearcoat=0.7),
-        detail={"base": 0.6},
+        texel_density={"base": 0.6},
     )
 
 
@@ -151,6 +160,24 @@ def _teapot_body(
         (mouth, height),
     ]
     side = shapes.spline(knots, count=26)
+    under = [(0.0, 0.2), (foot * 0.8, 0.2), (foot * 0.86, 0.0), (foot * 0.97, 0.0)]
+    profile: list[tuple[str, Points]] = [
+        ("base", under),
+        ("body", [under[-1], *side]),
+        *_lid_profile(sampler, mouth, height),
+    ]
+    return side, shapes.lathe(profile, columns=56)
+
+
+def _lid_profile(
+    sampler: ParameterSampler, mouth: float, height: float
+) -> list[tuple[str, Points]]:
+    """Return the tags and profiles of a teapot's mouth, lid and knob, upwards.
+
+    Args:
+        sampler: samples the lid's dome and the knob's radius.
+        mouth, height: radius and height of the mouth.
+    """
     dome = sampler(1.5, low=0.7, high=2.4)
     knob_radius = sampler(1.0, low=0.7, high=1.4)
     top = height + dome + 0.2  # of the lid
@@ -162,36 +189,22 @@ def _teapot_body(
         (mouth * 0.94, height + 0.05),
         (mouth * 0.97, height + 0.05),
     ]
-    lid = shapes.spline(
-        [
-            rim[-1],
-            (mouth * 0.9, height + 0.35),
-            (mouth * 0.55, height + 0.75 * dome + 0.2),
-            (0.35, top),
-        ],
-        count=10,
-    )
-    knob = shapes.spline(
-        [
-            (0.45, top),
-            (0.5, top + 0.3),
-            (knob_radius, top + 0.45 + knob_radius * 0.6),
-            (0.7 * knob_radius, top + 0.45 + 1.35 * knob_radius),
-            (0.0, top + 0.45 + 1.6 * knob_radius),
-        ],
-        count=12,
-    )
-    profile: list[tuple[str, Points]] = [
-        (
-            "base",
-            [(0.0, 0.2), (foot * 0.8, 0.2), (foot * 0.86, 0.0), (foot * 0.97, 0.0)],
-        ),
-        ("body", [(foot * 0.97, 0.0), *side]),
-        ("body", rim),
-        ("lid", lid),
-        ("knob", [lid[-1], *knob]),
+    lid_knots = [
+        rim[-1],
+        (mouth * 0.9, height + 0.35),
+        (mouth * 0.55, height + 0.75 * dome + 0.2),
+        (0.35, top),
     ]
-    return side, shapes.lathe(profile, columns=56)
+    knob_knots = [
+        (0.45, top),
+        (0.5, top + 0.3),
+        (knob_radius, top + 0.45 + knob_radius * 0.6),
+        (0.7 * knob_radius, top + 0.45 + 1.35 * knob_radius),
+        (0.0, top + 0.45 + 1.6 * knob_radius),
+    ]
+    lid = shapes.spline(lid_knots, count=10)
+    knob = shapes.spline(knob_knots, count=12)
+    return [("body", rim), ("lid", lid), ("knob", [lid[-1], *knob])]
 
 
 def _teapot_handle(
@@ -205,29 +218,28 @@ def _teapot_handle(
         radius, height: radius and height of the body.
     """
     span = sampler(0.9, low=0.75, high=1.0)
-    high = height * 0.84
-    low = height * (0.84 - 0.62 * span)
+    top = height * 0.84
+    bottom = height * (0.84 - 0.62 * span)
     # both ends lie a little inside the wall
-    top_root, low_root = (shapes.radius_at_height(side, z) - 0.25 for z in (high, low))
+    top_radius = shapes.radius_at_height(side, top) - 0.25
+    bottom_radius = shapes.radius_at_height(side, bottom) - 0.25
     reach = radius * sampler(0.72, low=0.5, high=0.9)
     lift = sampler(0.05, low=-0.02, high=0.2) * height
+    middle_reach = sampler(0.95, low=0.7, high=1.0) * reach
     knots = [
-        (top_root, high),
-        (radius + 0.35 * reach, high + lift),
-        (radius + 0.9 * reach, high - 0.1 * (high - low)),
-        (radius + sampler(0.95, low=0.7, high=1.0) * reach, 0.5 * (high + low)),
-        (radius + 0.4 * reach, low + 0.08 * (high - low)),
-        (low_root, low),
+        (top_radius, top),
+        (radius + 0.35 * reach, top + lift),
+        (radius + 0.9 * reach, top - 0.1 * (top - bottom)),
+        (radius + middle_reach, 0.5 * (top + bottom)),
+        (radius + 0.4 * reach, bottom + 0.08 * (top - bottom)),
+        (bottom_radius, bottom),
     ]
     section = shapes.ellipse(
         sampler(0.5, low=0.4, high=0.7), sampler(0.62, low=0.45, high=0.85), count=16
     )
-    return shapes.sweep(
-        "handle",
-        shapes.to_xz_plane(shapes.spline(knots, count=26)),
-        section,
-        1.0 + 0.2 * np.abs(np.linspace(-1, 1, 26)) ** 3,  # thicker at both ends
-    )
+    root_flare = 1.0 + 0.2 * np.abs(np.linspace(-1, 1, 26)) ** 3  # thicker at both ends
+    curve = shapes.spline(knots, count=26)
+    return shapes.sweep("handle", shapes.to_xz_plane(curve), section, root_flare)
 
 
 def _teapot_paints(sampler: ParameterSampler, height: float) -> dict[str, Paint]:
@@ -237,105 +249,118 @@ def _teapot_paints(sampler: ParameterSampler, height: float) -> dict[str, Paint]
         "7b2d26", "f2eee4", "2f5d7c", "3d5c47", "22262b", "c98a3a", "e7b9b0"
     )
     glaze = clouded(clay, factor=1.25, scale=3.5, offset=offset, contrast=1.6)
-    second = sampler.sample_color("e8cfa0", "23408f", "c9a24b", "f4efe4", "b5442e")
-    kind = sampler.pick("bands", "plain", "dots", "stripes", "rings", "speckle")
-    if kind == "bands":
-        paint = over(
-            glaze, between(0.7 * height, 0.74 * height, soft=0.1), solid(second)
-        )
-        paint = over(
-            paint, between(0.77 * height, 0.785 * height, soft=0.1), solid(second)
-        )
-    elif kind == "dots":
-        paint = dots(
-            glaze,
-            second,
-            cell=sampler(2.6, low=1.6, high=4.0),
-            radius=sampler(0.28, low=0.18, high=0.4),
-        )
-    elif kind == "stripes":
-        paint = stripes(
-            clay,
-            second,
-            cell=sampler(3.0, low=1.5, high=5.0),
-            share=sampler(0.4, low=0.2, high=0.6),
-        )
-    elif kind == "rings":
-        paint = rings(clay, second, period=sampler(2.0, low=1.0, high=4.0))
-    elif kind == "speckle":
-        paint = speckled(glaze, second, scale=0.5, offset=offset)
-    else:
-        paint = glaze
-    paint = paint_or_random(sampler, height + 4.0, paint)
-    trim = sampler.pick(glaze, solid(second), paint)
+    accent = sampler.sample_color("e8cfa0", "23408f", "c9a24b", "f4efe4", "b5442e")
+    decoration = _teapot_decoration(sampler, clay, glaze, accent, height, offset)
+    paint = paint_or_random(sampler, height + 4.0, decoration)
+    trim = sampler.pick(glaze, solid(accent), paint)
     return {
         "base": solid("a98663"),
         "body": paint,
         "lid": sampler.pick(paint, trim),
         "spout": sampler.pick(glaze, paint),
         "handle": sampler.pick(glaze, trim),
-        "knob": solid(second) if sampler.chance(0.5, canonical=True) else trim,
+        "knob": solid(accent) if sampler.chance(0.5, canonical=True) else trim,
     }
+
+
+def _teapot_decoration(
+    sampler: ParameterSampler,
+    clay: Color,
+    glaze: Paint,
+    accent: Color,
+    height: float,
+    offset: Array,
+) -> Paint:
+    """Sample what is painted on the body of a teapot.
+
+    Args:
+        sampler: samples the kind and its proportions.
+        clay: color of the teapot.
+        glaze: paint of that color.
+        accent: color of the decoration.
+        height: height of the teapot.
+        offset: (3,) into the noise.
+    """
+    kind = sampler.pick("bands", "plain", "dots", "stripes", "rings", "speckle")
+    if kind == "bands":
+        lower_band = between(0.7 * height, 0.74 * height, soft=0.1)
+        upper_band = between(0.77 * height, 0.785 * height, soft=0.1)
+        return over(over(glaze, lower_band, solid(accent)), upper_band, solid(accent))
+    if kind == "dots":
+        return dots(
+            glaze,
+            accent,
+            cell=sampler(2.6, low=1.6, high=4.0),
+            radius=sampler(0.28, low=0.18, high=0.4),
+        )
+    if kind == "stripes":
+        return stripes(
+            clay,
+            accent,
+            cell=sampler(3.0, low=1.5, high=5.0),
+            fraction=sampler(0.4, low=0.2, high=0.6),
+        )
+    if kind == "rings":
+        return rings(clay, accent, period=sampler(2.0, low=1.0, high=4.0))
+    if kind == "speckle":
+        return speckled(glaze, accent, scale=0.5, offset=offset)
+    return glaze
 
 
 @family(metres=0.01)
 def frying_pan(sampler: ParameterSampler) -> Instance:
     """Make a frying pan with a random handle."""
-    base = sampler(10.5, low=9.0, high=11.5)
-    rim = sampler(13.0, low=12.2, high=14.5)
+    base_radius = sampler(10.5, low=9.0, high=11.5)
+    rim_radius = sampler(13.0, low=12.2, high=14.5)
     depth = sampler(4.2, low=2.8, high=5.5)
     wall = sampler(0.38, low=0.3, high=0.55)
     side = shapes.spline(
         [
-            (base - 0.8, 0.0),
-            (base, 0.25),
-            (base + 0.55 * (rim - base), 0.5 * depth),
-            (rim, depth),
+            (base_radius - 0.8, 0.0),
+            (base_radius, 0.25),
+            (base_radius + 0.55 * (rim_radius - base_radius), 0.5 * depth),
+            (rim_radius, depth),
         ],
         count=14,
     )
     body = shapes.vessel(side, wall=wall, floor=0.5, columns=64, step=1.6)
 
     length = sampler(18.0, low=14.0, high=21.0)
-    root = np.array([rim - 0.6, 0.0, 0.78 * depth])
+    root = np.array([rim_radius - 0.6, 0.0, 0.78 * depth])
     rise = sampler(2.6, low=0.6, high=4.5)
-    grip = _pan_handle(sampler, root, length, rise)
-    rivets = _wall_rivets(side, depth, wall)
-    bracket = _pan_bracket(rim, depth, length, rise)
-    patches = shapes.transform_patches(
-        [*body, *grip, *rivets, *bracket], shapes.rotation("z", 118.0)
-    )
-    paints = _pan_paints(sampler, rim, depth)
+    handle = _pan_handle(sampler, root, length, rise)
+    bracket = _pan_bracket(rim_radius, depth, length, rise)
+    # The bracket goes through the wall at this height.
+    rivet_z = 0.72 * depth
+    rivets = _pan_rivets(shapes.radius_at_height(side, rivet_z) - wall, rivet_z)
+    patches = [*body, *handle, *rivets, *bracket]
     return Instance(
-        patches,
-        paints,
+        shapes.transform_patches(patches, shapes.rotation("z", VIEW_DEGREES)),
+        _pan_paints(sampler, rim_radius, depth),
         sample_material(sampler, roughness=0.38, clearcoat=0.3),
-        detail={"base": 0.5},
+        texel_density={"base": 0.5},
     )
 
 
-def _wall_rivets(side: Array, depth: float, wall: float) -> list[Patch]:
-    """Create the rivets on the inside of a pan's wall."""
-    inner_radius = shapes.radius_at_height(side, 0.72 * depth) - wall
-    return _pan_rivets(inner_radius, 0.72 * depth)
-
-
-def _pan_bracket(rim: float, depth: float, length: float, rise: float) -> list[Patch]:
+def _pan_bracket(
+    rim_radius: float, depth: float, length: float, rise: float
+) -> list[Patch]:
     """Create the bracket that holds the handle of a pan: a flat bar through the wall.
 
     Args:
-        rim: radius of the pan's rim.
+        rim_radius: radius of the pan's rim.
         depth: depth of the pan.
-        length, rise: length and rise of the handle.
+        length: length of the handle.
+        rise: by how much the end of the handle is higher than its root.
     """
-    spine = [
-        (rim - 1.4, 0.72 * depth),
-        (rim - 0.3, 0.75 * depth),
-        (rim + 0.2 * length, 0.78 * depth + 0.5 * rise),
+    path = [
+        (rim_radius - 1.4, 0.72 * depth),
+        (rim_radius - 0.3, 0.75 * depth),
+        (rim_radius + 0.2 * length, 0.78 * depth + 0.5 * rise),
     ]
     return shapes.sweep(
         "bracket",
-        shapes.to_xz_plane(np.array(spine)),
+        shapes.to_xz_plane(np.array(path)),
         shapes.rectangle(0.7, 3.0, bevel=0.25),
         (1.0, 1.0, 0.62),
         caps=True,
@@ -348,7 +373,7 @@ def _pan_handle(
     """Create a handle along +x, which rises and has a round end.
 
     Its section is scaled along the path: it is narrow at the root and has its full
-        width after a third.
+    width after a third.
 
     Args:
         sampler: samples its curve and its section.
@@ -356,68 +381,94 @@ def _pan_handle(
         length: along x.
         rise: by how much it is higher at its end, about.
     """
-    knots = [
-        (0.0, 0.0),
-        (0.22 * length, 0.55 * rise),
-        (0.6 * length, rise),
-        (length, rise * sampler(1.05, low=0.8, high=1.2)),
-    ]
-    path = shapes.spline(root + shapes.to_xz_plane(np.array(knots)), count=26)
+    end_rise = rise * sampler(1.05, low=0.8, high=1.2)
+    knots = [(0.0, 0.0), (0.22 * length, 0.55 * rise), (0.6 * length, rise)]
+    curve = shapes.to_xz_plane(np.array([*knots, (length, end_rise)]))
+    path = shapes.spline(root + curve, count=26)
     t = np.linspace(0.0, 1.0, 26)  # from the root to the end
-    width = sampler(1.15, low=0.85, high=1.5)
-    thick = sampler(0.62, low=0.45, high=0.9)
-    shape = (0.62 + 0.38 * np.clip(t / 0.35, 0.0, 1.0) ** 1.5) * (
-        1.0 + sampler(0.12, low=0.0, high=0.25) * np.sin(np.pi * t)
+    max_width = sampler(1.15, low=0.85, high=1.5)
+    max_thickness = sampler(0.62, low=0.45, high=0.9)
+    bulge = sampler(0.12, low=0.0, high=0.25)  # in the middle
+    relative_width = (0.62 + 0.38 * np.clip(t / 0.35, 0.0, 1.0) ** 1.5) * (
+        1.0 + bulge * np.sin(np.pi * t)
     )
+    relative_thickness = 0.7 + 0.3 * np.clip(t / 0.3, 0.0, 1.0)
     # a quarter of an ellipse over the last 6 %
-    round_end = np.sqrt(
-        np.clip(1.0 - ((t - 0.94) / 0.06).clip(0.0, 1.0) ** 2, 0.0, 1.0)
+    end_fraction = ((t - 0.94) / 0.06).clip(0.0, 1.0)
+    rounding = np.sqrt(np.clip(1.0 - end_fraction**2, 0.0, 1.0))
+    scale = np.stack(
+        [max_thickness * relative_thickness, max_width * relative_width], axis=1
     )
-    thickness = thick * (0.7 + 0.3 * np.clip(t / 0.3, 0.0, 1.0))
-    scale = np.stack([thickness, width * shape], axis=1) * round_end[:, None]
     if sampler.chance(0.5, canonical=True):
         section = shapes.ellipse(1.0, 1.0, count=20)
     else:
         section = shapes.rectangle(2.0, 2.0, bevel=0.7)
-    return shapes.sweep("handle", path, section, scale)
+    return shapes.sweep("handle", path, section, scale * rounding[:, None])
 
 
 def _pan_rivets(radius: float, height: float) -> list[Patch]:
-    """Create the two rivets of the bracket on the inside of a pan."""
+    """Create the two rivets of the bracket on the inside of a pan.
+
+    Args:
+        radius: radius of the inside of the wall at that height.
+        height: height of the rivets.
+    """
     center = (radius + 0.02, 0.0, height)
-    rivet = shapes.sphere("rivet", 0.38, centre=center, rows=8, columns=12)
+    rivet = shapes.sphere("rivet", 0.38, center=center, rows=8, columns=12)
     left = shapes.transform_patches(rivet, offset=(0.0, -1.1, 0.0))
     right = shapes.transform_patches(rivet, offset=(0.0, 1.1, 0.0))
     return left + right
 
 
 def _pan_paints(
-    sampler: ParameterSampler, rim: float, depth: float
+    sampler: ParameterSampler, rim_radius: float, depth: float
 ) -> dict[str, Paint]:
     """Sample the paints of a pan, by the tags of its parts.
 
     Args:
         sampler: samples the paints.
-        rim: radius of its rim.
+        rim_radius: radius of its rim.
         depth: height of its rim.
     """
     offset = sampler.offset()
+    coating = _pan_coating(sampler, offset)
+    enamel = _pan_enamel(sampler, depth, offset)
+    outside = paint_or_random(sampler, 2 * rim_radius, enamel, p_random=0.3)
+    inside = paint_or_random(sampler, 2 * rim_radius, coating, p_random=0.2)
+    handle_kind = sampler.pick("black", "wood", "colored")
+    # All three are sampled, whichever is used.
+    handle_paints = {
+        "black": solid(sampler.sample_color("1b1b1d", "2a2a2c", p_random=0.1)),
+        "wood": wood(
+            sampler.sample_color("8a5a32", "b98550", p_random=0.0),
+            scale=1.4,
+            offset=offset,
+            axis=0,
+        ),
+        "colored": solid(sampler.sample_color("a9231f")),
+    }
+    steel = solid(sampler.sample_color("b9bcc0", "8c8f94", p_random=0.1))
+    return {
+        "outside": outside,
+        "inside": inside,
+        "handle": handle_paints[handle_kind],
+        "rivet": steel,
+        "bracket": steel,
+        "base": solid(sampler.sample_color("77797c", "2b2c2e")),
+    }
+
+
+def _pan_coating(sampler: ParameterSampler, offset: Array) -> Paint:
+    """Sample the speckled coating of the inside of a pan, often with faint rings.
+
+    Args:
+        sampler: samples the color and whether it has rings.
+        offset: (3,) into the noise.
+    """
     coat = sampler.sample_color(
-        "2b2c2e", "3a3a3c", "1c1d1f", "8c8f94", "5c4033", wild=0.2
+        "2b2c2e", "3a3a3c", "1c1d1f", "8c8f94", "5c4033", p_random=0.2
     )
-
-    def turned(t: Texels) -> Array:
-        """Return the mask of faint rings, as turning leaves."""
-        return (
-            step(
-                np.sin(2 * np.pi * np.hypot(t.xyz[:, 0], t.xyz[:, 1]) / 0.9),
-                0.6,
-                soft=0.8,
-            )
-            * 0.35
-        )
-
-    inside = speckled(
+    coating = speckled(
         clouded(coat, factor=1.2, scale=5.0, offset=offset),
         shade(coat, 1.7),
         scale=0.5,
@@ -425,36 +476,29 @@ def _pan_paints(
         amount=0.06,
     )
     if sampler.chance(0.4, canonical=True):
-        inside = over(inside, turned, solid(shade(coat, 1.6)))
-    outer = sampler.sample_color(
+        return over(coating, _turning_rings(), solid(shade(coat, 1.6)))
+    return coating
+
+
+@painter
+def _turning_rings(t: Texels) -> Array:
+    """Return the mask of faint rings around the z axis, as turning leaves."""
+    phase = 2 * np.pi * np.hypot(t.xyz[:, 0], t.xyz[:, 1]) / 0.9
+    return step(np.sin(phase), 0.6, soft=0.8) * 0.35
+
+
+def _pan_enamel(sampler: ParameterSampler, depth: float, offset: Array) -> Paint:
+    """Sample the outside of a pan: darker at the bottom, with a dark line at the rim.
+
+    Args:
+        sampler: samples the color.
+        depth: height of the rim.
+        offset: (3,) into the noise.
+    """
+    color = sampler.sample_color(
         "a9231f", "2b2c2e", "9a9da1", "2f5d7c", "3d6b4a", "d9822b"
     )
-    # darker towards the bottom, with a dark line at the rim
-    enamel = clouded(outer, factor=0.85, scale=5.0, offset=offset)
-    enamel = over(
-        enamel, between(-1.0, 0.25 * depth, soft=0.6 * depth), solid(shade(outer, 0.6))
-    )
-    enamel = over(enamel, between(depth - 0.1, 2 * depth, soft=0.15), solid("2b2c2e"))
-    outside = paint_or_random(sampler, 2 * rim, enamel, wild=0.3)
-    inside = paint_or_random(sampler, 2 * rim, inside, wild=0.2)
-    style = sampler.pick("black", "wood", "wild")
-    handle_paints = {
-        "black": solid(sampler.sample_color("1b1b1d", "2a2a2c", wild=0.1)),
-        "wood": wood(
-            sampler.sample_color("8a5a32", "b98550", wild=0.0),
-            scale=1.4,
-            offset=offset,
-            axis=0,
-        ),
-        "wild": solid(sampler.sample_color("a9231f")),
-    }
-    steel = solid(sampler.sample_color("b9bcc0", "8c8f94", wild=0.1))
-    paints = {
-        "outside": outside,
-        "inside": inside,
-        "handle": handle_paints[style],
-        "rivet": steel,
-        "bracket": steel,
-    }
-    paints["base"] = solid(sampler.sample_color("77797c", "2b2c2e"))
-    return paints
+    enamel = clouded(color, factor=0.85, scale=5.0, offset=offset)
+    is_bottom = between(-1.0, 0.25 * depth, soft=0.6 * depth)
+    enamel = over(enamel, is_bottom, solid(shade(color, 0.6)))
+    return over(enamel, between(depth - 0.1, 2 * depth, soft=0.15), solid("2b2c2e"))

@@ -14,6 +14,7 @@ from advsearch.extend import assets, workbench
 from advsearch.questions.harden.objects.family import Instance, family
 from advsearch.questions.harden.objects.shapes import Array, ChartToPoints, Patch
 from advsearch.questions.harden.objects.textures import (
+    Paint,
     ParameterSampler,
     Texels,
     mix,
@@ -33,12 +34,14 @@ FINISHES = {
 }
 
 
-def _rest(charts: Array, points: Array) -> ChartToPoints:
+def _interpolate_chart(charts: Array, points: Array) -> ChartToPoints:
     """Return the function from chart coordinates (N,), (N,) to points of a body (N, 3).
 
-    It interpolates the points (V, 3) at chart coordinates (V, 2) of one chart. They are
-    of the reference body, which stands as MakeHuman's does, so that all bodies are
-    painted alike. Outside the triangles it is the nearest point.
+    Outside the triangles of the chart it is the nearest point.
+
+    Args:
+        charts: (V, 2) chart coordinates of the vertices.
+        points: (V, 3) their points.
     """
     linear = LinearNDInterpolator(charts, points)
     nearest = NearestNDInterpolator(charts, points)
@@ -53,90 +56,94 @@ def _rest(charts: Array, points: Array) -> ChartToPoints:
 def _patches(person: Any) -> list[Patch]:
     """Return the patches of a body, one for each chart of its texture.
 
-    Normals are smooth across the seams of charts. What is painted on a patch depends on
-    the corresponding points of the reference body.
+    Normals are smooth across the seams of charts. All bodies are painted alike: what is
+    painted on a patch depends on the corresponding points of the reference body.
 
     Args:
         person: person of `workbench.library.make_person`.
     """
     data = person.data
     vertices = person.standing_points.numpy().astype(np.float64)
-    index = data["index"].astype(np.int64)
-    # the reference body: the mean, stored in tenths of millimetres, plus what the
-    # shares of one fixed phenotype add
-    reference = data["mean"][index] * 1e-4 + np.einsum(
-        "r,rpc->pc", data["shares"][1, 1, 1, 1], data["basis"][:, index]
-    )
-    reference[:, 2] -= reference[:, 2].min()
+    reference = _reference_vertices(data)
     charts = data["charts"].astype(np.float64)
+    faces = data["faces"].astype(np.int64)
     # where the vertices and the faces of each chart begin
     first_vertex = np.cumsum([0, *data["points"]])
     first_face = np.cumsum([0, *data["triangles"]])
-    faces = data["faces"].astype(np.int64)
+    point_of_vertex = data["index"].astype(np.int64)
     normals = _smooth_normals(
-        vertices=vertices,
-        index=index,
-        faces=faces,
-        first_vertex=first_vertex,
-        first_face=first_face,
+        vertices, point_of_vertex, faces, first_vertex, first_face
     )
     patches = []
     for number, tag in enumerate(data["tags"]):
-        chart_vertices = slice(first_vertex[number], first_vertex[number + 1])
-        chart_faces = faces[first_face[number] : first_face[number + 1]]
+        in_chart = slice(first_vertex[number], first_vertex[number + 1])
         patches.append(
             Patch(
                 tag=str(tag),
-                vertices=vertices[chart_vertices],
-                normals=normals[chart_vertices],
-                uvs=charts[chart_vertices],
-                faces=chart_faces,
-                size=_chart_size(data["sizes"][number]),
-                rest=_rest(charts[chart_vertices], reference[chart_vertices]),
+                vertices=vertices[in_chart],
+                normals=normals[in_chart],
+                uvs=charts[in_chart],
+                faces=faces[first_face[number] : first_face[number + 1]],
+                size=tuple(map(float, data["sizes"][number])),
+                rest=_interpolate_chart(charts[in_chart], reference[in_chart]),
             )
         )
     return patches
 
 
-def _chart_size(size: Array) -> tuple[float, float]:
-    """Return the width and the height of a chart."""
-    return float(size[0]), float(size[1])
+def _reference_vertices(data: Any) -> Array:
+    """Return the vertices (V, 3) of the reference body, in metres, standing on z = 0.
+
+    It is of one fixed phenotype, and stands as MakeHuman's body does.
+
+    Args:
+        data: the arrays of the file of bodies.
+    """
+    point_of_vertex = data["index"].astype(np.int64)
+    # the mean of all bodies, stored in tenths of millimetres, plus what the shares of
+    # the phenotype add
+    mean = data["mean"][point_of_vertex] * 1e-4
+    shares = data["shares"][1, 1, 1, 1]
+    vertices = mean + np.einsum("r,rpc->pc", shares, data["basis"][:, point_of_vertex])
+    vertices[:, 2] -= vertices[:, 2].min()
+    return np.asarray(vertices)
 
 
 def _smooth_normals(
     vertices: Array,
-    index: assets.IntArray,
+    point_of_vertex: assets.IntArray,
     faces: assets.IntArray,
     first_vertex: assets.IntArray,
     first_face: assets.IntArray,
 ) -> Array:
     """Return normals (V, 3) that are smooth across the seams of charts.
 
-    Vertices of several charts that are the same point of the body share one normal: the
-        mean of the normals of all faces around it, weighted by area.
+    Vertices of several charts that are the same point of the body have the same normal:
+    the mean of the normals of all faces around it, weighted by area.
 
     Args:
         vertices: (V, 3), chart after chart.
-        index: (V,) number of the body's point that each vertex is.
-        faces: (F, 3), chart after chart; numbers of vertices within the chart.
+        point_of_vertex: (V,) index of the body's point that each vertex is.
+        faces: (F, 3), chart after chart; indices of vertices within the chart.
         first_vertex, first_face: where the vertices and faces of each chart begin, and
             where all end.
     """
-    all_faces = np.concatenate(
-        [
-            faces[a:b] + start
-            for a, b, start in zip(
-                first_face, first_face[1:], first_vertex, strict=False
-            )
-        ]
-    )
-    normal_sum = np.zeros((int(index.max()) + 1, 3))
+    faces_of_chart = [
+        faces[first:last] + offset
+        for first, last, offset in zip(
+            first_face, first_face[1:], first_vertex, strict=False
+        )
+    ]
+    all_faces = np.concatenate(faces_of_chart)
+    # The area vector of a face is added to its three points.
+    area_vectors = assets.compute_area_vectors(vertices[all_faces])
+    normal_sum = np.zeros((int(point_of_vertex.max()) + 1, 3))
     np.add.at(
         normal_sum,
-        index[all_faces].reshape(-1),
-        np.repeat(assets.compute_area_vectors(vertices[all_faces]), 3, axis=0),
+        point_of_vertex[all_faces].reshape(-1),
+        np.repeat(area_vectors, 3, axis=0),
     )
-    normals = normal_sum[index]
+    normals = normal_sum[point_of_vertex]
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     return normals
 
@@ -148,96 +155,94 @@ def _woven(t: Texels, color: Array, depth: float) -> Array:
     `depth` is about by how much they change the color, as a fraction.
     """
     folds = noise(t.xyz * np.array([9.0, 9.0, 4.0])) - 0.5
-    thread = noise(t.xyz * 180.0) - 0.5
-    return np.clip(
-        color * (1.0 + depth * (1.2 * folds + 0.6 * thread))[:, None], 0.0, 1.0
-    )
+    threads = noise(t.xyz * 180.0) - 0.5
+    brightness = 1.0 + depth * (1.2 * folds + 0.6 * threads)
+    return np.clip(color * brightness[:, None], 0.0, 1.0)
 
 
 @painter
 def _jeans(t: Texels, color: Array) -> Array:
     """Paint woven cloth with seams down the legs and a hem at both ankles."""
     x, _, z = t.xyz.T
-    # distance to the seam, which is in the plane x = 0.005; far away above and below it
-    seam = np.where((z < 0.88) & (z > 0.08), np.minimum(np.abs(x - 0.005), 9.0), 9.0)
-    hem = np.abs(z - 0.085)
-    return mix(
-        _woven(color, depth=0.25)(t),
-        0.6 * color,
-        0.8 * step(0.004 - np.minimum(seam, hem), 0.0, soft=0.003),
-    )
+    has_seam = (z < 0.88) & (z > 0.08)
+    far = 9.0  # metres; no seam
+    # The seam is in the plane x = 0.005.
+    seam_distance = np.where(has_seam, np.minimum(np.abs(x - 0.005), far), far)
+    hem_distance = np.abs(z - 0.085)
+    line = step(0.004 - np.minimum(seam_distance, hem_distance), 0.0, soft=0.003)
+    return mix(_woven(color, depth=0.25)(t), 0.6 * color, 0.8 * line)
 
 
 @painter
 def _face(t: Texels, color: Array, hair: Array) -> Array:
     """Paint skin with lips, cheeks and eyebrows at the front of the head.
 
-    Their places are those of the reference body, in metres. Shades of lips and cheeks
-    are multiples of the skin's color (3,); eyebrows have the color of the hair (3,).
+    Their positions are those of the reference body, in metres. Shades of lips and
+    cheeks are multiples of the skin's color (3,); eyebrows have the color of the hair
+    (3,).
     """
     x, y, z = t.xyz.T
     abs_y = np.abs(y)
     is_front = x > 0.1
-    skin = np.clip(color * (1.0 + 0.1 * (noise(t.xyz * 14.0) - 0.5))[:, None], 0.0, 1.0)
-    lips = np.where(is_front, 1.0 - np.hypot(y / 0.025, (z - 1.563) / 0.011), -1.0)
-    skin = mix(
-        skin, color * np.array([0.86, 0.62, 0.6]), 0.75 * step(lips, 0.0, soft=0.25)
-    )
-    cheeks = np.where(
+    mottling = 1.0 + 0.1 * (noise(t.xyz * 14.0) - 0.5)
+    skin = np.clip(color * mottling[:, None], 0.0, 1.0)
+
+    # how far inside an ellipse; -1 at the back of the head
+    in_lips = np.where(is_front, 1.0 - np.hypot(y / 0.025, (z - 1.563) / 0.011), -1.0)
+    lip_color = color * np.array([0.86, 0.62, 0.6])
+    skin = mix(skin, lip_color, 0.75 * step(in_lips, 0.0, soft=0.25))
+
+    in_cheeks = np.where(
         is_front, 1.0 - np.hypot((abs_y - 0.042) / 0.022, (z - 1.605) / 0.02), -1.0
     )
-    skin = mix(
-        skin, color * np.array([1.0, 0.84, 0.8]), 0.5 * step(cheeks, 0.0, soft=0.6)
-    )
-    arch = 1.659 - 14.0 * (abs_y - 0.034) ** 2
-    brow = np.where(
-        is_front & (np.abs(abs_y - 0.034) < 0.021), 0.0038 - np.abs(z - arch), -1.0
-    )
-    return mix(skin, hair, 0.8 * step(brow, 0.0, soft=0.0015))
+    cheek_color = color * np.array([1.0, 0.84, 0.8])
+    skin = mix(skin, cheek_color, 0.5 * step(in_cheeks, 0.0, soft=0.6))
+
+    brow_height = 1.659 - 14.0 * (abs_y - 0.034) ** 2  # an arch over each eye
+    has_brow = is_front & (np.abs(abs_y - 0.034) < 0.021)  # over the eye
+    in_brow = np.where(has_brow, 0.0038 - np.abs(z - brow_height), -1.0)
+    return mix(skin, hair, 0.8 * step(in_brow, 0.0, soft=0.0015))
 
 
 @painter
 def _strands(t: Texels, color: Array) -> Array:
-    strand = noise(t.xyz * np.array([60.0, 160.0, 40.0])) - 0.5
-    return np.clip(color * (1.0 + 0.7 * strand)[:, None] + 0.02, 0.0, 1.0)
+    """Paint hair of a color, a little lighter than that, in vertical strands."""
+    strands = noise(t.xyz * np.array([60.0, 160.0, 40.0])) - 0.5
+    return np.clip(color * (1.0 + 0.7 * strands)[:, None] + 0.02, 0.0, 1.0)
 
 
 @painter
 def _leather(t: Texels, color: Array) -> Array:
-    return mix(
-        color, parse_hex_color("cfcac0"), step(0.012 - t.xyz[:, 2], 0.0, soft=0.004)
-    )
+    """Paint shoes of a color with light soles, which are 1.2 cm high."""
+    sole = step(0.012 - t.xyz[:, 2], 0.0, soft=0.004)
+    return mix(color, parse_hex_color("cfcac0"), sole)
 
 
 @painter
 def _irises(t: Texels, color: Array) -> Array:
     """Paint eyes that look ahead: white, iris and pupil.
 
-    `color` (3,) is that of the iris. Places are those of the reference body, in metres.
+    `color` (3,) is that of the iris. Positions are those of the reference body, in
+    metres.
     """
     x, y, z = t.xyz.T
+    middle_z = float(0.5 * (z.min() + z.max()))  # of the eyes
     # from the nearest pupil; all that is not at the front is white
-    pupil_distance = np.where(
-        x > 0.128,
-        np.hypot(np.abs(y) - 0.031, z - float(0.5 * (z.min() + z.max()))),
-        1.0,
-    )
-    iris = mix(
-        parse_hex_color("e6e2dc"), color, step(0.0065 - pupil_distance, 0.0, soft=0.001)
-    )
-    return mix(
-        iris, parse_hex_color("101010"), step(0.003 - pupil_distance, 0.0, soft=0.001)
-    )
+    is_front = x > 0.128
+    pupil_distance = np.where(is_front, np.hypot(np.abs(y) - 0.031, z - middle_z), 1.0)
+    iris = step(0.0065 - pupil_distance, 0.0, soft=0.001)
+    pupil = step(0.003 - pupil_distance, 0.0, soft=0.001)
+    eye = mix(parse_hex_color("e6e2dc"), color, iris)
+    return mix(eye, parse_hex_color("101010"), pupil)
 
 
 @family(metres=1.0, texels=512)
 def person(sampler: ParameterSampler) -> Instance:
     """Make a person of random phenotype, pose and clothes."""
     is_woman = sampler.chance(0.5)
-    gender = 0.0 if is_woman else 1.0
     height_reduction = 0.08 if is_woman else 0.0  # metres
     phenotype = {
-        "gender": gender,
+        "gender": 0.0 if is_woman else 1.0,
         "height": sampler(1.7, low=1.52, high=1.9) - height_reduction,
         "weight": sampler(0.5, low=0.25, high=0.8),
         "age": sampler(35.0, low=16.0, high=75.0),
@@ -245,37 +250,37 @@ def person(sampler: ParameterSampler) -> Instance:
         "walk": sampler(0.0, low=0.0, high=360.0),
     }
     body = workbench.library.make_person(phenotype)
+    return Instance(
+        _patches(body),
+        _person_paints(sampler),
+        material=FINISHES["shirt"],
+        texel_density={"skin": 0.8, "shoes": 0.8, "shirt": 1.15},
+        finishes=FINISHES,
+        rig=body,
+    )
+
+
+def _person_paints(sampler: ParameterSampler) -> dict[str, Paint]:
+    """Sample the paints of a person's skin, hair, eyes and clothes, by their tags."""
     skin = parse_hex_color(
         sampler.pick("d9a98a", "e8c3a8", "c68863", "8d5a3a", "5c3a28", "f0cfb4")
     )
     hair = parse_hex_color(
         sampler.pick("2e2019", "120d0a", "5a3a20", "8a6a3c", "9a948c")
     )
-    paints = {
-        "shirt": _woven(
-            sampler.sample_color(
-                "5b86b8", "c8c4ba", "b04038", "3f6b4a", "d0a83e", "2f3338"
-            ),
-            depth=0.16,
-        ),
-        "trousers": _jeans(
-            sampler.sample_color(
-                "31374a", "4a4640", "1f2226", "6b6152", "5a6270", wild=0.15
-            )
-        ),
+    shirt = sampler.sample_color(
+        "5b86b8", "c8c4ba", "b04038", "3f6b4a", "d0a83e", "2f3338"
+    )
+    trousers = sampler.sample_color(
+        "31374a", "4a4640", "1f2226", "6b6152", "5a6270", p_random=0.15
+    )
+    shoes = sampler.sample_color("4a3324", "1d1d1f", "8a8680", "5b2f24", p_random=0.15)
+    irises = parse_hex_color(sampler.pick("4a3424", "5a7a94", "5f6f4a"))
+    return {
+        "shirt": _woven(shirt, depth=0.16),
+        "trousers": _jeans(trousers),
         "skin": _face(skin, hair),
         "hair": _strands(hair),
-        "shoes": _leather(
-            sampler.sample_color("4a3324", "1d1d1f", "8a8680", "5b2f24", wild=0.15)
-        ),
-        "eyes": _irises(parse_hex_color(sampler.pick("4a3424", "5a7a94", "5f6f4a"))),
+        "shoes": _leather(shoes),
+        "eyes": _irises(irises),
     }
-    detail = {"skin": 0.8, "shoes": 0.8, "shirt": 1.15}
-    return Instance(
-        _patches(body),
-        paints,
-        material=FINISHES["shirt"],
-        detail=detail,
-        finishes=FINISHES,
-        rig=body,
-    )

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain, pairwise
+from itertools import chain, pairwise, product
 from typing import TypeAlias
 
 import numpy as np
@@ -61,7 +61,8 @@ def distance_to_polylines(x: Array, y: Array, *paths: Points) -> Array:
         dy = y1 - y0
         # the nearest point of the segment, as a fraction of its length
         t = np.clip(((x - x0) * dx + (y - y0) * dy) / (dx * dx + dy * dy), 0.0, 1.0)
-        distance = np.minimum(distance, np.hypot(x - x0 - t * dx, y - y0 - t * dy))
+        segment_distance = np.hypot(x - x0 - t * dx, y - y0 - t * dy)
+        distance = np.minimum(distance, segment_distance)
     return distance
 
 
@@ -93,11 +94,9 @@ def spline(points: Points, count: int) -> Array:
     """
     knots = np.asarray(points, dtype=np.float64)
     arc_length = arc_lengths(knots)
-    return np.asarray(
-        CubicHermiteSpline(arc_length, knots, np.gradient(knots, arc_length, axis=0))(
-            np.linspace(0.0, arc_length[-1], count)
-        )
-    )
+    slopes = np.gradient(knots, arc_length, axis=0)
+    curve = CubicHermiteSpline(arc_length, knots, slopes)
+    return np.asarray(curve(np.linspace(0.0, arc_length[-1], count)))
 
 
 def round_corners(
@@ -112,49 +111,57 @@ def round_corners(
         steps: edges of a rounded corner.
     """
     points = np.asarray(corners, dtype=np.float64)
-    radii = np.broadcast_to(
-        np.asarray(radius, dtype=np.float64), (max(len(points) - 2, 0),)
-    )
+    n_inner = max(len(points) - 2, 0)
+    radii = np.broadcast_to(np.asarray(radius, dtype=np.float64), (n_inner,))
     rounded_points = [points[0]]
-    for previous, corner, following, corner_radius in zip(
-        points, points[1:], points[2:], radii, strict=False
-    ):
-        to_previous = previous - corner
-        to_next = following - corner
-        # a little less than half an edge, so that two roundings never meet
-        reach = min(
-            float(corner_radius),
-            0.499 * float(np.linalg.norm(to_previous)),
-            0.499 * float(np.linalg.norm(to_next)),
-        )
-        if reach <= 1e-9:
-            rounded_points.append(corner)
-            continue
-        start = corner + normalize(to_previous) * reach
-        end = corner + normalize(to_next) * reach
-        t = np.linspace(0.0, 1.0, steps + 1)[:, None]
-        # quadratic Bezier curve whose control point is the corner
+    for index in range(n_inner):
+        previous, corner, following = points[index : index + 3]
         rounded_points.extend(
-            (1 - t) ** 2 * start + 2 * t * (1 - t) * corner + t**2 * end
+            _round_corner(previous, corner, following, float(radii[index]), steps)
         )
     rounded_points.append(points[-1])
     return np.array(rounded_points)
 
 
+def _round_corner(
+    previous: Array, corner: Array, following: Array, radius: float, steps: int
+) -> list[Array]:
+    """Return the points (D,) of a rounded corner between two other points.
+
+    Args:
+        previous, corner, following: three consecutive points (D,) of a polyline.
+        radius, steps: as of `round_corners`.
+    """
+    to_previous = previous - corner
+    to_next = following - corner
+    # a little less than half an edge, so that two roundings never meet
+    reach = min(
+        radius,
+        0.499 * float(np.linalg.norm(to_previous)),
+        0.499 * float(np.linalg.norm(to_next)),
+    )
+    if reach <= 1e-9:  # a sharp corner
+        return [corner]
+    start = corner + normalize(to_previous) * reach
+    end = corner + normalize(to_next) * reach
+    t = np.linspace(0.0, 1.0, steps + 1)[:, None]
+    # quadratic Bezier curve whose control point is the corner
+    return list((1 - t) ** 2 * start + 2 * t * (1 - t) * corner + t**2 * end)
+
+
 def subdivide(points: Points, longest: float) -> Array:
-    """Divide each edge of a polyline (K, D) that is longer than `longest` into equal
-    pieces.
+    """Divide the edges of a polyline (K, D) that are longer than `longest`.
+
+    All pieces of an edge are equally long.
     """
     curve = np.asarray(points, dtype=np.float64)
     parts = [curve[:1]]
     for start, end in pairwise(curve):
+        edge_length = float(np.linalg.norm(end - start))
         # The ratio is rounded, so that rounding errors add no piece.
-        n_pieces = max(
-            1, int(np.ceil(round(float(np.linalg.norm(end - start)) / longest, 6)))
-        )
-        parts.append(
-            start + (end - start) * (np.arange(1, n_pieces + 1) / n_pieces)[:, None]
-        )
+        n_pieces = max(1, int(np.ceil(round(edge_length / longest, 6))))
+        t = np.arange(1, n_pieces + 1) / n_pieces  # without the start
+        parts.append(start + (end - start) * t[:, None])
     return np.concatenate(parts)
 
 
@@ -292,20 +299,7 @@ def grid(
     rows, columns = points.shape[:2]
     u = np.broadcast_to(across, (rows, columns))
     v = np.broadcast_to(down[:, None], (rows, columns))
-
-    # index of the first vertex of each cell, and two triangles of its vertices
-    corner = np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)
-    two_triangles = [[0, 1, columns + 1, 0, columns + 1, columns]]
-    faces = (
-        (corner.reshape(-1)[:, None] + two_triangles).reshape(-1, 3).astype(np.int64)
-    )
-    area = np.linalg.norm(
-        assets.compute_area_vectors(points.reshape(-1, 3)[faces]), axis=1
-    )
-    # A triangle has no area where a row shrinks to a point.
-    has_area = area > 0.0
-    is_used = area > 1e-6 * float(np.median(area[has_area]))
-    faces = faces[is_used]
+    vertices = points.reshape(-1, 3)
     interpolate = RegularGridInterpolator(
         (down, across), points, bounds_error=False, fill_value=None
     )
@@ -314,16 +308,30 @@ def grid(
         """Return the points (N, 3) at chart coordinates (N,)."""
         return np.asarray(interpolate(np.stack([at_v, at_u], axis=-1)))
 
-    uvs = np.stack([u, v], axis=-1).reshape(-1, 2)
     return Patch(
         tag=tag,
-        vertices=points.reshape(-1, 3),
+        vertices=vertices,
         normals=normals.reshape(-1, 3),
-        uvs=uvs,
-        faces=faces,
+        uvs=np.stack([u, v], axis=-1).reshape(-1, 2),
+        faces=_grid_faces(vertices, rows, columns),
         size=size,
         rest=rest,
     )
+
+
+def _grid_faces(vertices: Array, rows: int, columns: int) -> assets.IntArray:
+    """Return the triangles (F, 3) of a grid of vertices (rows * columns, 3).
+
+    Triangles without area are left out: they are where a row shrinks to a point.
+    """
+    # index of the first vertex of each cell, and two triangles relative to it
+    first_vertex = np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)
+    two_triangles = [[0, 1, columns + 1, 0, columns + 1, columns]]
+    faces = (first_vertex.reshape(-1)[:, None] + two_triangles).reshape(-1, 3)
+    faces = faces.astype(np.int64)
+    area = np.linalg.norm(assets.compute_area_vectors(vertices[faces]), axis=1)
+    typical_area = float(np.median(area[area > 0.0]))
+    return faces[area > 1e-6 * typical_area]
 
 
 def _along(curve: Array) -> tuple[Array, float]:
@@ -338,13 +346,13 @@ def _fan(count: int) -> assets.IntArray:
     """Return the faces (count, 3) between vertex 0 and a ring of `count` vertices after
     it.
     """
-    j = np.arange(count)
-    return np.stack([np.zeros_like(j), 1 + j, 1 + (j + 1) % count], axis=1).astype(
-        np.int64
-    )
+    index = np.arange(count)  # of the vertices of the ring
+    following = (index + 1) % count
+    faces = np.stack([np.zeros_like(index), 1 + index, 1 + following], axis=1)
+    return faces.astype(np.int64)
 
 
-def _profile_normals(parts: Sequence[Array]) -> list[Array]:
+def _profile_normals(polylines: Sequence[Array]) -> list[Array]:
     """Return the unit normals (K, 2), as (r, z), of each of several consecutive
     polylines.
 
@@ -353,31 +361,39 @@ def _profile_normals(parts: Sequence[Array]) -> list[Array]:
     Where it ends on the axis, the normal there is along the axis. Where two polylines
     meet at less than `HARD_ANGLE` degrees, they share the mean of their normals.
     """
-    all_directions = []
-    for polyline in parts:
-        segments = np.diff(polyline, axis=0)
-        # central differences, one-sided at the ends
-        directions = np.concatenate(
-            [segments[:1], polyline[2:] - polyline[:-2], segments[-1:]]
-        )
-        for end in (0, -1):
-            if polyline[end, 0] < 1e-9:  # on the axis: horizontal, as at a pole
-                directions[end] = (segments[end][0], 0.0)
-        all_directions.append(normalize(directions))
-    for number in range(len(parts) - 1):
-        before = all_directions[number]
-        after = all_directions[number + 1]
-        gap = parts[number][-1] - parts[number + 1][0]
+    all_directions = [_profile_directions(polyline) for polyline in polylines]
+    for index in range(len(polylines) - 1):
+        before = all_directions[index]
+        after = all_directions[index + 1]
+        gap = polylines[index][-1] - polylines[index + 1][0]
         is_joined = float(np.linalg.norm(gap)) < 1e-9
         cosine = float(before[-1] @ after[0])
-        if is_joined and cosine > np.cos(np.radians(HARD_ANGLE)):
-            shared = normalize(before[-1] + after[0])
-            before[-1] = shared
-            after[0] = shared
+        is_smooth = cosine > np.cos(np.radians(HARD_ANGLE))
+        if is_joined and is_smooth:
+            mean_direction = normalize(before[-1] + after[0])
+            before[-1] = mean_direction
+            after[0] = mean_direction
     return [
         np.stack([directions[:, 1], -directions[:, 0]], axis=1)
         for directions in all_directions
     ]
+
+
+def _profile_directions(polyline: Array) -> Array:
+    """Return the unit directions (K, 2) of a profile (K, 2) of points (r, z).
+
+    They are horizontal where it ends on the axis, as at a pole.
+    """
+    segments = np.diff(polyline, axis=0)
+    # central differences, one-sided at the ends
+    directions = np.concatenate(
+        [segments[:1], polyline[2:] - polyline[:-2], segments[-1:]]
+    )
+    for end in (0, -1):
+        is_on_axis = polyline[end, 0] < 1e-9
+        if is_on_axis:
+            directions[end] = (segments[end][0], 0.0)
+    return normalize(directions)
 
 
 def _around(curve: Array, theta: Array) -> Array:
@@ -404,25 +420,20 @@ def _disc(tag: str, profile: Array, normals: Array, columns: int) -> Patch:
         normals: (K, 2), as (r, z), at these points.
         columns: faces around.
     """
-    ends_on_axis = profile[-1, 0] < 1e-9
-    # both from the axis outwards
-    curve = profile[::-1] if ends_on_axis else profile
-    normal = normals[::-1] if ends_on_axis else normals
+    # A profile that ends on the axis faces up, one that begins there faces down.
+    faces_up = profile[-1, 0] < 1e-9
+    from_axis = slice(None, None, -1) if faces_up else slice(None)
+    curve = profile[from_axis]
+    mirror = 1.0 if faces_up else -1.0  # of the chart, seen from above
     radial_fraction, length = _along(curve)
     theta = 2 * np.pi * np.arange(columns) / columns
-    # a profile that ends on the axis faces up: seen from above it is not mirrored
-    mirror = 1.0 if ends_on_axis else -1.0
-    vertices = _revolve_from_pole(curve, theta)
-    vertex_normals = _revolve_from_pole(normal, theta)
-    disc_uvs = [
-        0.5 + 0.5 * mirror * radial_fraction[1:, None] * np.cos(theta),
-        0.5 + 0.5 * radial_fraction[1:, None] * np.sin(theta),
+    chart_radius = 0.5 * radial_fraction[1:, None]
+    ring_uvs = [
+        0.5 + chart_radius * mirror * np.cos(theta),
+        0.5 + chart_radius * np.sin(theta),
     ]
-    uvs = np.concatenate([[[0.5, 0.5]], np.stack(disc_uvs, axis=-1).reshape(-1, 2)])
-
+    uvs = np.concatenate([[[0.5, 0.5]], np.stack(ring_uvs, axis=-1).reshape(-1, 2)])
     triangles = _disc_triangles(columns, curve)
-    if not ends_on_axis:
-        triangles = triangles[:, ::-1]  # it faces down
 
     def rest(u: Array, v: Array) -> Array:
         """Return the points (N, 3) at chart coordinates (N,)."""
@@ -430,24 +441,17 @@ def _disc(tag: str, profile: Array, normals: Array, columns: int) -> Patch:
         y = 2 * v - 1
         pole_distance = np.minimum(np.hypot(x, y), 1.0)
         radius = np.interp(pole_distance, radial_fraction, curve[:, 0])
+        z = np.interp(pole_distance, radial_fraction, curve[:, 1])
         angle = np.arctan2(y, x)
-        return np.stack(
-            [
-                radius * np.cos(angle),
-                radius * np.sin(angle),
-                np.interp(pole_distance, radial_fraction, curve[:, 1]),
-            ],
-            axis=-1,
-        )
+        return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=-1)
 
-    size = (2 * length, 2 * length)
     return Patch(
         tag=tag,
-        vertices=vertices,
-        normals=vertex_normals,
+        vertices=_revolve_from_pole(curve, theta),
+        normals=_revolve_from_pole(normals[from_axis], theta),
         uvs=uvs,
-        faces=triangles,
-        size=size,
+        faces=triangles if faces_up else triangles[:, ::-1],
+        size=(2 * length, 2 * length),
         rest=rest,
     )
 
@@ -472,7 +476,7 @@ def _disc_triangles(columns: int, curve: Array) -> assets.IntArray:
     next_column = (column + 1) % columns
     faces = [_fan(columns)]
     for row in range(len(curve) - 2):
-        # numbers of the first vertices of two rings
+        # indices of the first vertices of two rings
         inner = 1 + row * columns
         outer = 1 + (row + 1) * columns
         faces += [
@@ -502,12 +506,12 @@ def _wall(tag: str, profile: Array, normals: Array, columns: int) -> list[Patch]
     down, length = _along(profile)
     # a typical circumference: nearly the largest, whatever the profile does at its ends
     width = 2 * np.pi * float(np.quantile(profile[:, 0], 0.75))
-    if width <= 3 * length:
-        n_pieces = 1
-    elif width <= 6 * length or columns % 4:
-        n_pieces = 2
-    else:
+    can_be_quartered = columns % 4 == 0
+    n_pieces = 1
+    if width > 6 * length and can_be_quartered:
         n_pieces = 4
+    elif width > 3 * length:
+        n_pieces = 2
     piece_columns = columns // n_pieces
     across = np.arange(piece_columns + 1) / piece_columns
     size = (width / n_pieces, length)
@@ -528,11 +532,10 @@ def lathe(profile: Sequence[tuple[str, Points]], columns: int = 56) -> list[Patc
             flat and touches the axis, a band otherwise.
         columns: faces around the axis.
     """
+    tags = [tag for tag, _ in profile]
     curves = [np.asarray(curve, dtype=np.float64) for _, curve in profile]
     patches = []
-    for (tag, _), curve, normals in zip(
-        profile, curves, _profile_normals(curves), strict=True
-    ):
+    for tag, curve, normals in zip(tags, curves, _profile_normals(curves), strict=True):
         end_radii = (curve[0, 0], curve[-1, 0])
         touches_axis = min(end_radii) < 1e-9 <= max(end_radii)
         is_flat = abs(end_radii[1] - end_radii[0]) > 0.5 * _along(curve)[1]
@@ -563,24 +566,36 @@ def vessel(
     max_radius = float(outside[:, 0].max())
     fillet = min(1.5 * wall, 0.3 * max_radius)  # radius between wall and floor
     floor_radius = radius_at_height(inner[::-1], floor)
-    # Above the fillet, and not where the two sides of a narrow container meet.
-    is_wall = (inner[:, 1] > floor + fillet) & (inner[:, 0] > 0.05 * max_radius)
-    inner = inner[is_wall]
-    corner = np.array([floor_radius, floor])
     fillet_end = np.array([max(floor_radius - fillet, 0.4 * floor_radius), floor])
-    inside = np.concatenate([inner, _bezier(inner[-1], corner, fillet_end)])
-    # The base is hollow inside a foot ring.
-    foot = outside[0]
-    # how far the middle of the base lies above the foot ring
-    inset = min(0.35 * wall, 0.3 * floor)
-    base = [(0.0, inset), (0.86 * foot[0], inset), (0.9 * foot[0], foot[1]), foot]
+    # The wall is above the fillet, and not where the two sides of a narrow container
+    # meet.
+    is_wall = (inner[:, 1] > floor + fillet) & (inner[:, 0] > 0.05 * max_radius)
+    inner_wall = inner[is_wall]
+    rounding = _bezier(inner_wall[-1], np.array([floor_radius, floor]), fillet_end)
+    inside = np.concatenate([inner_wall, rounding])
+    outside_with_lip = np.concatenate([outside, lip, inner_wall[:1]])
+    base = _hollow_base(outside[0], wall, floor)
     pieces = [
         ("base", subdivide(base, longest=3 * step)),
-        ("outside", subdivide(np.concatenate([outside, lip, inner[:1]]), longest=step)),
+        ("outside", subdivide(outside_with_lip, longest=step)),
         ("inside", subdivide(inside, longest=step)),
         ("inside", subdivide([fillet_end, (0.0, floor)], longest=3 * step)),
     ]
     return lathe(pieces, columns=columns)
+
+
+def _hollow_base(
+    foot: Array, wall: float, floor: float
+) -> list[Sequence[float] | Array]:
+    """Return the profile of a container's base, which is hollow inside a foot ring.
+
+    Args:
+        foot: (r, z) of the outer edge of the foot ring.
+        wall, floor: as of `vessel`.
+    """
+    # how far the middle of the base lies above the foot ring
+    inset = min(0.35 * wall, 0.3 * floor)
+    return [(0.0, inset), (0.86 * foot[0], inset), (0.9 * foot[0], foot[1]), foot]
 
 
 def _bezier(start: Array, control: Array, end: Array) -> Array:
@@ -614,25 +629,22 @@ def _inner_profile(outside: Array, wall: float) -> tuple[Array, Array]:
 
 
 def _round_lip(outside: Array, wall: float, normal: Array) -> Array:
-    """Return five points (5, 2) of the half circle from the outside of a wall to its
-    inside.
+    """Return five points (5, 2) of the half circle over the lip of a wall.
 
-    Both ends of the half circle are left out.
+    It leads from the outside to the inside; its ends are left out.
 
     Args:
         outside: profile (K, 2) that ends at the lip.
         wall: thickness of the wall.
         normal: (K, 2) of the profile, outwards.
     """
-    lip_angle = np.pi * np.arange(1, 6) / 6
-    lip_center = outside[-1] - wall / 2 * normal[-1]
-    lip_across = wall / 2 * normal[-1]
-    # `lip_across` turned by a quarter to the left: on along the profile
-    lip_up = np.array([-lip_across[1], lip_across[0]])
+    angle = np.pi * np.arange(1, 6) / 6
+    center = outside[-1] - wall / 2 * normal[-1]
+    outwards = wall / 2 * normal[-1]
+    # turned by a quarter to the left: on along the profile
+    upwards = np.array([-outwards[1], outwards[0]])
     lip: Array = (
-        lip_center
-        + np.cos(lip_angle)[:, None] * lip_across
-        + np.sin(lip_angle)[:, None] * lip_up
+        center + np.cos(angle)[:, None] * outwards + np.sin(angle)[:, None] * upwards
     )
     return lip
 
@@ -640,7 +652,7 @@ def _round_lip(outside: Array, wall: float, normal: Array) -> Array:
 def sphere(
     tag: str,
     radius: float,
-    centre: Sequence[float] = (0.0, 0.0, 0.0),
+    center: Sequence[float] = (0.0, 0.0, 0.0),
     rows: int = 24,
     columns: int = 40,
 ) -> list[Patch]:
@@ -649,7 +661,7 @@ def sphere(
     Args:
         tag: tag of the paint.
         radius: radius of the sphere.
-        centre: centre of the sphere.
+        center: center of the sphere.
         rows: faces from pole to pole.
         columns: faces around the z axis.
     """
@@ -664,7 +676,7 @@ def sphere(
         (tag, curve[cut : rows - cut + 1]),
         (tag, curve[rows - cut :]),
     ]
-    return transform_patches(lathe(pieces, columns=columns), offset=centre)
+    return transform_patches(lathe(pieces, columns=columns), offset=center)
 
 
 def compute_frames(path: Array, first: Sequence[float]) -> tuple[Array, Array, Array]:
@@ -702,42 +714,30 @@ def sweep(
 
     Args:
         tag: tag of the paint.
-        path: the centres of the section.
+        path: the centers of the section.
         section: (M, 2) counter-clockwise, coordinates along the first and second
             normal.
-        scale: one number, (N,) or (N, 2): the section's scale at each centre; 0 closes
+        scale: one number, (N,) or (N, 2): the section's scale at each center; 0 closes
             the surface in a point.
         first: direction (3,) of the section's first axis at the start of the path.
         caps: close both ends with flat faces and a hard edge.
         frame: tangents and normals to use in place of `compute_frames(path, first)`.
     """
-    centres = np.asarray(path, dtype=np.float64)
-    tangent, first_normal, second_normal = (
-        compute_frames(centres, first) if frame is None else frame
-    )
-    scales = np.asarray(scale, dtype=np.float64)
-    if scales.ndim < 2:
-        scales = scales.reshape(-1, 1)
-    scales = np.broadcast_to(scales, (len(centres), 2))
-    points = _sweep_points(
-        section=section,
-        scales=scales,
-        centres=centres,
-        first_normal=first_normal,
-        second_normal=second_normal,
-    )
-    normals = _sweep_normals(points, tangent)
-    ring_fraction, ring_length = _along(np.concatenate([section, section[:1]]))
-    closed = np.concatenate([points, points[:, :1]], axis=1)
-    closed_normals = np.concatenate([normals, normals[:, :1]], axis=1)
-    down = mean_lengths(points)
+    centers = np.asarray(path, dtype=np.float64)
+    if frame is None:
+        frame = compute_frames(centers, first)
+    tangent, first_normal, second_normal = frame
+    scales = _to_axis_scales(scale, len(centers))
+    points = _sweep_points(section, scales, centers, first_normal, second_normal)
+    ring_fraction, ring_length = _along(_repeat_first(section, axis=0))
     # nearly the largest circumference, whatever the scale is at the ends
     width = ring_length * float(np.quantile(scales.mean(axis=1), 0.75))
+    down = mean_lengths(points)
     patches = [
         grid(
             tag,
-            closed,
-            closed_normals,
+            _repeat_first(points, axis=1),
+            _repeat_first(_sweep_normals(points, tangent), axis=1),
             size=(width, float(down[-1])),
             down=down / down[-1],
             across=ring_fraction,
@@ -751,20 +751,33 @@ def sweep(
     return patches
 
 
+def _to_axis_scales(scale: Array | Sequence[float] | float, count: int) -> Array:
+    """Return scales (count, 2) along both axes of a section; see `sweep`."""
+    scales = np.asarray(scale, dtype=np.float64)
+    if scales.ndim < 2:  # the same scale along both axes
+        scales = scales.reshape(-1, 1)
+    return np.broadcast_to(scales, (count, 2))
+
+
+def _repeat_first(rings: Array, axis: int) -> Array:
+    """Close rings of points by repeating the first one at the end of an axis."""
+    return np.concatenate([rings, np.take(rings, [0], axis=axis)], axis=axis)
+
+
 def _sweep_points(
     section: Array,
     scales: Array,
-    centres: Array,
+    centers: Array,
     first_normal: Array,
     second_normal: Array,
 ) -> Array:
-    """Return the points (N, M, 3) of a section (M, 2) at each of the centres (N, 3).
+    """Return the points (N, M, 3) of a section (M, 2) at each of the centers (N, 3).
 
     There it is scaled by `scales` (N, 2), and its two axes are the normals (N, 3).
     """
     scaled_section = section[None] * scales[:, None]
     return (
-        centres[:, None]
+        centers[:, None]
         + scaled_section[..., :1] * first_normal[:, None]
         + scaled_section[..., 1:] * second_normal[:, None]
     )
@@ -783,9 +796,10 @@ def _sweep_normals(points: Array, tangent: Array) -> Array:
     normals = np.cross(ring_tangent, np.gradient(points, axis=0))
     normal_length = np.linalg.norm(normals, axis=-1)
     normals = normalize(normals)
+    negligible_length = 1e-7 * float(normal_length.max())  # all points are one
     # outwards is backwards at the first ring, and forwards at the last
     for row, direction in ((0, -1.0), (-1, 1.0)):
-        is_point = normal_length[row] < 1e-7 * float(normal_length.max())
+        is_point = normal_length[row] < negligible_length
         normals[row][is_point] = direction * tangent[row]
     return normals
 
@@ -809,39 +823,41 @@ def cap(tag: str, ring: Array, normal: Array) -> Patch:
     bounding rectangle, with u in the direction from the middle to the first point of
     the ring.
     """
-    centre = ring.mean(axis=0)
-    x = normalize(ring[0] - centre)
-    x = normalize(x - (x @ normal) * normal)
-    y = np.cross(normal, x)
-    plane_points = np.stack([(ring - centre) @ x, (ring - centre) @ y], axis=1)
+    center = ring.mean(axis=0)
+    # axes of the plane; the first is made exactly perpendicular to the normal
+    to_first = normalize(ring[0] - center)
+    x_axis = normalize(to_first - (to_first @ normal) * normal)
+    y_axis = np.cross(normal, x_axis)
+    plane_points = np.stack(
+        [(ring - center) @ x_axis, (ring - center) @ y_axis], axis=1
+    )
     lower = plane_points.min(axis=0)
     extent = plane_points.max(axis=0) - plane_points.min(axis=0)
-    uvs = (np.concatenate([[[0.0, 0.0]], plane_points]) - lower) / extent
-    vertices = np.concatenate([centre[None], ring])
+    vertices = np.concatenate([center[None], ring])
+    plane_vertices = np.concatenate([[[0.0, 0.0]], plane_points])
 
     def rest(u: Array, v: Array) -> Array:
         """Return the points (N, 3) at chart coordinates (N,)."""
         return np.asarray(
-            centre
-            + (u * extent[0] + lower[0])[:, None] * x
-            + (v * extent[1] + lower[1])[:, None] * y
+            center
+            + (u * extent[0] + lower[0])[:, None] * x_axis
+            + (v * extent[1] + lower[1])[:, None] * y_axis
         )
 
-    size = (float(extent[0]), float(extent[1]))
     return Patch(
         tag=tag,
         vertices=vertices,
         normals=np.tile(normal, (len(vertices), 1)),
-        uvs=uvs,
+        uvs=(plane_vertices - lower) / extent,
         faces=_fan(len(ring)),
-        size=size,
+        size=(float(extent[0]), float(extent[1])),
         rest=rest,
     )
 
 
 def box(
     tag: str,
-    centre: Sequence[float],
+    center: Sequence[float],
     size: Sequence[float],
     bevel: float,
     steps: int = 2,
@@ -851,7 +867,7 @@ def box(
 
     Args:
         tag: tag of the paint.
-        centre: centre of the box.
+        center: center of the box.
         size: along x, y and z.
         bevel: radius of the edges.
         steps: cells across half of an edge's rounding.
@@ -859,32 +875,34 @@ def box(
     """
     half = np.asarray(size, dtype=np.float64) / 2
     bevel = min(bevel, 0.95 * float(half.min()))
-    core = half - bevel  # half the size of what lies within the rounded edges
+    flat = half - bevel  # half the size of the flat parts
+    coordinates = [
+        _edge_coordinates(float(half_length), bevel, steps, cells)
+        for half_length in flat
+    ]
     patches = []
-    for axis in range(3):
+    for axis, side in product(range(3), (1.0, -1.0)):
+        # the two axes of the face
         i = (axis + 1) % 3
         j = (axis + 2) % 3
-        for side in (1.0, -1.0):
-            u = _edge_coordinates(float(core[i]), bevel, steps, cells)
-            v = _edge_coordinates(float(core[j]), bevel, steps, cells)
-            normal, points = _rounded_face(
-                axis=axis, side=side, u=u, v=v, half=half, bevel=bevel
+        normals, points = _rounded_face(
+            axis, side, coordinates[i], coordinates[j], half, bevel
+        )
+        down = (coordinates[j] + half[j]) / (2 * half[j])
+        across = (coordinates[i] + half[i]) / (2 * half[i])
+        if side < 0:
+            # `_rounded_face` turns the lower face around, and with it u
+            across = 1.0 - across[::-1]
+        patches.append(
+            grid(
+                tag,
+                points + np.asarray(center, dtype=np.float64),
+                normals,
+                size=(2 * float(half[i]), 2 * float(half[j])),
+                down=down,
+                across=across,
             )
-            down = (v + half[j]) / (2 * half[j])
-            across = (u + half[i]) / (2 * half[i])
-            if side < 0:
-                # `_rounded_face` turns the lower face around, and with it u
-                across = 1.0 - across[::-1]
-            patches.append(
-                grid(
-                    tag,
-                    points + np.asarray(centre, dtype=np.float64),
-                    normal,
-                    size=(2 * float(half[i]), 2 * float(half[j])),
-                    down=down,
-                    across=across,
-                )
-            )
+        )
     return patches
 
 
@@ -920,19 +938,21 @@ def _rounded_face(
         bevel: radius of the edges.
     """
     core = half - bevel
-    cube = np.empty((len(v), len(u), 3))
-    cube[..., axis] = half[axis]
-    cube[..., (axis + 1) % 3] = u[None]
-    cube[..., (axis + 2) % 3] = v[:, None]
-    inner = np.clip(cube, -core, core)
-    normal = normalize(cube - inner)
-    points = inner + bevel * normal
-    if side < 0:  # half a turn about the j axis: keeps orientation
+    sharp_points = np.empty((len(v), len(u), 3))
+    sharp_points[..., axis] = half[axis]
+    sharp_points[..., (axis + 1) % 3] = u[None]
+    sharp_points[..., (axis + 2) % 3] = v[:, None]
+    core_points = np.clip(sharp_points, -core, core)
+    normals = normalize(sharp_points - core_points)
+    points = core_points + bevel * normals
+    if side < 0:
+        # The upper face, turned by half a turn about the axis of v, is the lower one:
+        # it still looks outwards.
         points = points[:, ::-1].copy()
-        normal = normal[:, ::-1].copy()
+        normals = normals[:, ::-1].copy()
         points[..., axis] *= -1.0
-        normal[..., axis] *= -1.0
-    return normal, points
+        normals[..., axis] *= -1.0
+    return normals, points
 
 
 # ---- cutting
@@ -969,17 +989,7 @@ def carve_patches(
     """
     carved_patches = []
     for patch in patches:
-        edges = _edges(patch)  # (E, 2)
-        value = np.array(inside(patch.vertices))  # (V,)
-        end_values = value[edges]
-        is_crossed = end_values[:, 0] * end_values[:, 1] < 0.0
-        crossed_edges = edges[is_crossed]
-        # how far the cut is from each end, as a fraction of the edge
-        distance = np.abs(end_values[is_crossed])
-        fraction = distance / distance.sum(axis=1, keepdims=True)
-        is_near = fraction < SNAP
-        # the cut goes through that vertex instead, which saves a sliver
-        value[crossed_edges[is_near]] = 0.0
+        value = _snap_to_vertices(patch, np.array(inside(patch.vertices)))
         if value.max() <= 0.0:
             carved_patches.append(patch)
             continue
@@ -995,6 +1005,26 @@ def carve_patches(
     return carved_patches
 
 
+def _snap_to_vertices(patch: Patch, value: Array) -> Array:
+    """Set the value of a vertex to 0 where a cut is very near to it (`SNAP`).
+
+    The cut then goes through that vertex, which saves a sliver.
+
+    Args:
+        patch: the patch that is cut.
+        value: value of the field at its vertices (V,), which is changed and returned.
+    """
+    edges = _edges(patch)  # (E, 2)
+    end_values = value[edges]
+    is_crossed = end_values[:, 0] * end_values[:, 1] < 0.0
+    # how far the cut is from each end, as a fraction of the edge
+    distance = np.abs(end_values[is_crossed])
+    fraction = distance / distance.sum(axis=1, keepdims=True)
+    is_near = fraction < SNAP
+    value[edges[is_crossed][is_near]] = 0.0
+    return value
+
+
 def crop_chart(patch: Patch) -> Patch:
     """Return the patch with its chart cropped to the part that its faces use.
 
@@ -1003,15 +1033,17 @@ def crop_chart(patch: Patch) -> Patch:
     used_uvs = patch.uvs[np.unique(patch.faces)]
     lower = used_uvs.min(axis=0)
     extent = np.ptp(used_uvs, axis=0)
-    size = (patch.size[0] * float(extent[0]), patch.size[1] * float(extent[1]))
-    uvs = np.clip((patch.uvs - lower) / extent, 0.0, 1.0)
+    width, height = patch.size
+
+    def rest(u: Array, v: Array) -> Array:
+        """Return the points (N, 3) at coordinates (N,) of the cropped chart."""
+        return patch.rest(lower[0] + u * extent[0], lower[1] + v * extent[1])
+
     return replace(
         patch,
-        uvs=uvs,
-        size=size,
-        rest=lambda u, v: patch.rest(
-            lower[0] + u * extent[0], lower[1] + v * extent[1]
-        ),
+        uvs=np.clip((patch.uvs - lower) / extent, 0.0, 1.0),
+        size=(width * float(extent[0]), height * float(extent[1])),
+        rest=rest,
     )
 
 
@@ -1033,29 +1065,29 @@ def _split(patch: Patch, value: Array) -> tuple[Patch, assets.BoolArray]:
         that is where the values are positive.
     """
     edges = _edges(patch)
-    is_crossed = value[edges[:, 0]] * value[edges[:, 1]] < 0.0
-    crossed = edges[is_crossed]
-    first, second = crossed.T
+    crossed_edges = edges[value[edges[:, 0]] * value[edges[:, 1]] < 0.0]
+    first, second = crossed_edges.T
     # where the value is 0, from the first vertex to the second
     fraction = (value[first] / (value[first] - value[second]))[:, None]
 
-    def interpolate(attribute: Array) -> Array:
-        """Return an attribute (V, k) of the vertices at the cuts."""
+    def add_cuts(attribute: Array) -> Array:
+        """Return an attribute (V, k) of the vertices, then of the cuts."""
         difference = attribute[second] - attribute[first]
-        return np.asarray(attribute[first] + fraction * difference)
+        return np.concatenate([attribute, attribute[first] + fraction * difference])
 
-    cut_normals = interpolate(patch.normals)
+    normals = add_cuts(patch.normals)
+    cut_normals = normals[len(patch.normals) :]
     cut_normals /= np.linalg.norm(cut_normals, axis=1, keepdims=True)
     cut_of_edge = {
         (int(start), int(end)): len(patch.vertices) + index
-        for index, (start, end) in enumerate(crossed)
+        for index, (start, end) in enumerate(crossed_edges)
     }
     faces, is_inside = _split_faces(patch, value, cut_of_edge)
     split_patch = replace(
         patch,
-        vertices=np.concatenate([patch.vertices, interpolate(patch.vertices)]),
-        normals=np.concatenate([patch.normals, cut_normals]),
-        uvs=np.concatenate([patch.uvs, interpolate(patch.uvs)]),
+        vertices=add_cuts(patch.vertices),
+        normals=normals,
+        uvs=add_cuts(patch.uvs),
         faces=np.array(faces),
     )
     return split_patch, np.array(is_inside)
@@ -1064,31 +1096,33 @@ def _split(patch: Patch, value: Array) -> tuple[Patch, assets.BoolArray]:
 def _split_faces(
     patch: Patch, value: Array, cut_of_edge: dict[tuple[int, int], int]
 ) -> tuple[list[tuple[int, int, int]], list[bool]]:
-    """Split the faces that change sign, and tell for each part whether it is inside.
+    """Split the faces that change sign; return all faces, and whether each is inside.
 
     Args:
         patch: before its new vertices are added.
         value: value of its vertices (V,), positive inside.
-        cut_of_edge: number of the new vertex of each edge that is cut, by the numbers
-            of its ends, the smaller one first.
+        cut_of_edge: index of the new vertex of each edge that is cut, by the indices of
+            its ends, the smaller one first.
     """
     faces: list[tuple[int, int, int]] = []
     is_inside: list[bool] = []
     for face in patch.faces:
         face_values = value[face]
-        if face_values.min() >= 0.0 or face_values.max() <= 0.0:
-            faces.append(tuple(int(i) for i in face))  # type: ignore[arg-type]
+        is_uncut = face_values.min() >= 0.0 or face_values.max() <= 0.0
+        if is_uncut:
+            first, second, third = map(int, face)
+            faces.append((first, second, third))
             is_inside.append(bool(face_values.sum() > 0.0))
             continue
-        # The parts on both sides share the cuts, whose value is 0; each part is a
-        # triangle or a quadrangle, which is divided as a fan.
+        # The parts on both sides share the cuts, whose value is 0.
         outline = _outline_with_cuts(face, value, cut_of_edge)
         for sign in (1.0, -1.0):
             polygon = [
                 vertex for vertex, vertex_value in outline if vertex_value * sign >= 0.0
             ]
-            for k in range(1, len(polygon) - 1):
-                faces.append((polygon[0], polygon[k], polygon[k + 1]))
+            # a triangle or a quadrangle, which is divided into triangles as a fan
+            for second, third in pairwise(polygon[1:]):
+                faces.append((polygon[0], second, third))
                 is_inside.append(sign > 0.0)
     return faces, is_inside
 
@@ -1098,7 +1132,7 @@ def _outline_with_cuts(
 ) -> list[tuple[int, float]]:
     """Return the vertices around a triangle, with the cuts of its edges between them.
 
-    Each is its number and its value; the value of a cut is 0.
+    Each is its index and its value; the value of a cut is 0.
     """
     outline: list[tuple[int, float]] = []
     for i in range(3):

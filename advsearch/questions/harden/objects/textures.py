@@ -1,6 +1,6 @@
 """Procedural base colors: functions from surface points to display-referred sRGB.
 
-A `Paint` maps `Texels` to (N, 3) colours in [0, 1]. Painting in object coordinates
+A `Paint` maps `Texels` to (N, 3) colors in [0, 1]. Painting in object coordinates
 (`xyz`) makes patterns run on across the edges of charts; painting in chart coordinates
 (`u`, `v` times `size`) suits patterns that should wrap around a part. Lengths are in
 the object's units.
@@ -19,8 +19,9 @@ from scipy.ndimage import map_coordinates
 
 from advsearch.questions.harden.objects.shapes import Array
 
-# ---- One way to write a family: each proportion and each colour is stated once, with
-# what else it may be ------------
+# ---- sampling: a family states each proportion and each color once, as its canonical
+# value with the range or the choices that other instances have
+# ----------------------------------------------------------------------------------
 
 T = TypeVar("T")
 Color = Array  # (3,) display-referred sRGB
@@ -35,7 +36,7 @@ def parse_hex_color(code: str) -> Color:
 class ParameterSampler:
     """Samples the parameters of an instance, or returns the canonical ones.
 
-    ``draw(9.4, low=7.6, high=12.0)`` is 9.4 without a generator, else uniform.
+    ``sampler(9.4, low=7.6, high=12.0)`` is 9.4 without a generator, else uniform.
     """
 
     # the source of randomness, or None for the canonical instance
@@ -67,30 +68,29 @@ class ParameterSampler:
             return np.array([1.7, 9.2, 5.5])
         return self.rng.uniform(0.0, 16.0, 3)
 
-    def sample_color(self, canonical: str, *others: str, wild: float = 0.4) -> Color:
-        """Return a color (3,) near one of those named, or with probability `wild` any
-        color.
+    def sample_color(
+        self, canonical: str, *others: str, p_random: float = 0.4
+    ) -> Color:
+        """Return a color near one of those named, or with `p_random` any color (3,).
 
         Without a generator it is the canonical one.
 
         Args:
             canonical, *others: codes of six hexadecimal digits, all equally likely.
-            wild: probability of any other color.
+            p_random: probability of any other color.
         """
         rng = self.rng
         if rng is None:
             return parse_hex_color(canonical)
-        if rng.random() < wild:
-            # any hue; saturated colors a little more often; no black
-            return np.array(
-                colorsys.hsv_to_rgb(
-                    rng.random(), rng.random() ** 0.7, rng.uniform(0.15, 0.97)
-                )
-            )
+        if rng.random() < p_random:
+            hue = rng.random()
+            saturation = rng.random() ** 0.7  # saturated colors a little more often
+            value = rng.uniform(0.15, 0.97)  # no black
+            return np.array(colorsys.hsv_to_rgb(hue, saturation, value))
         base = parse_hex_color(self.pick(canonical, *others))
-        return np.clip(
-            base * rng.uniform(0.85, 1.12) + rng.uniform(-0.05, 0.05, 3), 0.02, 0.98
-        )
+        brightness = rng.uniform(0.85, 1.12)
+        tint = rng.uniform(-0.05, 0.05, 3)
+        return np.clip(base * brightness + tint, 0.02, 0.98)
 
 
 Options = ParamSpec("Options")
@@ -155,7 +155,7 @@ def noise(points: Array) -> Array:
 
 
 def mix(a: Array, b: Array, weight: Array) -> Array:
-    """Blend colours (3,) or (N, 3) by (N,) weights: 0 gives a, 1 gives b."""
+    """Blend colors (3,) or (N, 3) by (N,) weights: 0 gives a, 1 gives b."""
     return a + (b - a) * weight[:, None]
 
 
@@ -208,9 +208,11 @@ def speckled(
 
     They take about the fraction `amount` of its area. `offset` (3,) is as of `mottled`.
     """
+    # The noise is seldom near 1, so that the threshold falls faster than `amount` grows.
+    threshold = 1.0 - 1.1 * amount
     return over(
         base,
-        lambda t: step(noise(t.xyz / scale + offset), 1.0 - 1.1 * amount, soft=0.12),
+        lambda t: step(noise(t.xyz / scale + offset), threshold, soft=0.12),
         solid(color),
     )
 
@@ -234,40 +236,43 @@ def wood(
 ) -> Array:
     """Paint wood with growth rings about `scale` apart, and fibers along an axis.
 
-    `color` is that of its light parts; `contrast` is by how much the grain is darker,
-    as a fraction. `offset` (3,) is as of `mottled`.
+    Args:
+        t: points to paint.
+        color: color of its light parts.
+        scale: distance of the growth rings, about.
+        offset: (3,) as of `mottled`.
+        axis: axis of the fibers: 0, 1 or 2.
+        contrast: by how much the grain is darker, as a fraction.
     """
     stretch = np.full(3, 1.0 / scale)
     stretch[axis] = 0.12 / scale  # the grain is long along the axis
     grain_position = t.xyz * stretch + offset
-    cross_axes = [i for i in range(3) if i != axis]
-    # a slanted plane wave, bent by noise
-    ring = (
-        grain_position[:, cross_axes[0]]
-        + 0.6 * grain_position[:, cross_axes[1]]
+    first_cross, second_cross = (i for i in range(3) if i != axis)
+    # growth rings are a slanted plane wave, bent by noise
+    ring_phase = (
+        grain_position[:, first_cross]
+        + 0.6 * grain_position[:, second_cross]
         + 1.6 * noise(grain_position * 0.45)
     )
-    rings = 0.5 + 0.5 * np.sin(2 * np.pi * ring * 0.8)
-    # finer across the axis than the rings are
-    fibre = noise(grain_position * np.where(np.arange(3) == axis, 1.0, 4.0))
-    grain = contrast * (0.55 * rings**2 + 0.45 * fibre)
-    # 1.12 makes up for some of what the grain darkens
-    return np.asarray(np.clip(color * (1.0 - grain)[:, None] * 1.12, 0.0, 1.0))
+    rings = 0.5 + 0.5 * np.sin(2 * np.pi * ring_phase * 0.8)
+    # fibers are four times as fine across the axis as the rings are
+    is_axis = np.arange(3) == axis
+    fibers = noise(grain_position * np.where(is_axis, 1.0, 4.0))
+    grain = contrast * (0.55 * rings**2 + 0.45 * fibers)
+    brightening = 1.12  # makes up for some of what the grain darkens
+    return np.asarray(np.clip(color * (1.0 - grain)[:, None] * brightening, 0.0, 1.0))
 
 
 @painter
 def rings(
-    t: Texels, a: Color, b: Color, period: float, share: float = 0.5, axis: int = 2
+    t: Texels, a: Color, b: Color, period: float, fraction: float = 0.5, axis: int = 2
 ) -> Array:
-    """Paint stripes across an axis, one in every `period`; color b takes `share` of it.
+    """Paint stripes across an axis, one in each `period`; `fraction` of it is color b.
 
     Where the axis is z, these are rings around an upright object.
     """
-    return mix(
-        a,
-        b,
-        step(share / 2 - np.abs(t.xyz[:, axis] / period % 1.0 - 0.5), 0.0, soft=0.06),
-    )
+    distance_from_middle = np.abs(t.xyz[:, axis] / period % 1.0 - 0.5)
+    return mix(a, b, step(fraction / 2 - distance_from_middle, 0.0, soft=0.06))
 
 
 def _cells(t: Texels, cell: float) -> tuple[Array, Array]:
@@ -281,19 +286,16 @@ def _cells(t: Texels, cell: float) -> tuple[Array, Array]:
 
 @painter
 def stripes(
-    t: Texels, a: Color, b: Color, cell: float, share: float = 0.5, slant: int = 0
+    t: Texels, a: Color, b: Color, cell: float, fraction: float = 0.5, slant: int = 0
 ) -> Array:
     """Paint stripes of color b on a, which run up the chart, about `cell` apart.
 
-    They take `share` of the width, and shift by `slant` cells from the bottom to the
+    They take `fraction` of the width, and shift by `slant` cells from the bottom to the
     top.
     """
     across, _ = _cells(t, cell)
-    return mix(
-        a,
-        b,
-        step(share / 2 - np.abs((across + slant * t.v) % 1.0 - 0.5), 0.0, soft=0.08),
-    )
+    distance_from_middle = np.abs((across + slant * t.v) % 1.0 - 0.5)
+    return mix(a, b, step(fraction / 2 - distance_from_middle, 0.0, soft=0.08))
 
 
 @painter
@@ -309,29 +311,23 @@ def dots(base: Paint, color: Color, cell: float, radius: float = 0.3) -> Paint:
     Cells are about `cell` wide; the radius of the dots is in cells.
     """
 
-    def staggered(t: Texels) -> Array:
-        """Return the mask of the dots; every other row is shifted by half a cell."""
+    def dot_mask(t: Texels) -> Array:
+        """Return 1 inside the dots; every other row is shifted by half a cell."""
         across, up = _cells(t, cell)
         across = across + 0.5 * (np.floor(up) % 2.0)
-        return step(
-            radius - np.hypot(across % 1.0 - 0.5, up % 1.0 - 0.5), 0.0, soft=0.1
-        )
+        center_distance = np.hypot(across % 1.0 - 0.5, up % 1.0 - 0.5)
+        return step(radius - center_distance, 0.0, soft=0.1)
 
-    return over(base, staggered, solid(color))
+    return over(base, dot_mask, solid(color))
 
 
 @painter
 def zigzag(t: Texels, a: Color, b: Color, cell: float) -> Array:
     """Paint chevrons around the chart, `cell` high."""
     across, up = _cells(t, cell)
-    # distance from the middle of a line whose height follows a triangular wave
-    return mix(
-        a,
-        b,
-        step(
-            0.25 - np.abs((up + np.abs(across % 1.0 - 0.5)) % 1.0 - 0.5), 0.0, soft=0.1
-        ),
-    )
+    line_height = np.abs(across % 1.0 - 0.5)  # a triangular wave
+    distance_from_line = np.abs((up + line_height) % 1.0 - 0.5)
+    return mix(a, b, step(0.25 - distance_from_line, 0.0, soft=0.1))
 
 
 @painter
@@ -383,17 +379,16 @@ def facing(
 
 
 def sample_paint(sampler: ParameterSampler, size: float) -> Paint:
-    """Sample a paint of any kind and colors, for textures that do not indicate the
-    class.
+    """Sample a paint of any kind and colors, so that textures don't give away a class.
 
     Args:
         sampler: sampler with a generator.
         size: size of the instance, about.
     """
-    first_color = sampler.sample_color("808080", wild=1.0)
-    second_color = sampler.sample_color("808080", wild=1.0)
+    a = sampler.sample_color("808080", p_random=1.0)
+    b = sampler.sample_color("808080", p_random=1.0)
     cell = size * sampler(0.1, low=0.05, high=0.2)
-    noise_offset = sampler.offset()
+    offset = sampler.offset()
     kind = sampler.pick(
         "solid",
         "rings",
@@ -406,72 +401,60 @@ def sample_paint(sampler: ParameterSampler, size: float) -> Paint:
         "gradient",
         "wood",
     )
-    if kind == "rings":
-        return rings(
-            first_color,
-            second_color,
-            period=cell,
-            share=sampler(0.5, low=0.2, high=0.8),
-            axis=int(sampler.pick(0, 1, 2)),
-        )
+    if kind in ("mottled", "speckled", "wood"):
+        return _sample_irregular_paint(sampler, kind, a, b, cell, offset)
+    if kind in ("rings", "gradient"):
+        return _sample_paint_along_axis(sampler, kind, a, b, cell, size)
     if kind == "stripes":
         return stripes(
-            first_color,
-            second_color,
+            a,
+            b,
             cell=cell,
-            share=sampler(0.5, low=0.2, high=0.8),
+            fraction=sampler(0.5, low=0.2, high=0.8),
             slant=int(sampler.pick(0, 1, 3)),
         )
-    if kind == "checks":
-        return checks(first_color, second_color, cell=cell)
     if kind == "dots":
-        return dots(
-            solid(first_color),
-            second_color,
-            cell=cell,
-            radius=sampler(0.3, low=0.18, high=0.42),
-        )
+        radius = sampler(0.3, low=0.18, high=0.42)
+        return dots(solid(a), b, cell=cell, radius=radius)
+    if kind == "checks":
+        return checks(a, b, cell=cell)
     if kind == "zigzag":
-        return zigzag(first_color, second_color, cell=cell)
+        return zigzag(a, b, cell=cell)
+    return solid(a)
+
+
+def _sample_irregular_paint(
+    sampler: ParameterSampler, kind: str, a: Color, b: Color, cell: float, offset: Array
+) -> Paint:
+    """Sample clouds or specks of two colors, or wood, which has a color of its own."""
     if kind == "mottled":
-        return mottled(
-            first_color,
-            second_color,
-            scale=1.5 * cell,
-            offset=noise_offset,
-            contrast=sampler(2.0, low=1.0, high=4.0),
-        )
+        contrast = sampler(2.0, low=1.0, high=4.0)
+        return mottled(a, b, scale=1.5 * cell, offset=offset, contrast=contrast)
     if kind == "speckled":
-        return speckled(
-            solid(first_color),
-            second_color,
-            scale=0.4 * cell,
-            offset=noise_offset,
-            amount=sampler(0.2, low=0.1, high=0.4),
-        )
-    if kind == "gradient":
-        return gradient(
-            first_color,
-            second_color,
-            low=0.0,
-            high=size,
-            axis=int(sampler.pick(0, 1, 2)),
-        )
-    if kind == "wood":
-        return wood(
-            sampler.sample_color("9a6a3c", "c89b62", "5b3a22"),
-            scale=0.5 * cell,
-            offset=noise_offset,
-            axis=int(sampler.pick(0, 1, 2)),
-        )
-    return solid(first_color)
+        amount = sampler(0.2, low=0.1, high=0.4)
+        return speckled(solid(a), b, scale=0.4 * cell, offset=offset, amount=amount)
+    timber = sampler.sample_color("9a6a3c", "c89b62", "5b3a22")
+    axis = int(sampler.pick(0, 1, 2))
+    return wood(timber, scale=0.5 * cell, offset=offset, axis=axis)
+
+
+def _sample_paint_along_axis(
+    sampler: ParameterSampler, kind: str, a: Color, b: Color, cell: float, size: float
+) -> Paint:
+    """Sample rings, or a gradient over the size of the instance, along an axis."""
+    if kind == "rings":
+        fraction = sampler(0.5, low=0.2, high=0.8)
+        axis = int(sampler.pick(0, 1, 2))
+        return rings(a, b, period=cell, fraction=fraction, axis=axis)
+    axis = int(sampler.pick(0, 1, 2))
+    return gradient(a, b, low=0.0, high=size, axis=axis)
 
 
 def paint_or_random(
-    sampler: ParameterSampler, size: float, paint: Paint, wild: float = 0.35
+    sampler: ParameterSampler, size: float, paint: Paint, p_random: float = 0.35
 ) -> Paint:
-    """Return the paint, or with probability `wild` a sample of `sample_paint`.
+    """Return the paint, or with probability `p_random` a sample of `sample_paint`.
 
     The canonical instance has the paint.
     """
-    return sample_paint(sampler, size) if sampler.chance(wild) else paint
+    return sample_paint(sampler, size) if sampler.chance(p_random) else paint

@@ -1,10 +1,11 @@
-"""Ball, banana and book. Units are centimetres."""
+"""Ball, banana, book and stop sign. Units are centimetres, but for the stop sign."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -53,26 +54,34 @@ HEXAGONS = shapes.normalize(
     np.array([PENTAGONS[list(face)].sum(axis=0) for face in _FACES])
 )
 """The 20 unit directions of its face middles: the middles of the light panels."""
+PENTAGON_DISTANCE = 0.9393
+"""Distance of the pentagons from the center of a truncated icosahedron whose corners are
+at a distance of 1.
+"""
+HEXAGON_DISTANCE = 0.9149
+"""The same of its hexagons."""
+BANANA_POINTS = 44  # points of the path of a banana
+COVER_SHIFT = 0.25
+"""By how much the covers of a book are farther at +x than its middle."""
 
 
-def football_seams(direction: Array) -> tuple[Array, Array]:
+def football_seams(directions: Array) -> tuple[Array, Array]:
     """Return how far unit directions (N, 3) are from the seams of a football.
 
     The panels are the faces of a truncated icosahedron. A direction crosses the face
     for which its projection on the face's normal, over the face's distance from the
-    centre, is largest.
+    center, is largest.
 
     Returns:
         About the distance to the nearest seam (N,), and whether the panel is a pentagon
         (N,).
     """
-    # projections over the distances of both kinds of faces from the centre, if that of
-    # the corners is 1
-    pentagon = direction @ PENTAGONS.T / 0.9393
-    hexagon = direction @ HEXAGONS.T / 0.9149
-    both = np.sort(np.concatenate([pentagon, hexagon], axis=1), axis=1)
+    to_pentagons = directions @ PENTAGONS.T / PENTAGON_DISTANCE
+    to_hexagons = directions @ HEXAGONS.T / HEXAGON_DISTANCE
+    ascending = np.sort(np.concatenate([to_pentagons, to_hexagons], axis=1), axis=1)
     # At a seam the two largest are equal.
-    return both[:, -1] - both[:, -2], pentagon.max(axis=1) > hexagon.max(axis=1)
+    seam_distance = ascending[:, -1] - ascending[:, -2]
+    return seam_distance, to_pentagons.max(axis=1) > to_hexagons.max(axis=1)
 
 
 def basketball_seams(directions: Array) -> Array:
@@ -102,7 +111,7 @@ def _press_seams(
     """Press grooves along seams into a sphere.
 
     Normals stay those of the sphere: in a picture the groove is a dark line, not an
-        edge.
+    edge.
 
     Args:
         patches: patches of the sphere, around the origin.
@@ -123,23 +132,19 @@ def _press_seams(
 
 @painter
 def _football(t: Texels, light: Array, dark: Array, offset: Array) -> Array:
-    """Paint dark pentagons, light hexagons and gray seams on a sphere around the
-    origin.
-    """
-    seam_distance, pentagon = football_seams(shapes.normalize(t.xyz))
-    # both a little darker in irregular clouds
-    base = (
-        mix(light, dark, pentagon.astype(np.float64))
-        * (1.0 - 0.06 * noise(t.xyz / 2.0 + offset))[:, None]
-    )
-    return mix(parse_hex_color("3a3a3a"), base, step(seam_distance, 0.012, soft=0.016))
+    """Paint dark pentagons, light hexagons and gray seams on a sphere at the origin."""
+    seam_distance, is_pentagon = football_seams(shapes.normalize(t.xyz))
+    panels = mix(light, dark, is_pentagon.astype(np.float64))
+    clouds = 1.0 - 0.06 * noise(t.xyz / 2.0 + offset)  # a little darker
+    off_seam = step(seam_distance, 0.012, soft=0.016)
+    return mix(parse_hex_color("3a3a3a"), panels * clouds[:, None], off_seam)
 
 
 @painter
 def _beach(t: Texels, colors: list[Array], light: Array, radius: float) -> Array:
     """Paint six segments in colors, and light caps at both poles."""
+    # the angle about z, from 0 to 1
     turn = np.arctan2(t.xyz[:, 1], t.xyz[:, 0]) / (2 * np.pi) % 1.0
-    # turn: the angle about z, in turns from 0 to 1
     segment = np.minimum((turn * 6).astype(np.int64), 5)  # a turn may round to 1
     is_pole = np.abs(t.xyz[:, 2]) > 0.955 * radius
     return np.where(is_pole[:, None], light, np.array(colors)[segment])
@@ -156,104 +161,101 @@ def _star(t: Texels, radius: float) -> Array:
     """Return the mask of a star with five points on a sphere, seen along z."""
     x = t.xyz[:, 0]
     y = t.xyz[:, 1]
-    return step(
-        np.cos(5 * np.arctan2(y, x)) * 0.25 - np.hypot(x, y) / radius, -0.55, soft=0.04
-    )
+    points = np.cos(5 * np.arctan2(y, x)) * 0.25  # five maxima around z
+    return step(points - np.hypot(x, y) / radius, -0.55, soft=0.04)
 
 
 @family(metres=0.01)
 def ball(sampler: ParameterSampler) -> Instance:
     """Make a football, or a ball of another pattern."""
     radius = 11.0
+    # "random" is named twice, to be sampled twice as often
     style = sampler.pick(
-        "football", "beach", "basket", "tennis", "star", "plain", "wild", "wild"
+        "football", "beach", "basket", "tennis", "star", "plain", "random", "random"
     )
     squash = sampler(1.0, low=0.95, high=1.03)
-    patches = shapes.sphere("ball", radius, rows=28, columns=48)
-    turn = shapes.rotation("z", sampler(12.0, low=0.0, high=360.0)) @ shapes.rotation(
-        "x", sampler(24.0, low=0.0, high=180.0)
-    )
+    about_z = shapes.rotation("z", sampler(12.0, low=0.0, high=360.0))
+    about_x = shapes.rotation("x", sampler(24.0, low=0.0, high=180.0))
     offset = sampler.offset()
-    light = sampler.sample_color("f1f0ea", "f4f4f2", "e8d34a", wild=0.3)
-    dark = sampler.sample_color("1d1f22", "23395d", "b5442e", wild=0.3)
-    paint, patches = _ball_surface(
-        sampler,
-        style=style,
-        light=light,
-        radius=radius,
-        offset=offset,
-        patches=patches,
-        dark=dark,
-    )
-    shaped = [
-        replace(p, vertices=p.vertices * np.array([1.0, 1.0, squash]))
-        for p in shapes.transform_patches(patches, turn)
+    light = sampler.sample_color("f1f0ea", "f4f4f2", "e8d34a", p_random=0.3)
+    dark = sampler.sample_color("1d1f22", "23395d", "b5442e", p_random=0.3)
+    paint = _ball_paint(sampler, style, light, dark, radius, offset)
+    sphere = shapes.sphere("ball", radius, rows=28, columns=48)
+    patches = [
+        replace(patch, vertices=patch.vertices * np.array([1.0, 1.0, squash]))
+        for patch in shapes.transform_patches(
+            _press_ball(sphere, style, radius), about_z @ about_x
+        )
     ]
     return Instance(
-        shaped, {"ball": paint}, sample_material(sampler, roughness=0.4, clearcoat=0.3)
+        patches, {"ball": paint}, sample_material(sampler, roughness=0.4, clearcoat=0.3)
     )
 
 
-def _ball_surface(
+def _press_ball(sphere: list[Patch], style: str, radius: float) -> list[Patch]:
+    """Press the grooves of a football or a basketball into a sphere."""
+    if style == "basket":
+        return _press_seams(sphere, radius, 0.015, basketball_seams)
+    if style == "football":
+        # 1.5: grooves narrower than those of a basketball
+        return _press_seams(
+            sphere,
+            radius,
+            0.008,
+            lambda directions: football_seams(shapes.normalize(directions))[0] * 1.5,
+        )
+    return sphere
+
+
+def _ball_paint(
     sampler: ParameterSampler,
     style: str,
     light: Array,
+    dark: Array,
     radius: float,
     offset: Array,
-    patches: list[Patch],
-    dark: Array,
-) -> tuple[Paint, list[Patch]]:
-    """Sample the paint of a ball of a style, and return it with the ball's patches.
-
-    A football and a basketball have grooves pressed into their patches.
+) -> Paint:
+    """Sample the paint of a ball of a style.
 
     Args:
         sampler: samples colors.
-        style: "football", "beach", "basket", "tennis", "star", "plain" or "wild".
+        style: "football", "beach", "basket", "tennis", "star", "plain" or "random".
         light, dark: colors of some styles.
         radius: radius of the ball.
         offset: (3,) into the noise.
-        patches: patches of a sphere.
     """
     if style == "beach":
-        bright = [
-            sampler.sample_color(code, wild=0.5)
-            for code in "d8342c f4f4f2 2f6fb5 f4f4f2 eeb52d f4f4f2".split()
-        ]
-        paint = _beach(
-            [color if sampler.chance(0.7) else light for color in bright], light, radius
-        )
-    elif style == "basket":
-        skin = sampler.sample_color("c8642b", "b5532a", "7a3b22", wild=0.2)
-        paint = over(
+        return _beach(_beach_colors(sampler, light), light, radius)
+    if style == "basket":
+        skin = sampler.sample_color("c8642b", "b5532a", "7a3b22", p_random=0.2)
+        return over(
             clouded(skin, factor=0.85, scale=0.7, offset=offset),
             _near_to(basketball_seams, reach=0.03),
             solid("1b1715"),
         )
-        patches = _press_seams(patches, radius, 0.015, basketball_seams)
-    elif style == "tennis":
-        felt = sampler.sample_color("c9d63c", "d5dc4a", "e08a2e", wild=0.25)
-        paint = over(
+    if style == "tennis":
+        felt = sampler.sample_color("c9d63c", "d5dc4a", "e08a2e", p_random=0.25)
+        return over(
             clouded(felt, factor=0.85, scale=0.6, offset=offset),
             _near_to(tennis_seam, reach=0.045),
             solid("eeeee6"),
         )
-    elif style == "star":
-        paint = over(solid(dark), _star(radius), solid(light))
-    elif style == "plain":
-        paint = clouded(dark, factor=1.2, scale=3.0, offset=offset)
-    elif style == "wild":
-        paint = sample_paint(sampler, 2 * radius)
-    else:
-        paint = _football(light, dark, offset)
-        patches = _press_seams(
-            patches,
-            radius,
-            0.008,
-            # grooves narrower than those of a basketball
-            lambda d: football_seams(shapes.normalize(d))[0] * 1.5,
-        )
-    return paint, patches
+    if style == "star":
+        return over(solid(dark), _star(radius), solid(light))
+    if style == "plain":
+        return clouded(dark, factor=1.2, scale=3.0, offset=offset)
+    if style == "random":
+        return sample_paint(sampler, 2 * radius)
+    return _football(light, dark, offset)
+
+
+def _beach_colors(sampler: ParameterSampler, light: Array) -> list[Array]:
+    """Sample the colors of a beach ball's six segments, some of them light."""
+    bright_colors = [
+        sampler.sample_color(code, p_random=0.5)
+        for code in "d8342c f4f4f2 2f6fb5 f4f4f2 eeb52d f4f4f2".split()
+    ]
+    return [color if sampler.chance(0.7) else light for color in bright_colors]
 
 
 @family(metres=0.01)
@@ -261,11 +263,10 @@ def banana(sampler: ParameterSampler) -> Instance:
     """Make a banana of random bend and ripeness."""
     length = sampler(19.0, low=15.0, high=22.0)
     bend = sampler(105.0, low=65.0, high=130.0)
-    thick = sampler(1.65, low=1.45, high=2.1)
-    stem = sampler(2.4, low=1.6, high=3.6)
-    path, radius = _banana_shape(
-        sampler, bend=bend, length=length, stem=stem, thick=thick
-    )
+    max_radius = sampler(1.65, low=1.45, high=2.1)
+    stem_length = sampler(2.4, low=1.6, high=3.6)
+    path = _banana_path(bend, length)
+    radius = _banana_radius(sampler, length, stem_length, max_radius)
     section = _banana_section(sampler)
     patches = shapes.sweep(
         "banana", path, section, radius, first=(0.0, 0.0, 1.0), caps=True
@@ -276,50 +277,55 @@ def banana(sampler: ParameterSampler) -> Instance:
     patches = shapes.transform_patches(
         patches, shapes.rotation("z", sampler(78.0, low=45.0, high=120.0))
     )
-
-    paint = _banana_paint(sampler, path, stem)
-
+    paint = _banana_paint(sampler, path, stem_length)
     return Instance(
         patches,
-        {"banana": paint_or_random(sampler, length, paint, wild=0.4)},
+        {"banana": paint_or_random(sampler, length, paint, p_random=0.4)},
         sample_material(sampler, roughness=0.45, clearcoat=0.1),
     )
 
 
-def _banana_shape(
-    sampler: ParameterSampler, bend: float, length: float, stem: float, thick: float
-) -> tuple[Array, Array]:
-    """Return the path (N, 3) of a banana from its stem, and its radius (N,) along it.
+def _banana_path(bend: float, length: float) -> Array:
+    """Return the path (`BANANA_POINTS`, 3) of a banana in the x-y plane, from its stem.
 
-    The path is in the x-y plane.
+    Args:
+        bend: by how many degrees the path turns from end to end.
+        length: length of the path.
+    """
+    t = np.linspace(0.0, 1.0, BANANA_POINTS)
+    # direction of each step, from -bend/2 to bend/2; it turns faster at both ends
+    angle = np.radians(bend * (t + 0.05 * np.sin(2 * np.pi * t)) - bend / 2)[:-1]
+    step_length = length / (BANANA_POINTS - 1)
+    path = np.zeros((BANANA_POINTS, 3))
+    path[1:, 0] = np.cumsum(np.sin(angle)) * step_length
+    path[1:, 1] = np.cumsum(np.cos(angle)) * step_length
+    return path
+
+
+def _banana_radius(
+    sampler: ParameterSampler, length: float, stem_length: float, max_radius: float
+) -> Array:
+    """Return the radius (`BANANA_POINTS`,) of a banana along its path from the stem.
 
     Args:
         sampler: samples the thickness of the stem.
-        bend: by how many degrees the path turns from end to end.
         length: length of the path.
-        stem: length of the stem.
-        thick: the largest radius.
+        stem_length: length of the stem.
+        max_radius: the largest radius.
     """
-    count = 44
-    t = np.linspace(0.0, 1.0, count)
-    # direction of each step, from -bend/2 to bend/2; it turns faster at both ends
-    angle = np.radians(bend * (t + 0.05 * np.sin(2 * np.pi * t)) - bend / 2)[:-1]
-    path = np.zeros((count, 3))
-    path[1:, 0] = np.cumsum(np.sin(angle)) * (length / (count - 1))
-    path[1:, 1] = np.cumsum(np.cos(angle)) * (length / (count - 1))
-
-    position = t * length  # distance from the end of the stem
-    # the radius rises from the stem, and falls to a blunt tip
-    rise = np.clip((position - stem) / (0.26 * length), 0.0, 1.0) ** 0.75
+    # distance from the end of the stem
+    position = np.linspace(0.0, 1.0, BANANA_POINTS) * length
+    # from 0 to 1 over a quarter of the length: from the stem, and from the tip
+    rise = np.clip((position - stem_length) / (0.26 * length), 0.0, 1.0) ** 0.75
     fall = np.clip((length - position) / (0.24 * length), 0.0, 1.0) ** 0.62
-    body = np.sin(0.5 * np.pi * rise) * np.maximum(np.sin(0.5 * np.pi * fall), 0.26)
+    blunt_tip = np.maximum(np.sin(0.5 * np.pi * fall), 0.26)
+    body = np.sin(0.5 * np.pi * rise) * blunt_tip
     # the stem is thicker where it was cut
     neck = sampler(0.3, low=0.24, high=0.4)
-    stem_radius = neck * (1.0 + 0.25 * np.exp(-position / 0.5))
-    radius = thick * np.maximum(stem_radius, body)
+    stem = neck * (1.0 + 0.25 * np.exp(-position / 0.5))
+    radius = max_radius * np.maximum(stem, body)
     # smoothed by a mean of five
-    radius = np.convolve(np.pad(radius, 2, mode="edge"), np.ones(5) / 5, mode="valid")
-    return path, radius
+    return np.convolve(np.pad(radius, 2, mode="edge"), np.ones(5) / 5, mode="valid")
 
 
 def _banana_section(sampler: ParameterSampler) -> Array:
@@ -331,40 +337,65 @@ def _banana_section(sampler: ParameterSampler) -> Array:
     return np.stack([np.cos(phi), np.sin(phi)], axis=1) * lumps[:, None]
 
 
-def _banana_paint(sampler: ParameterSampler, path: Array, stem: float) -> Paint:
+def _banana_paint(sampler: ParameterSampler, path: Array, stem_length: float) -> Paint:
     """Sample the paint of a banana: green and brown towards its ends, with flecks.
 
     Args:
         sampler: samples its color and how many flecks it has.
         path: (N, 3) of the banana, whose ends are those of the stem and of the tip.
-        stem: length of the stem.
+        stem_length: length of the stem.
     """
     offset = sampler.offset()
-    skin = sampler.sample_color("f0c930", "f3d64a", "e3b62a", "b7c04a", wild=0.0)
-    tip, brown, green = map(parse_hex_color, ("3a2a18", "6b4520", "a9b13c"))
-    amount = sampler(0.1, low=0.0, high=0.22)
+    skin = sampler.sample_color("f0c930", "f3d64a", "e3b62a", "b7c04a", p_random=0.0)
+    dark = parse_hex_color("3a2a18")
+    brown = parse_hex_color("6b4520")
+    green = parse_hex_color("a9b13c")
+    fleck_amount = sampler(0.1, low=0.0, high=0.22)
 
     def paint(t: Texels) -> Array:
         """Paint the skin, then green, flecks, the brown stem and both dark ends."""
-        xyz = t.xyz
-        stem_distance = np.linalg.norm(xyz - path[0], axis=1)
-        tip_distance = np.linalg.norm(xyz - path[-1], axis=1)
-        color = mix(skin, shade(skin, 0.86), noise(xyz / 2.2 + offset))
-        stem_green = np.clip(1.0 - (stem_distance - 0.9 * stem) / 2.6, 0.0, 1.0)
+        stem_distance = np.linalg.norm(t.xyz - path[0], axis=1)
+        tip_distance = np.linalg.norm(t.xyz - path[-1], axis=1)
+        color = mix(skin, shade(skin, 0.86), noise(t.xyz / 2.2 + offset))
+        stem_green = np.clip(1.0 - (stem_distance - 0.9 * stem_length) / 2.6, 0.0, 1.0)
+        tip_green = np.clip(1.0 - tip_distance / 2.2, 0.0, 1.0)
         color = mix(color, green, stem_green * 0.75)
-        color = mix(color, green, np.clip(1.0 - tip_distance / 2.2, 0.0, 1.0) * 0.5)
-        fleck = step(
-            noise(xyz * np.array([1.9, 1.9, 3.1]) + offset), 1.0 - amount, soft=0.08
-        )
-        fleck = np.maximum(
-            fleck, step(noise(xyz * 3.7 + offset), 1.02 - amount, soft=0.08)
-        )
-        color = mix(color, brown, fleck * 0.85)
-        color = mix(color, brown, step(-stem_distance, -0.5 * stem, soft=1.3) * 0.5)
-        color = mix(color, tip, step(-stem_distance, -0.45, soft=0.5))
-        return mix(color, tip, step(-tip_distance, -0.75, soft=0.5))
+        color = mix(color, green, tip_green * 0.5)
+        color = mix(color, brown, _flecks(t.xyz, offset, fleck_amount) * 0.85)
+        stem_brown = step(-stem_distance, -0.5 * stem_length, soft=1.3)
+        color = mix(color, brown, stem_brown * 0.5)
+        color = mix(color, dark, step(-stem_distance, -0.45, soft=0.5))
+        return mix(color, dark, step(-tip_distance, -0.75, soft=0.5))
 
     return paint
+
+
+def _flecks(points: Array, offset: Array, amount: float) -> Array:
+    """Return the mask (N,) of a banana's flecks at points (N, 3): large and small ones.
+
+    Args:
+        points: points of the surface.
+        offset: (3,) into the noise.
+        amount: how much of the surface they take; not a fraction.
+    """
+    large_noise = noise(points * np.array([1.9, 1.9, 3.1]) + offset)
+    small_noise = noise(points * 3.7 + offset)
+    large = step(large_noise, 1.0 - amount, soft=0.08)
+    return np.maximum(large, step(small_noise, 1.02 - amount, soft=0.08))
+
+
+class _BookSize(NamedTuple):
+    """The size of a book that lies on its back cover.
+
+    Attributes:
+        width: extent along x, from the spine to the edge of the covers.
+        height: extent along y.
+        thickness: extent along z.
+    """
+
+    width: float
+    height: float
+    thickness: float
 
 
 @family(metres=0.01)
@@ -375,129 +406,113 @@ def book(sampler: ParameterSampler) -> Instance:
     """
     width = sampler(15.5, low=12.0, high=18.0)
     height = 22.5
-    thick = sampler(4.2, low=2.2, high=6.0)
-    board = sampler(0.34, low=0.2, high=0.45)
-    lip = sampler(0.4, low=0.2, high=0.6)
+    size = _BookSize(width, height, thickness=sampler(4.2, low=2.2, high=6.0))
+    board = sampler(0.34, low=0.2, high=0.45)  # thickness of a cover
+    overhang = sampler(0.4, low=0.2, high=0.6)  # of the covers over the pages
     bulge = sampler(0.35, low=0.0, high=0.7)
     patches: list[Patch] = []
-    for z in (board / 2, thick - board / 2):
+    for z in (board / 2, size.thickness - board / 2):
         patches += shapes.box(
-            "cover", (0.25, 0.0, z), (width, height, board), bevel=0.12
+            "cover", (COVER_SHIFT, 0.0, z), (width, height, board), bevel=0.12
         )
-    size = (width - lip - 0.5, height - 2 * lip, thick - 2 * board + 0.04)
     patches += shapes.box(
-        "pages", (0.3 - lip / 2, 0.0, thick / 2), size, bevel=0.05, steps=1
+        "pages",
+        (0.3 - overhang / 2, 0.0, size.thickness / 2),
+        (
+            width - overhang - 0.5,
+            height - 2 * overhang,
+            size.thickness - 2 * board + 0.04,  # no gap to the covers
+        ),
+        bevel=0.05,
+        steps=1,
     )
-    patches += _round_spine(
-        thick=thick, width=width, bulge=bulge, board=board, height=height
-    )
-    turned = shapes.transform_patches(
+    patches += _round_spine(size, bulge, board)
+    rotated = shapes.transform_patches(
         patches, shapes.rotation("z", sampler(-122.0, low=-150.0, high=-100.0))
     )
-
-    front, pages_paint, spine = _book_paints(sampler, height, width, thick)
-
     return Instance(
-        turned,
-        {"cover": front, "pages": pages_paint, "spine": spine},
+        rotated,
+        _book_paints(sampler, size),
         sample_material(sampler, roughness=0.55, clearcoat=0.0),
     )
 
 
-def _round_spine(
-    thick: float, width: float, bulge: float, board: float, height: float
-) -> list[Patch]:
+def _round_spine(size: _BookSize, bulge: float, board: float) -> list[Patch]:
     """Create the rounded spine of a book.
 
     Its section in the x-z plane lies between two half ellipses that bulge towards -x.
 
     Args:
-        thick, width, height: thick, width and height of the book.
+        size: the size of the book.
         bulge: by how much it bulges.
         board: its thickness, which is that of the covers.
     """
-    half = thick / 2
+    half = size.thickness / 2
     angle = np.linspace(-np.pi / 2, np.pi / 2, 9)
-    cosine = np.cos(angle)
-    sine = np.sin(angle)
-    # points (x, z); -width / 2 + 0.25 is the edge of the covers, which the spine
-    # overlaps a little on both sides
-    outer = np.stack(
-        [-width / 2 + 0.25 - bulge * cosine - 0.1, half + half * sine], axis=1
-    )
-    inner = np.stack(
-        [-width / 2 + 0.25 - bulge * cosine + board, half + (half - board) * sine],
-        axis=1,
-    )[::-1]
-    return _spine(outer, inner, height)
+    cover_edge = -size.width / 2 + COVER_SHIFT
+    x = cover_edge - bulge * np.cos(angle)
+    # It overlaps the covers a little on both sides: by 0.1 and by its thickness.
+    outer = np.stack([x - 0.1, half + half * np.sin(angle)], axis=1)
+    inner = np.stack([x + board, half + (half - board) * np.sin(angle)], axis=1)
+    return _spine(outer, inner[::-1], size.height)
 
 
-def _book_paints(
-    sampler: ParameterSampler, height: float, width: float, thick: float
-) -> tuple[Paint, Paint, Paint]:
-    """Sample the paints of the cover, the pages and the spine of a book, in this order.
+def _book_paints(sampler: ParameterSampler, size: _BookSize) -> dict[str, Paint]:
+    """Sample the paints of a book by the tags of its parts.
 
     Args:
         sampler: samples the paints.
-        height, width, thick: height, width and thick of the book.
+        size: the size of the book.
     """
     offset = sampler.offset()
-    cloth = sampler.sample_color(
+    cloth_color = sampler.sample_color(
         "7a1f2b", "1f3f5f", "2f5b46", "20242a", "c98a3a", "5b3a6b", "d8d0bd"
     )
-    gold = sampler.sample_color("d8b45a", "efe6cf", "1d1f22", wild=0.25)
-    base = paint_or_random(
+    gold = sampler.sample_color("d8b45a", "efe6cf", "1d1f22", p_random=0.25)
+    cloth = paint_or_random(
         sampler,
-        height,
-        clouded(cloth, factor=0.85, scale=0.6, offset=offset, contrast=1.2),
-        wild=0.3,
+        size.height,
+        clouded(cloth_color, factor=0.85, scale=0.6, offset=offset, contrast=1.2),
+        p_random=0.3,
     )
-    title = sampler.pick("frame", "blocks", "picture", "plain")
-    front = _front(
-        sampler,
-        base=base,
-        gold=gold,
-        title=title,
-        width=width,
-        height=height,
-        thick=thick,
-    )
+    style = sampler.pick("frame", "blocks", "picture", "plain")
+    cover = _cover_paint(sampler, style, cloth, gold, size)
     paper = parse_hex_color("f4f2ea")
     if sampler.chance(0.7, canonical=True):
         paper = parse_hex_color("ece2c8")
+    return {
+        "cover": cover,
+        "pages": _page_edges(paper, offset),
+        "spine": _spine_paint(cloth, gold, size),
+    }
 
-    def pages_paint(t: Texels) -> Array:
-        """Paint the edges of pages: fine lines along them."""
-        # fine across the sheets (z), and long along them
-        lines = noise(
-            np.stack(
-                [t.xyz[:, 2] * 9.0, 0.08 * t.xyz[:, 0], 0.08 * t.xyz[:, 1]], axis=1
-            )
-            + offset
-        )
-        return np.asarray(paper * (0.72 + 0.28 * lines)[:, None])
 
-    def spine(t: Texels) -> Array:
-        """Paint two bands at each end, and words in a block in the middle."""
-        y = np.abs(t.xyz[:, 1]) / height  # 0 in the middle, 1/2 at the ends
-        band = np.maximum(
-            step(0.008 - np.abs(y - 0.36), 0.0, soft=0.006),
-            step(0.008 - np.abs(y - 0.42), 0.0, soft=0.006),
-        )
-        block = step(0.16 - y, 0.0, soft=0.01) * step(
-            0.22 * thick - np.abs(t.xyz[:, 2] - thick / 2), 0.0, soft=0.05
-        )
-        # noise that changes along the spine only, nearly: bars instead of letters
-        words = step(
-            noise(
-                np.stack([t.xyz[:, 1] * 1.8, t.xyz[:, 2] * 0.2, 0 * y], axis=1) + 3.0
-            ),
-            0.36,
-            soft=0.1,
-        )
-        return mix(base(t), gold, np.maximum(band, block * words))
+@painter
+def _page_edges(t: Texels, paper: Array, offset: Array) -> Array:
+    """Paint the edges of pages in the color of paper, with fine lines along them."""
+    x, y, z = t.xyz.T
+    # The noise is fine across the sheets (z), and long along them.
+    position = np.stack([z * 9.0, 0.08 * x, 0.08 * y], axis=1)
+    lines = noise(position + offset)
+    return np.asarray(paper * (0.72 + 0.28 * lines)[:, None])
 
-    return front, pages_paint, spine
+
+@painter
+def _spine_paint(t: Texels, cloth: Paint, gold: Array, size: _BookSize) -> Array:
+    """Paint two golden bands at each end of a spine, and words in its middle."""
+    _, y, z = t.xyz.T
+    end_fraction = np.abs(y) / size.height  # 0 in the middle, 1/2 at the ends
+    bands = np.maximum(
+        step(0.008 - np.abs(end_fraction - 0.36), 0.0, soft=0.006),
+        step(0.008 - np.abs(end_fraction - 0.42), 0.0, soft=0.006),
+    )
+    in_length = step(0.16 - end_fraction, 0.0, soft=0.01)
+    from_middle = np.abs(z - size.thickness / 2)
+    in_thickness = step(0.22 * size.thickness - from_middle, 0.0, soft=0.05)
+    # noise that changes along the spine only, nearly: bars instead of letters
+    position = np.stack([y * 1.8, z * 0.2, 0 * end_fraction], axis=1)
+    words = step(noise(position + 3.0), 0.36, soft=0.1)
+    return mix(cloth(t), gold, np.maximum(bands, in_length * in_thickness * words))
 
 
 def _spine(outer: Array, inner: Array, height: float) -> list[Patch]:
@@ -508,17 +523,16 @@ def _spine(outer: Array, inner: Array, height: float) -> list[Patch]:
         inner: (K, 2) points (x, z) of its inner side, downwards.
         height: height of the book; the extent along y.
     """
-    loop = np.concatenate([outer, inner])[::-1]
+    section = np.concatenate([outer, inner])[::-1]
     # the path leads along -y, and the section's axes are x and z
     frame = (
         np.tile([0.0, -1.0, 0.0], (2, 1)),
         np.tile([1.0, 0.0, 0.0], (2, 1)),
         np.tile([0.0, 0.0, 1.0], (2, 1)),
     )
-    patches = shapes.sweep(
-        "spine", [(0.0, height / 2, 0.0), (0.0, -height / 2, 0.0)], loop, frame=frame
-    )
-    size = (
+    path = [(0.0, height / 2, 0.0), (0.0, -height / 2, 0.0)]
+    patches = shapes.sweep("spine", path, section, frame=frame)
+    end_size = (
         float(np.ptp(outer[:, 1])),
         float(np.ptp(outer[:, 0])) + float(np.linalg.norm(outer[0] - inner[-1])),
     )
@@ -528,91 +542,101 @@ def _spine(outer: Array, inner: Array, height: float) -> list[Patch]:
             np.insert(curve, 1, side * height / 2, axis=1)
             for curve in (outer, inner[::-1])
         ]
-        ends = np.stack(rows if side > 0 else rows[::-1])
-        normal = np.broadcast_to([0.0, side, 0.0], ends.shape)
-        patches.append(
-            shapes.grid(
-                "spine",
-                ends,
-                normal,
-                size,
-                np.array([0.0, 1.0]),
-                np.linspace(0.0, 1.0, len(outer)),
-            )
-        )
+        # the order of the rows decides to which side the face looks
+        points = np.stack(rows if side > 0 else rows[::-1])
+        normals = np.broadcast_to([0.0, side, 0.0], points.shape)
+        down = np.array([0.0, 1.0])
+        across = np.linspace(0.0, 1.0, len(outer))
+        patches.append(shapes.grid("spine", points, normals, end_size, down, across))
     return patches
 
 
-def _front(
-    sampler: ParameterSampler,
-    base: Paint,
-    gold: Array,
-    title: str,
-    width: float,
-    height: float,
-    thick: float,
+def _cover_paint(
+    sampler: ParameterSampler, style: str, cloth: Paint, gold: Array, size: _BookSize
 ) -> Paint:
-    """Paint the covers of a book, with a title and decoration on the front.
-
-    A title "plain" has nothing. "picture" has a picture with a round spot in it;
-    "frame" has a frame along the edges; "blocks" and "frame" have a ring as a seal. All
-    but "plain" have lines of words.
+    """Sample the paint of a book's covers, with a decoration on the front.
 
     Args:
         sampler: samples the color of a picture.
-        base: paint of both covers.
+        style: "plain" for nothing; "picture" has lines of words and a picture; "frame"
+            has words, a ring as a seal, and a frame along the edges; "blocks" has words
+            and a seal.
+        cloth: paint of both covers.
         gold: color of the decoration and the words.
-        title: "plain", "picture", "frame" or "blocks".
-        width, height, thick: width, height and thick of the book.
+        size: the size of the book.
     """
     accent = sampler.sample_color("c9a24b", "2f6f8f", "b5442e", "3d6b4a")
 
-    def inside(x: Array, y: Array, half_width: float, half_height: float) -> Array:
-        """Return the mask of a rectangle around the origin, for points (x, y)."""
-        in_width = step(half_width - np.abs(x), 0.0, soft=0.12)
-        return in_width * step(half_height - np.abs(y), 0.0, soft=0.12)
-
     def paint(t: Texels) -> Array:
-        """Paint the base, and on the upper side the decoration and the words."""
-        # from the middle of the cover, which is a little beside that of the book
-        x = t.xyz[:, 0] - 0.25
-        y = -t.xyz[:, 1]
-        top = (t.xyz[:, 2] > thick - 0.1).astype(np.float64)
-        color = base(t)
-        if title == "plain":
+        """Paint the cloth, and on the front the decoration and the words."""
+        color = cloth(t)
+        if style == "plain":
             return color
-        if title == "picture":
-            picture = inside(x, y + 0.12 * height, 0.36 * width, 0.26 * height) * top
+        # from the middle of the cover, which is a little beside that of the book
+        x = t.xyz[:, 0] - COVER_SHIFT
+        y = -t.xyz[:, 1]
+        is_front = (t.xyz[:, 2] > size.thickness - 0.1).astype(np.float64)
+        if style == "picture":
+            picture = _picture_mask(x, y, size) * is_front
             color = mix(color, accent, picture)
-            color = mix(
-                color,
-                gold,
-                picture
-                * step(0.16 * width - np.hypot(x, y + 0.12 * height), 0.0, soft=0.15),
-            )
-        if title == "frame":
-            frame = inside(x, y, 0.43 * width, 0.45 * height) - inside(
-                x, y, 0.43 * width - 0.28, 0.45 * height - 0.28
-            )
-            color = mix(color, gold, frame * top)
-        # rows 2 units high; along a row noise decides where there is a word
-        words = step(
-            noise(np.stack([x * 1.5, 0 * x, np.floor(y / 2.0)], axis=1) + 7.0),
-            0.3,
-            soft=0.08,
-        )
-        rows = step(np.abs((y / 2.0) % 1.0 - 0.5), 0.22, soft=0.1) * words
-        lines = inside(x, y - 0.24 * height, 0.32 * width, 0.09 * height) * rows
-        color = mix(color, gold, np.clip(lines, 0.0, 1.0) * top)
-        if title != "picture":
-            center_distance = np.hypot(x, y + 0.16 * height)
-            seal = step(0.14 * width - center_distance, 0.0, soft=0.12) - step(
-                0.1 * width - center_distance, 0.0, soft=0.12
-            )
-            color = mix(color, gold, seal * top)
+            color = mix(color, gold, picture * _picture_spot(x, y, size))
+        if style == "frame":
+            color = mix(color, gold, _frame_mask(x, y, size) * is_front)
+        color = mix(color, gold, _word_mask(x, y, size) * is_front)
+        if style != "picture":
+            color = mix(color, gold, _seal_mask(x, y, size) * is_front)
         return color
 
     return paint
+
+
+def _in_rectangle(x: Array, y: Array, half_width: float, half_height: float) -> Array:
+    """Return the mask of a rectangle around the origin, for points (x, y), each (N,)."""
+    in_width = step(half_width - np.abs(x), 0.0, soft=0.12)
+    return in_width * step(half_height - np.abs(y), 0.0, soft=0.12)
+
+
+# Masks (N,) of what is on the front of a book. They take x and y (N,) from the middle
+# of the cover, with y downwards.
+
+
+def _picture_mask(x: Array, y: Array, size: _BookSize) -> Array:
+    """Return the mask of a picture above the middle."""
+    center_y = y + 0.12 * size.height
+    return _in_rectangle(x, center_y, 0.36 * size.width, 0.26 * size.height)
+
+
+def _picture_spot(x: Array, y: Array, size: _BookSize) -> Array:
+    """Return the mask of a round spot in the middle of the picture."""
+    center_distance = np.hypot(x, y + 0.12 * size.height)
+    return step(0.16 * size.width - center_distance, 0.0, soft=0.15)
+
+
+def _frame_mask(x: Array, y: Array, size: _BookSize) -> Array:
+    """Return the mask of a frame along the edges, 0.28 wide."""
+    half_width = 0.43 * size.width
+    half_height = 0.45 * size.height
+    outside = _in_rectangle(x, y, half_width, half_height)
+    return outside - _in_rectangle(x, y, half_width - 0.28, half_height - 0.28)
+
+
+def _word_mask(x: Array, y: Array, size: _BookSize) -> Array:
+    """Return the mask of lines of words below the middle."""
+    # lines 2 units high; along a line noise decides where there is a word
+    line_number = np.floor(y / 2.0)
+    word_noise = noise(np.stack([x * 1.5, 0 * x, line_number], axis=1) + 7.0)
+    words = step(word_noise, 0.3, soft=0.08)
+    lines = step(np.abs((y / 2.0) % 1.0 - 0.5), 0.22, soft=0.1) * words
+    center_y = y - 0.24 * size.height
+    block = _in_rectangle(x, center_y, 0.32 * size.width, 0.09 * size.height)
+    return np.clip(block * lines, 0.0, 1.0)
+
+
+def _seal_mask(x: Array, y: Array, size: _BookSize) -> Array:
+    """Return the mask of a ring above the middle."""
+    center_distance = np.hypot(x, y + 0.16 * size.height)
+    disc = step(0.14 * size.width - center_distance, 0.0, soft=0.12)
+    return disc - step(0.1 * size.width - center_distance, 0.0, soft=0.12)
 
 
 # ---- stop sign
@@ -681,10 +705,11 @@ def _word_strokes(letters: str, height: float) -> list[Array]:
         letters: keys of `_STROKES`.
         height: height of a letter.
     """
+    spacing = 0.74  # from letter to letter, in heights; a letter is 0.6 wide
+    half_gap = 0.07  # at the left of each letter
     strokes = []
-    for k, letter in enumerate(letters):
-        # letters are 0.74 apart and 0.6 wide: half of the gap, 0.07, is at their left
-        left = ((k - len(letters) / 2) * 0.74 + 0.07) * height
+    for index, letter in enumerate(letters):
+        left = ((index - len(letters) / 2) * spacing + half_gap) * height
         corner = np.array([left, -height / 2])
         strokes += [np.array(path) * height + corner for path in _STROKES[letter]]
     return strokes
@@ -701,14 +726,15 @@ def _face(t: Texels, red: Array, radius: float) -> Array:
         red: color.
         radius: radius from the middle of the octagon to its corners.
     """
-    apothem = radius * np.cos(np.pi / 8)  # from the middle to the sides
+    _, y, z = t.xyz.T
+    apothem = radius * np.cos(np.pi / 8)  # from the middle of the octagon to its sides
     side_angles = np.pi * (np.arange(8) + 0.5) / 4 + np.pi / 8
-    y = t.xyz[:, 1]
-    z = t.xyz[:, 2]
     # apothem of the octagon whose outline goes through each texel
-    out = np.max([y * np.cos(a) + z * np.sin(a) for a in side_angles], axis=0)
-    rim = step(out - 0.915 * apothem, 0.0, soft=0.006)
-    rim = rim * step(0.985 * apothem - out, 0.0, soft=0.006)
+    texel_apothem = np.max(
+        [y * np.cos(angle) + z * np.sin(angle) for angle in side_angles], axis=0
+    )
+    rim = step(texel_apothem - 0.915 * apothem, 0.0, soft=0.006)
+    rim = rim * step(0.985 * apothem - texel_apothem, 0.0, soft=0.006)
 
     strokes = _word_strokes("STOP", 0.52 * apothem)
     stroke_distance = shapes.distance_to_polylines(y, z, *strokes)
@@ -720,82 +746,91 @@ def _face(t: Texels, red: Array, radius: float) -> Array:
 def stop_sign(sampler: ParameterSampler) -> Instance:
     """Make a stop sign on a post."""
     radius = sampler(0.45, low=0.4, high=0.5)
-    height = sampler(0.74, low=0.66, high=0.84)
-    red = sampler.sample_color("b3121d", "a8161f", "c0202a", wild=0.0)
-    plate = _sign_plate(radius, height)
-    post = _sign_post(height, radius)
-    foot = shapes.box(
-        "rubber", (0.0, 0.0, 0.03), (0.6, 0.36, 0.06), bevel=0.02, steps=2
-    )
-    foot += shapes.box("post", (0, 0, 0.07), (0.1, 0.1, 0.05), bevel=0.01, steps=1)
-    heights = (height - 0.5 * radius, height + 0.5 * radius)
-    clamps = [
-        patch
-        for z in heights
-        for patch in shapes.box(
-            "post", (0.008, 0.0, z), (0.05, 0.09, 0.03), bevel=0.006, steps=1
-        )
+    height = sampler(0.74, low=0.66, high=0.84)  # of the middle of the plate
+    red = sampler.sample_color("b3121d", "a8161f", "c0202a", p_random=0.0)
+    patches = [
+        *_sign_plate(radius, height),
+        *_sign_post(height, radius),
+        *_sign_stand(),
+        *_sign_clamps(radius, height),
     ]
-    grey = sampler.sample_color("9a9da0", "7d8083", wild=0.0)
+    gray = sampler.sample_color("9a9da0", "7d8083", p_random=0.0)
     paints = {
         "face": _face(red, radius),
         "metal": solid("a4a7aa"),
-        "post": solid(grey),
+        "post": solid(gray),
         "rubber": solid("1d1d1f"),
     }
-    turned = shapes.transform_patches(
-        [*plate, *post, *foot, *clamps],
-        shapes.rotation("z", sampler(0.0, low=-25.0, high=25.0)),
+    rotated = shapes.transform_patches(
+        patches, shapes.rotation("z", sampler(0.0, low=-25.0, high=25.0))
     )
     return Instance(
-        turned,
+        rotated,
         paints,
         FINISHES["face"],
-        detail={"metal": 0.25, "post": 0.18, "rubber": 0.3},
+        texel_density={"metal": 0.25, "post": 0.18, "rubber": 0.3},
         finishes=FINISHES,
     )
 
 
+def _sign_stand() -> list[Patch]:
+    """Create the rubber foot of a stop sign, with a block that holds the post."""
+    foot = shapes.box(
+        "rubber", (0.0, 0.0, 0.03), (0.6, 0.36, 0.06), bevel=0.02, steps=2
+    )
+    block = shapes.box("post", (0, 0, 0.07), (0.1, 0.1, 0.05), bevel=0.01, steps=1)
+    return foot + block
+
+
+def _sign_clamps(radius: float, height: float) -> list[Patch]:
+    """Create the two clamps between the post and the plate of a stop sign.
+
+    Args:
+        radius, height: radius of the plate, and height of its middle.
+    """
+    patches = list[Patch]()
+    for z in (height - 0.5 * radius, height + 0.5 * radius):
+        patches += shapes.box(
+            "post", (0.008, 0.0, z), (0.05, 0.09, 0.03), bevel=0.006, steps=1
+        )
+    return patches
+
+
 def _sign_plate(radius: float, height: float) -> list[Patch]:
-    """Create the octagonal plate of a stop sign, which looks along +x, in front of the
-    post.
+    """Create the octagonal plate of a stop sign, which looks along +x.
 
     Args:
         radius: radius from its middle to its corners.
         height: height of its middle.
     """
+    thickness = 0.004
     ring = shapes.polygon(8, bevel=0.02, steps=2) * radius
-    ahead = np.array([1.0, 0.0, 0.0])
-    # an octagon that looks along +x, its middle at the origin
+    forwards = np.array([1.0, 0.0, 0.0])
+    # an octagon whose middle is the origin
     back = np.insert(ring, 0, 0.0, axis=1)
     edge = shapes.sweep(
-        "metal", [(0.0, 0.0, 0.0), 0.004 * ahead], ring, first=(0.0, 1.0, 0.0)
+        "metal", [(0.0, 0.0, 0.0), thickness * forwards], ring, first=(0.0, 1.0, 0.0)
     )
     plate = [
-        shapes.cap("face", back + 0.004 * ahead, ahead),
+        shapes.cap("face", back + thickness * forwards, forwards),
         *edge,
-        shapes.cap("metal", back[::-1], -ahead),
+        shapes.cap("metal", back[::-1], -forwards),
     ]
     return shapes.transform_patches(plate, offset=(0.036, 0.0, height))
 
 
-def _sign_post(height: float, radius: float) -> list[Patch]:
+def _sign_post(height: float, plate_radius: float) -> list[Patch]:
     """Create the post of a stop sign: a closed tube that ends behind the plate.
 
     Args:
         height: height of the middle of the plate.
-        radius: radius of the plate.
+        plate_radius: radius of the plate.
     """
+    top = height + 0.7 * plate_radius
     tube = shapes.round_corners(
-        [
-            (0.03, 0.0),
-            (0.03, height + 0.7 * radius),
-            (0.0, height + 0.7 * radius + 0.004),
-        ],
-        radius=0.004,
-        steps=2,
+        [(0.03, 0.0), (0.03, top), (0.0, top + 0.004)], radius=0.004, steps=2
     )
+    bottom = [(0.0, 0.0), (0.03, 0.0)]
     return shapes.lathe(
-        [("post", [(0.0, 0.0), (0.03, 0.0)]), ("post", tube[:-1]), ("post", tube[-2:])],
-        columns=20,
+        [("post", bottom), ("post", tube[:-1]), ("post", tube[-2:])], columns=20
     )

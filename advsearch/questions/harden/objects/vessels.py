@@ -1,11 +1,13 @@
 """Open containers of revolution: mug, bowl, bottle, vase, wine glass.
 
-Lengths are in centimeters, and z is up. A number `draw(9.4, low=7.6, high=12.0)` is 9.4
-of the canonical instance, and uniform between the bounds of others. Profiles are points
-(r, z).
+Lengths are in centimeters, and z is up. A number `sampler(9.4, low=7.6, high=12.0)` is
+9.4 of the canonical instance, and uniform between the bounds of others. Profiles are
+points (r, z).
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,6 +27,7 @@ from advsearch.questions.harden.objects.textures import (
     mottled,
     over,
     paint_or_random,
+    painter,
     parse_hex_color,
     rings,
     sample_paint,
@@ -39,13 +42,15 @@ from advsearch.questions.harden.objects.textures import (
 # turns the seam of a lathe away from the default camera, at azimuth 40
 SEAM_ROTATION = shapes.rotation("z", 220.0)
 HANDLE_POINTS = 26  # points of the curve of a handle
+LABEL_AZIMUTH = 180.0  # degrees about z; opposite the seam of the texture
+PALE = "f4efe4"  # the light color of printed patterns
 
 
 def make_handle(
     sampler: ParameterSampler,
     style: str,
-    low: float,
-    high: float,
+    bottom: float,
+    top: float,
     reach: float,
     profile: Array,
     inset: float,
@@ -57,14 +62,14 @@ def make_handle(
     Args:
         sampler: samples its thickness.
         style: "round", "ear" (widest at the top), "square" or "loop" (small).
-        low, high: heights of its roots.
+        bottom, top: heights of its roots.
         reach: its extent from the wall.
         profile: profile of the wall (K, 2).
         inset: depth of the roots inside the wall.
     """
-    low_root = shapes.radius_at_height(profile, low) - inset
-    high_root = shapes.radius_at_height(profile, high) - inset
-    curve = _handle_curve(style, (low_root, low), (high_root, high), reach)
+    bottom_radius = shapes.radius_at_height(profile, bottom) - inset
+    top_radius = shapes.radius_at_height(profile, top) - inset
+    curve = _handle_curve(style, (bottom_radius, bottom), (top_radius, top), reach)
     half_thickness = sampler(0.42, low=0.32, high=0.6)
     half_width = sampler(0.62, low=0.4, high=0.95)
     if sampler.chance(0.7, canonical=True):
@@ -80,8 +85,8 @@ def make_handle(
 
 def _handle_curve(
     style: str,
-    low_root: tuple[float, float],
-    high_root: tuple[float, float],
+    bottom_root: tuple[float, float],
+    top_root: tuple[float, float],
     reach: float,
 ) -> Array:
     """Return the curve (K, 2) of a handle from its upper to its lower root.
@@ -90,33 +95,34 @@ def _handle_curve(
 
     Args:
         style: as for `make_handle`.
-        low_root, high_root: (r, z).
+        bottom_root, top_root: (r, z).
         reach: its extent from the wall.
     """
-    low = low_root[1]
-    high = high_root[1]
-    edge = max(low_root[0], high_root[0])
+    bottom = bottom_root[1]
+    top = top_root[1]
+    wall_radius = max(bottom_root[0], top_root[0])
     if style == "square":
-        corners = [high_root, (edge + reach, high), (edge + reach, low), low_root]
+        outer = wall_radius + reach
+        corners = [top_root, (outer, top), (outer, bottom), bottom_root]
         rounded = shapes.round_corners(corners, radius=0.45 * reach, steps=6)
         return shapes.spline(
             shapes.subdivide(rounded, longest=0.8), count=HANDLE_POINTS
         )
-    # how far it extends at the top, the middle and the bottom, in units of `reach`
-    top, middle, bottom = {
+    # how far it extends near the top, the middle and the bottom, in units of `reach`
+    upper_reach, middle_reach, lower_reach = {
         "round": (0.82, 0.98, 0.82),
         "ear": (0.98, 0.9, 0.5),
         "loop": (0.85, 1.0, 0.85),
     }[style]
-    height = high - low
+    height = top - bottom
     knots = [
-        high_root,
-        (edge + 0.45 * reach, high + 0.04 * height),
-        (edge + top * reach, high - 0.16 * height),
-        (edge + middle * reach, (low + high) / 2),
-        (edge + bottom * reach, low + 0.18 * height),
-        (edge + 0.3 * reach, low + 0.03 * height),
-        low_root,
+        top_root,
+        (wall_radius + 0.45 * reach, top + 0.04 * height),
+        (wall_radius + upper_reach * reach, top - 0.16 * height),
+        (wall_radius + middle_reach * reach, (bottom + top) / 2),
+        (wall_radius + lower_reach * reach, bottom + 0.18 * height),
+        (wall_radius + 0.3 * reach, bottom + 0.03 * height),
+        bottom_root,
     ]
     return shapes.spline(knots, count=HANDLE_POINTS)
 
@@ -135,67 +141,64 @@ def _ceramic(
     kind = sampler.pick(
         "band", "plain", "bands", "dots", "stripes", "dip", "checks", "zigzag", "rings"
     )
-    second = sampler.sample_color(
+    second_color = sampler.sample_color(
         "2f5d7c", "b5442e", "356b4f", "e0b040", "22262b", "f2efe6"
     )
-    pale = "f4efe4"
-    if kind == "band":
-        return over(
-            glaze,
-            between(
-                sampler(0.36, low=0.1, high=0.5) * height,
-                sampler(0.72, low=0.55, high=0.9) * height,
-                soft=0.12,
-            ),
-            accent,
-        )
-    if kind == "bands":
-        return over(
-            glaze,
-            between(0.62 * height, 0.9 * height),
-            rings(parse_hex_color(pale), second, period=0.13 * height),
-        )
+    if kind in ("band", "bands", "checks", "zigzag", "dip"):
+        return _ceramic_belt(sampler, kind, height, glaze, accent, second_color)
     if kind == "dots":
         return dots(
             glaze,
-            second,
+            second_color,
             cell=sampler(2.0, low=1.2, high=3.2),
             radius=sampler(0.3, low=0.2, high=0.4),
         )
     if kind == "stripes":
-        ground = sampler.sample_color(pale, "f4f4f2")
         return stripes(
-            ground,
-            second,
+            sampler.sample_color(PALE, "f4f4f2"),
+            second_color,
             cell=sampler(1.8, low=1.0, high=4.0),
-            share=sampler(0.5, low=0.25, high=0.6),
+            fraction=sampler(0.5, low=0.25, high=0.6),
             slant=int(sampler.pick(0, 2)),
-        )
-    if kind == "checks":
-        board = checks(
-            sampler.sample_color(pale), second, cell=sampler(1.4, low=0.9, high=2.2)
-        )
-        return over(glaze, between(0.25 * height, 0.75 * height), board)
-    if kind == "zigzag":
-        return over(
-            glaze,
-            between(0.3 * height, 0.7 * height),
-            zigzag(sampler.sample_color(pale), second, cell=2.5),
-        )
-    if kind == "dip":
-        return over(
-            glaze,
-            between(sampler(0.5, low=0.3, high=0.7) * height, 2 * height, soft=0.1),
-            accent,
         )
     if kind == "rings":
         return rings(
-            sampler.sample_color(pale),
-            second,
+            sampler.sample_color(PALE),
+            second_color,
             period=height * sampler(0.12, low=0.06, high=0.25),
-            share=sampler(0.5, low=0.2, high=0.7),
+            fraction=sampler(0.5, low=0.2, high=0.7),
         )
     return glaze
+
+
+def _ceramic_belt(
+    sampler: ParameterSampler,
+    kind: str,
+    height: float,
+    glaze: Paint,
+    accent: Paint,
+    second_color: Array,
+) -> Paint:
+    """Sample a decoration between two heights of a vessel; see `_ceramic`."""
+    if kind == "band":
+        low = sampler(0.36, low=0.1, high=0.5) * height
+        high = sampler(0.72, low=0.55, high=0.9) * height
+        return over(glaze, between(low, high, soft=0.12), accent)
+    if kind == "dip":
+        low = sampler(0.5, low=0.3, high=0.7) * height
+        return over(glaze, between(low, 2 * height, soft=0.1), accent)
+    if kind == "bands":
+        bands = rings(parse_hex_color(PALE), second_color, period=0.13 * height)
+        return over(glaze, between(0.62 * height, 0.9 * height), bands)
+    if kind == "checks":
+        board = checks(
+            sampler.sample_color(PALE),
+            second_color,
+            cell=sampler(1.4, low=0.9, high=2.2),
+        )
+        return over(glaze, between(0.25 * height, 0.75 * height), board)
+    chevrons = zigzag(sampler.sample_color(PALE), second_color, cell=2.5)
+    return over(glaze, between(0.3 * height, 0.7 * height), chevrons)
 
 
 @family(metres=0.01)
@@ -205,16 +208,16 @@ def mug(sampler: ParameterSampler) -> Instance:
     wall, side, body = _mug_body(sampler, height)
 
     style = sampler.pick("ear", "round", "square", "loop")
-    grip_high = height * sampler(0.85, low=0.76, high=0.88)
+    handle_top = height * sampler(0.85, low=0.76, high=0.88)
     if style == "loop":
-        grip_low = height * sampler(0.3, low=0.34, high=0.42)
+        handle_bottom = height * sampler(0.3, low=0.34, high=0.42)
     else:
-        grip_low = height * sampler(0.2, low=0.16, high=0.3)
-    grip = make_handle(
+        handle_bottom = height * sampler(0.2, low=0.16, high=0.3)
+    handle = make_handle(
         sampler,
         style,
-        low=grip_low,
-        high=grip_high,
+        bottom=handle_bottom,
+        top=handle_top,
         reach=sampler(2.9, low=2.3, high=3.4),
         profile=side,
         inset=0.55 * wall,
@@ -222,14 +225,14 @@ def mug(sampler: ParameterSampler) -> Instance:
 
     paints = _mug_paints(sampler, height)
     patches = shapes.transform_patches(
-        [*body, *shapes.transform_patches(grip, shapes.rotation("z", -108.0))],
+        [*body, *shapes.transform_patches(handle, shapes.rotation("z", -108.0))],
         SEAM_ROTATION,
     )
     return Instance(
         patches,
         paints,
         sample_material(sampler, roughness=0.3, clearcoat=0.5),
-        detail={"inside": 0.8, "base": 0.6},
+        texel_density={"inside": 0.8, "base": 0.6},
     )
 
 
@@ -246,19 +249,17 @@ def _mug_body(
         The thickness of its wall; the profile (14, 2) of its side, points (r, z) from
         the foot's edge upwards; and its patches.
     """
-    top = sampler(4.15, low=3.6, high=5.0)
-    foot = top * sampler(0.93, low=0.72, high=1.02)
-    belly = sampler(0.0, low=-0.06, high=0.13) * top
+    rim = sampler(4.15, low=3.6, high=5.0)
+    foot = rim * sampler(0.93, low=0.72, high=1.02)
+    bulge = sampler(0.0, low=-0.06, high=0.13) * rim
     wall = sampler(0.36, low=0.28, high=0.5)
-    low = sampler(0.7, low=0.3, high=1.2)  # size of the round edge at the foot
-    corners = [
-        (foot - low, 0.0),
-        (foot, low),
-        (0.5 * (foot + top) + belly, 0.5 * height),
-        (top, height),
-    ]
-    side = shapes.spline(np.array(corners[1:]), count=14)
-    outside = np.concatenate([[corners[0], (foot - 0.3 * low, 0.25 * low)], side])
+    edge = sampler(0.7, low=0.3, high=1.2)  # size of the round edge at the foot
+    side = shapes.spline(
+        [(foot, edge), (0.5 * (foot + rim) + bulge, 0.5 * height), (rim, height)],
+        count=14,
+    )
+    foot_edge = [(foot - edge, 0.0), (foot - 0.3 * edge, 0.25 * edge)]
+    outside = np.concatenate([foot_edge, side])
     body = shapes.vessel(outside, wall=wall, floor=sampler(0.6, low=0.5, high=0.9))
     return wall, side, body
 
@@ -269,7 +270,7 @@ def _mug_paints(sampler: ParameterSampler, height: float) -> dict[str, Paint]:
     clay = sampler.sample_color(
         "e9dfca", "f3f1ec", "d9c7a5", "3a3f45", "8fa7a0", "b5442e", "6f8fb0"
     )
-    specks = sampler.sample_color("7d6247", wild=0.2)
+    specks = sampler.sample_color("7d6247", p_random=0.2)
     glaze = speckled(
         clouded(clay, factor=0.93, scale=3.0, offset=offset),
         specks,
@@ -277,26 +278,30 @@ def _mug_paints(sampler: ParameterSampler, height: float) -> dict[str, Paint]:
         offset=offset,
         amount=sampler(0.06, low=0.0, high=0.14),
     )
-    deep = sampler.sample_color("1f4e79", "2c6e63", "a63c2a", "d79b2b", "2d2d33")
-    accent = clouded(deep, factor=1.35, scale=2.2, offset=offset)
-    outer = paint_or_random(sampler, height, _ceramic(sampler, height, glaze, accent))
-    # the inside is seldom decorated; else it is glazed or of one color
-    inner = outer
-    if not sampler.chance(0.15):
-        inner = glaze
-        if sampler.chance(0.5, canonical=True):
-            inner = solid(sampler.sample_color("efe6d4", "f3f1ec", wild=0.3))
+    deep_color = sampler.sample_color("1f4e79", "2c6e63", "a63c2a", "d79b2b", "2d2d33")
+    accent = clouded(deep_color, factor=1.35, scale=2.2, offset=offset)
+    decoration = _ceramic(sampler, height, glaze, accent)
+    decorated = paint_or_random(sampler, height, decoration)
+    inside = _mug_inside(sampler, decorated, glaze)
     raw_clay = solid("a98663")
-    # the foot may be left without a glaze
-    outside = outer
-    if sampler.chance(0.4, canonical=True):
-        outside = over(outer, between(-1.0, 0.35, soft=0.1), raw_clay)
+    outside = decorated
+    if sampler.chance(0.4, canonical=True):  # the foot is left without a glaze
+        outside = over(decorated, between(-1.0, 0.35, soft=0.1), raw_clay)
     return {
         "outside": outside,
-        "inside": inner,
+        "inside": inside,
         "base": raw_clay,
-        "handle": sampler.pick(glaze, outer, accent),
+        "handle": sampler.pick(glaze, decorated, accent),
     }
+
+
+def _mug_inside(sampler: ParameterSampler, decorated: Paint, glaze: Paint) -> Paint:
+    """Sample the inside of a mug: seldom decorated, else of one color or glazed."""
+    if sampler.chance(0.15):
+        return decorated
+    if sampler.chance(0.5, canonical=True):
+        return solid(sampler.sample_color("efe6d4", "f3f1ec", p_random=0.3))
+    return glaze
 
 
 @family(metres=0.01)
@@ -305,6 +310,22 @@ def bowl(sampler: ParameterSampler) -> Instance:
     radius = 8.0
     height = radius * sampler(0.86, low=0.6, high=1.0)
     body = _bowl_body(sampler, radius, height)
+    return Instance(
+        shapes.transform_patches(body, SEAM_ROTATION),
+        _bowl_paints(sampler, radius, height),
+        sample_material(sampler, roughness=0.28, clearcoat=0.5),
+        texel_density={"base": 0.6},
+    )
+
+
+def _bowl_paints(
+    sampler: ParameterSampler, radius: float, height: float
+) -> dict[str, Paint]:
+    """Sample the paints of a bowl, by the tags of its parts.
+
+    The canonical bowl is glazed, with a pale rim and a raw foot; the others have any
+    decoration of a potter.
+    """
     offset = sampler.offset()
     clay = sampler.sample_color(
         "3f7f86", "e9dfca", "2f5d7c", "b5442e", "f3f1ec", "566b3f"
@@ -313,28 +334,22 @@ def bowl(sampler: ParameterSampler) -> Instance:
     accent = mottled(
         parse_hex_color("e8dcc0"), parse_hex_color("d6c39a"), scale=2.0, offset=offset
     )
-    raw = solid("9b7352")
-    if sampler.rng is None:
-        rim = over(glaze, between(0.93 * height, 2 * height, soft=0.25), accent)
-        outer = over(rim, between(-1.0, 0.55, soft=0.1), raw)
+    raw_clay = solid("9b7352")
+    is_canonical = sampler.rng is None
+    if is_canonical:
+        with_rim = over(glaze, between(0.93 * height, 2 * height, soft=0.25), accent)
+        outside = over(with_rim, between(-1.0, 0.55, soft=0.1), raw_clay)
     else:
-        outer = paint_or_random(
-            sampler, 2 * radius, _ceramic(sampler, height, glaze, accent)
-        )
-    inner = sampler.pick(
+        decoration = _ceramic(sampler, height, glaze, accent)
+        outside = paint_or_random(sampler, 2 * radius, decoration)
+    inside = sampler.pick(
         accent,
         glaze,
-        outer,
+        outside,
         solid(sampler.sample_color("f3f1ec")),
         rings(clay, shade(clay, 1.3), period=height * 0.2),
     )
-    paints = {"outside": outer, "inside": inner, "base": raw}
-    return Instance(
-        shapes.transform_patches(body, SEAM_ROTATION),
-        paints,
-        sample_material(sampler, roughness=0.28, clearcoat=0.5),
-        detail={"base": 0.6},
-    )
+    return {"outside": outside, "inside": inside, "base": raw_clay}
 
 
 def _bowl_body(sampler: ParameterSampler, radius: float, height: float) -> list[Patch]:
@@ -345,22 +360,25 @@ def _bowl_body(sampler: ParameterSampler, radius: float, height: float) -> list[
         radius: radius of the rim before it flares.
         height: height of the rim.
     """
-    foot = radius * sampler(0.42, low=0.34, high=0.55)
-    ring = sampler(0.7, low=0.15, high=1.1)  # height of the foot ring
+    foot_radius = radius * sampler(0.42, low=0.34, high=0.55)
+    foot_height = sampler(0.7, low=0.15, high=1.1)
     # how far out the wall is at half height, in units of the radius
-    full = sampler(0.86, low=0.72, high=0.97)
+    fullness = sampler(0.86, low=0.72, high=0.97)
     flare = sampler(0.0, low=-0.03, high=0.1) * radius
     knots = [
-        (foot * 1.04, ring),
-        (radius * 0.5 * (0.72 + full) * 0.92, ring + 0.22 * (height - ring)),
-        (radius * full, 0.55 * height),
-        (radius * (0.5 + 0.5 * full), 0.8 * height),
+        (foot_radius * 1.04, foot_height),
+        (
+            radius * 0.5 * (0.72 + fullness) * 0.92,
+            foot_height + 0.22 * (height - foot_height),
+        ),
+        (radius * fullness, 0.55 * height),
+        (radius * (0.5 + 0.5 * fullness), 0.8 * height),
         (radius + flare, height),
     ]
     return shapes.vessel(
-        np.array([(foot, 0.0), *shapes.spline(knots, count=22)]),
+        np.array([(foot_radius, 0.0), *shapes.spline(knots, count=22)]),
         wall=sampler(0.45, low=0.32, high=0.65),
-        floor=ring + 0.55,
+        floor=foot_height + 0.55,
         step=0.9,
     )
 
@@ -375,7 +393,7 @@ def bottle(sampler: ParameterSampler) -> Instance:
         shapes.transform_patches(patches, SEAM_ROTATION),
         paints,
         sample_material(sampler, roughness=0.2, clearcoat=0.6),
-        detail={"inside": 0.25, "base": 0.5},
+        texel_density={"inside": 0.25, "base": 0.5},
     )
 
 
@@ -392,39 +410,52 @@ def _bottle_body(sampler: ParameterSampler, height: float) -> tuple[float, list[
     radius = sampler(3.75, low=3.0, high=4.8)
     neck_radius = sampler(1.35, low=1.0, high=1.7)
     shoulder = height * sampler(0.62, low=0.45, high=0.68)
-    rise = height * sampler(0.15, low=0.08, high=0.22)
+    rise = height * sampler(0.15, low=0.08, high=0.22)  # from the shoulder to the neck
     slope = sampler(0.35, low=0.1, high=0.8)  # 0: square shoulder, 1: sloping
     taper = sampler(1.0, low=0.93, high=1.03)
+    middle_of_shoulder = (
+        neck_radius + (radius - neck_radius) * (0.55 - 0.35 * slope),
+        shoulder + rise * (0.6 - 0.25 * slope),
+    )
     corners = [
         (radius * 0.82, 0.0),
         (radius * taper, 0.02 * height),
         (radius, shoulder),
-        (
-            neck_radius + (radius - neck_radius) * (0.55 - 0.35 * slope),
-            shoulder + rise * (0.6 - 0.25 * slope),
-        ),
+        middle_of_shoulder,
         (neck_radius * 1.03, shoulder + rise),
         (neck_radius * 0.95, height - 1.6),
     ]
-    curve = shapes.round_corners(
+    body = shapes.round_corners(
         corners, radius=[0.8, 0.45 * rise + 0.4, 0.6 * rise, 0.5 * rise], steps=7
     )
-    # the thicker ring around the mouth
     ring_radius = neck_radius * 0.95 + sampler(0.28, low=0.1, high=0.4)
-    ring = [
+    has_cap = sampler.chance(0.4)
+    mouth = _mouth_ring(ring_radius, neck_radius, height)
+    outside = np.concatenate([shapes.subdivide(body, longest=1.6), mouth])
+    patches = shapes.vessel(
+        outside, wall=sampler(0.35, low=0.3, high=0.45), floor=0.8, step=1.6, columns=48
+    )
+    if has_cap:
+        patches += _cap(sampler, ring_radius + 0.12, height)
+    return shoulder, patches
+
+
+def _mouth_ring(
+    ring_radius: float, neck_radius: float, height: float
+) -> list[tuple[float, float]]:
+    """Return the points (r, z) of the thicker ring around the mouth of a bottle.
+
+    Args:
+        ring_radius: radius of the ring.
+        neck_radius: radius of the neck.
+        height: height of the bottle.
+    """
+    return [
         (ring_radius, height - 1.5),
         (ring_radius, height - 0.6),
         (neck_radius * 0.97, height - 0.5),
         (neck_radius * 0.93, height),
     ]
-    capped = sampler.chance(0.4)
-    outside = np.concatenate([shapes.subdivide(curve, longest=1.6), ring])
-    patches = shapes.vessel(
-        outside, wall=sampler(0.35, low=0.3, high=0.45), floor=0.8, step=1.6, columns=48
-    )
-    if capped:
-        patches += _cap(sampler, ring_radius + 0.12, height)
-    return shoulder, patches
 
 
 def _bottle_paints(
@@ -441,51 +472,44 @@ def _bottle_paints(
     glass = sampler.sample_color(
         "17351f", "4a2c14", "1d3f2a", "cfdde0", "2a4d69", "ece7dd", "111416"
     )
-    surface = paint_or_random(
+    outside = paint_or_random(
         sampler,
         height,
         clouded(glass, factor=1.25, scale=9.0, offset=offset),
-        wild=0.25,
+        p_random=0.25,
     )
-    paper = sampler.sample_color("efe6cf", "f5f2ea", "20242a", "c9a24b", wild=0.3)
-    ink = sampler.sample_color("7a1f2b", "23395d", "2e2a25", "b08d3c", wild=0.3)
-    low = 0.14 * height
-    high = min(sampler(0.44, low=0.3, high=0.5) * height, shoulder - 1.5)
-    outer = (
-        surface
-        if sampler.chance(0.2)
-        else _labelled(
-            sampler, surface=surface, paper=paper, ink=ink, low=low, high=high
-        )
-    )
+    paper = sampler.sample_color("efe6cf", "f5f2ea", "20242a", "c9a24b", p_random=0.3)
+    ink = sampler.sample_color("7a1f2b", "23395d", "2e2a25", "b08d3c", p_random=0.3)
+    label_bottom = 0.14 * height
+    label_top = min(sampler(0.44, low=0.3, high=0.5) * height, shoulder - 1.5)
+    has_label = not sampler.chance(0.2)
+    if has_label:
+        outside = _add_label(sampler, outside, paper, ink, label_bottom, label_top)
     foil = sampler.sample_color("6d1a26", "b08d3c", "1c1f24", "23395d", "d5d5d5")
     if sampler.chance(0.5, canonical=True):
-        outer = over(
-            outer,
-            between(height * 0.8, 2 * height),
-            speckled(solid(foil), shade(foil, 1.3), scale=0.5, offset=offset),
-        )
+        foil_paint = speckled(solid(foil), shade(foil, 1.3), scale=0.5, offset=offset)
+        outside = over(outside, between(height * 0.8, 2 * height), foil_paint)
     return {
-        "outside": outer,
+        "outside": outside,
         "inside": solid(shade(glass, 0.6)),
         "base": solid(glass),
         "cap": solid(sampler.sample_color("c9a24b", "d0d0d0", "b5442e", "22262b")),
     }
 
 
-def _cap(sampler: ParameterSampler, radius: float, height: float) -> list[Patch]:
+def _cap(sampler: ParameterSampler, radius: float, bottle_height: float) -> list[Patch]:
     """Create the cap of a bottle: a cylinder around the end of its neck.
 
     Args:
         sampler: samples how far down it reaches.
         radius: radius of the cap.
-        height: height of the bottle without it.
+        bottle_height: height of the bottle without it.
     """
-    low = height - sampler(1.5, low=0.9, high=2.2)
-    top = height + 0.35
-    under = np.array([[0.6 * radius, low], [radius, low]])
+    bottom = bottle_height - sampler(1.5, low=0.9, high=2.2)
+    top = bottle_height + 0.35
+    under = np.array([[0.6 * radius, bottom], [radius, bottom]])
     side = shapes.round_corners(
-        [(radius, low), (radius, top), (0.6 * radius, top)], radius=0.3, steps=4
+        [(radius, bottom), (radius, top), (0.6 * radius, top)], radius=0.3, steps=4
     )
     return shapes.lathe(
         [
@@ -497,16 +521,15 @@ def _cap(sampler: ParameterSampler, radius: float, height: float) -> list[Patch]
     )
 
 
-def _labelled(
+def _add_label(
     sampler: ParameterSampler,
     surface: Paint,
     paper: Array,
     ink: Array,
-    low: float,
-    high: float,
+    bottom: float,
+    top: float,
 ) -> Paint:
-    """Paint a paper label around part of a bottle, centered opposite the texture's
-    seam.
+    """Paint a paper label around a part of a bottle, opposite the texture's seam.
 
     It has a bar near its upper and its lower edge, a title, three lines of text and a
     round seal.
@@ -515,92 +538,96 @@ def _labelled(
         sampler: samples its width.
         surface: paint of the bottle.
         paper, ink: colors.
-        low, high: heights of its edges.
+        bottom, top: heights of its edges.
     """
-    azimuth = 180.0
     # degrees from the middle of the label to its sides
     half_angle = sampler(95.0, low=60.0, high=180.0)
-    span = high - low
-    label = over(
-        surface,
-        facing(azimuth, half_width=half_angle, low=low, high=high, soft=0.08),
-        solid(paper),
-    )
-    label = over(
-        label,
-        facing(
-            azimuth,
-            half_width=half_angle - 6.0,
-            low=high - 0.12 * span,
-            high=high - 0.07 * span,
-            soft=0.05,
-        ),
-        solid(ink),
-    )
-    label = over(
-        label,
-        facing(
-            azimuth,
-            half_width=half_angle - 6.0,
-            low=low + 0.06 * span,
-            high=low + 0.1 * span,
-            soft=0.05,
-        ),
-        solid(ink),
-    )
-    title = facing(
-        azimuth,
-        half_width=0.42 * min(half_angle, 95.0),
-        low=low + 0.6 * span,
-        high=low + 0.76 * span,
-        soft=0.05,
-    )
-    label = over(label, title, solid(shade(ink, 0.8)))
-    for i, share in enumerate((0.5, 0.36, 0.44)):
-        z = low + (0.5 - 0.1 * i) * span
-        label = over(
-            label,
-            facing(
-                azimuth,
-                half_width=share * min(half_angle, 95.0),
-                low=z,
-                high=z + 0.035 * span,
-                soft=0.05,
-            ),
-            solid(ink),
-        )
+    # text stays on the half of the bottle that is seen from the front
+    half_text_angle = min(half_angle, 95.0)
+    height = top - bottom
 
-    def seal(texels: Texels) -> Array:
-        """Return the mask of a disc at the lower end of the label."""
-        xyz = texels.xyz
-        # from the middle of the label, wrapped to [-180, 180) degrees
-        angle = np.radians(
-            (np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0])) - azimuth + 180.0) % 360.0
-            - 180.0
+    def add(
+        base: Paint, half_width: float, low: float, high: float, color: Array
+    ) -> Paint:
+        """Paint a rectangle of the label, `half_width` in degrees, over a paint."""
+        mask = facing(
+            LABEL_AZIMUTH, half_width=half_width, low=low, high=high, soft=0.05
         )
-        radius = float(np.hypot(xyz[:, 0], xyz[:, 1]).max())
-        center_distance = np.hypot(angle * radius, xyz[:, 2] - (low + 0.2 * span))
-        return step(0.09 * span - center_distance, 0.0, soft=0.08)
+        return over(base, mask, solid(color))
 
-    return over(label, seal, solid("b08d3c"))
+    background = facing(
+        LABEL_AZIMUTH, half_width=half_angle, low=bottom, high=top, soft=0.08
+    )
+    label = over(surface, background, solid(paper))
+    half_bar_angle = half_angle - 6.0
+    label = add(label, half_bar_angle, top - 0.12 * height, top - 0.07 * height, ink)
+    label = add(
+        label, half_bar_angle, bottom + 0.06 * height, bottom + 0.1 * height, ink
+    )
+    label = add(
+        label,
+        0.42 * half_text_angle,
+        bottom + 0.6 * height,
+        bottom + 0.76 * height,
+        shade(ink, 0.8),
+    )
+    # lines of text, each of another length
+    for i, relative_length in enumerate((0.5, 0.36, 0.44)):
+        z = bottom + (0.5 - 0.1 * i) * height
+        label = add(
+            label, relative_length * half_text_angle, z, z + 0.035 * height, ink
+        )
+    return over(label, _seal(bottom, height), solid("b08d3c"))
+
+
+@painter
+def _seal(t: Texels, bottom: float, height: float) -> Array:
+    """Return the mask of a disc at the lower end of a label.
+
+    Args:
+        t: points of the bottle.
+        bottom, height: lower edge and height of the label.
+    """
+    x, y, z = t.xyz.T
+    # from the middle of the label, wrapped to [-180, 180) degrees
+    degrees = (np.degrees(np.arctan2(y, x)) - LABEL_AZIMUTH + 180.0) % 360.0 - 180.0
+    radius = float(np.hypot(x, y).max())  # of the bottle
+    center_distance = np.hypot(
+        np.radians(degrees) * radius, z - (bottom + 0.2 * height)
+    )
+    return step(0.09 * height - center_distance, 0.0, soft=0.08)
+
+
+class _VaseBody(NamedTuple):
+    """A vase without handles.
+
+    Attributes:
+        belly_height: height of the belly, its widest part.
+        neck_height: height of the neck, the narrowest part above the belly.
+        profile: outer profile (34, 2) of points (r, z).
+        patches: its surface.
+    """
+
+    belly_height: float
+    neck_height: float
+    profile: Array
+    patches: list[Patch]
 
 
 @family(metres=0.01)
 def vase(sampler: ParameterSampler) -> Instance:
     """Make a vase, perhaps with handles."""
     height = 24.0
-    belly_at, neck_at, profile, patches = _vase_body(sampler, height)
-    patches += _vase_handles(sampler, belly_at, neck_at, profile)
+    body = _vase_body(sampler, height)
+    patches = [*body.patches, *_vase_handles(sampler, body)]
     offset = sampler.offset()
     clay = sampler.sample_color(
         "f2f1ea", "b7562f", "2f6f6a", "26303c", "d9c7a5", "8a2f2a"
     )
     glaze = clouded(clay, factor=0.95, scale=4.0, offset=offset)
-    outer = paint_or_random(
-        sampler, height, _vase_paint(sampler, glaze, height, offset)
-    )
+    decoration = _vase_paint(sampler, glaze, height, offset)
     paints = {
-        "outside": outer,
+        "outside": paint_or_random(sampler, height, decoration),
         "inside": solid(shade(clay, 0.8)),
         "base": solid("b79b7c"),
         "handle": glaze,
@@ -609,80 +636,70 @@ def vase(sampler: ParameterSampler) -> Instance:
         shapes.transform_patches(patches, SEAM_ROTATION),
         paints,
         sample_material(sampler, roughness=0.25, clearcoat=0.6),
-        detail={"inside": 0.35, "base": 0.5},
+        texel_density={"inside": 0.35, "base": 0.5},
     )
 
 
-def _vase_body(
-    sampler: ParameterSampler, height: float
-) -> tuple[float, float, Array, list[Patch]]:
+def _vase_body(sampler: ParameterSampler, height: float) -> _VaseBody:
     """Create a vase without handles.
 
     Args:
         sampler: samples its proportions.
         height: height of the lip.
-
-    Returns:
-        The heights of the belly (its widest place) and of the neck (the narrowest
-        above); its outer profile (34, 2) of points (r, z); and its patches.
     """
     foot = sampler(3.6, low=2.6, high=4.4)
     belly = sampler(7.2, low=5.2, high=8.6)
-    belly_at = height * sampler(0.52, low=0.3, high=0.68)
+    belly_height = height * sampler(0.52, low=0.3, high=0.68)
     neck = sampler(2.6, low=2.2, high=3.8)
-    neck_at = height * sampler(0.84, low=0.78, high=0.88)
+    neck_height = height * sampler(0.84, low=0.78, high=0.88)
     lip = neck + sampler(1.5, low=0.5, high=2.6)
+    # points (r, z), with one halfway between the foot, the belly and the neck each
     knots = [
         (foot, 0.0),
         (foot * 0.97, 0.5),
-        (0.45 * foot + 0.55 * belly, 0.48 * belly_at),
-        (belly, belly_at),
-        (0.45 * belly + 0.55 * neck, 0.45 * belly_at + 0.55 * neck_at),
-        (neck, neck_at),
+        (0.45 * foot + 0.55 * belly, 0.48 * belly_height),
+        (belly, belly_height),
+        (0.45 * belly + 0.55 * neck, 0.45 * belly_height + 0.55 * neck_height),
+        (neck, neck_height),
         (lip, height),
     ]
     profile = shapes.spline(knots, count=34)
     patches = shapes.vessel(
         profile, wall=sampler(0.4, low=0.35, high=0.6), floor=0.8, step=1.2
     )
-    return belly_at, neck_at, profile, patches
+    return _VaseBody(belly_height, neck_height, profile, patches)
 
 
-def _vase_handles(
-    sampler: ParameterSampler, belly_at: float, neck_at: float, profile: Array
-) -> list[Patch]:
-    """Create two handles on opposite sides of a vase, or none.
+def _vase_handles(sampler: ParameterSampler, body: _VaseBody) -> list[Patch]:
+    """Create two handles on opposite sides of a vase; most vases have none.
 
     Args:
         sampler: chooses, and samples their shape.
-        belly_at, neck_at: heights between which they are.
-        profile: profile of the vase (K, 2).
+        body: the vase.
     """
-    patches = list[Patch]()
-    if sampler.chance(0.25):
-        low = belly_at + 0.15 * (neck_at - belly_at)
-        high = neck_at - 0.2
-        ear = make_handle(
-            sampler,
-            "ear",
-            low=low,
-            high=high,
-            reach=sampler(1.6, low=1.2, high=2.4),
-            profile=profile,
-            inset=0.2,
-        )
-        patches += [
-            *shapes.transform_patches(ear, shapes.rotation("z", 130.0)),
-            *shapes.transform_patches(ear, shapes.rotation("z", -50.0)),
-        ]
-    return patches
+    if not sampler.chance(0.25):
+        return []
+    ear = make_handle(
+        sampler,
+        "ear",
+        bottom=body.belly_height + 0.15 * (body.neck_height - body.belly_height),
+        top=body.neck_height - 0.2,
+        reach=sampler(1.6, low=1.2, high=2.4),
+        profile=body.profile,
+        inset=0.2,
+    )
+    return [
+        *shapes.transform_patches(ear, shapes.rotation("z", 130.0)),
+        *shapes.transform_patches(ear, shapes.rotation("z", -50.0)),
+    ]
 
 
 def _vase_paint(
     sampler: ParameterSampler, glaze: Paint, height: float, offset: Array
 ) -> Paint:
-    """Paint a vase: blue brushwork on the canonical one; on others that or a
-        decoration.
+    """Paint a vase with brushwork, or with another decoration of a potter.
+
+    The canonical vase has blue brushwork.
 
     Args:
         sampler: chooses, and samples the ink.
@@ -691,29 +708,11 @@ def _vase_paint(
         offset: (3,) into the noise.
     """
     ink = sampler.sample_color("23408f", "1f2a33", "b5442e", "d79b2b", "e9dfca")
-    if sampler.rng is not None and sampler.chance(0.6):
-        return _ceramic(
-            sampler, height, glaze, clouded(ink, factor=1.3, scale=3.0, offset=offset)
-        )
-
-    def scroll(texels: Texels) -> Array:
-        """Return the mask of curling petals around the belly."""
-        angle = np.arctan2(texels.xyz[:, 1], texels.xyz[:, 0])
-        z = texels.xyz[:, 2] / height
-        curl = np.abs(np.sin(3.0 * angle + 9.0 * np.sin(5.0 * z)))
-        petal = curl * (0.5 + 0.5 * np.sin(30.0 * z + 2.0 * np.sin(6.0 * angle)))
-        return step(petal, 0.55, soft=0.16) * between(
-            0.24 * height, 0.74 * height, soft=0.1
-        )(texels)
-
-    def frieze(texels: Texels) -> Array:
-        """Return the mask of a band of 16 teeth above the foot."""
-        teeth = step(
-            np.sin(16 * np.arctan2(texels.xyz[:, 1], texels.xyz[:, 0])), 0.0, soft=0.5
-        )
-        return between(0.09 * height, 0.17 * height, soft=0.1)(texels) * teeth
-
-    paint = over(glaze, scroll, solid(ink))
+    is_canonical = sampler.rng is None
+    if not is_canonical and sampler.chance(0.6):
+        accent = clouded(ink, factor=1.3, scale=3.0, offset=offset)
+        return _ceramic(sampler, height, glaze, accent)
+    paint = over(glaze, _scroll(height), solid(ink))
     # rings of ink, as fractions of the height
     for low, high in (
         (0.05, 0.08),
@@ -724,110 +723,119 @@ def _vase_paint(
         (0.96, 2.0),
     ):
         paint = over(paint, between(low * height, high * height, soft=0.12), solid(ink))
-    return over(paint, frieze, solid(ink))
+    return over(paint, _frieze(height), solid(ink))
+
+
+@painter
+def _scroll(t: Texels, height: float) -> Array:
+    """Return the mask of curling petals around the belly of a vase of a height."""
+    angle = np.arctan2(t.xyz[:, 1], t.xyz[:, 0])
+    z = t.xyz[:, 2] / height
+    curl = np.abs(np.sin(3.0 * angle + 9.0 * np.sin(5.0 * z)))
+    petal = curl * (0.5 + 0.5 * np.sin(30.0 * z + 2.0 * np.sin(6.0 * angle)))
+    on_belly = between(0.24 * height, 0.74 * height, soft=0.1)(t)
+    return step(petal, 0.55, soft=0.16) * on_belly
+
+
+@painter
+def _frieze(t: Texels, height: float) -> Array:
+    """Return the mask of a band of 16 teeth above the foot of a vase of a height."""
+    angle = np.arctan2(t.xyz[:, 1], t.xyz[:, 0])
+    teeth = step(np.sin(16 * angle), 0.0, soft=0.5)
+    return between(0.09 * height, 0.17 * height, soft=0.1)(t) * teeth
+
+
+class _GlassBowl(NamedTuple):
+    """The bowl of a wine glass, with the upper part of its stem.
+
+    Attributes:
+        bottom: height at which the bowl begins, on top of the stem.
+        depth: depth of the bowl.
+        wall: thickness of its wall.
+        outer: outer profile (36, 2), points (r, z) from the stem up to the mouth.
+    """
+
+    bottom: float
+    depth: float
+    wall: float
+    outer: Array
 
 
 @family(metres=0.01)
 def wine_glass(sampler: ParameterSampler) -> Instance:
     """Make a wine glass, perhaps with wine."""
-    foot = sampler(3.5, low=2.9, high=4.2)
-    stem = sampler(0.42, low=0.32, high=0.6)
-    stem_top = sampler(9.5, low=6.0, high=12.0)
-    depth, wall, outer = _glass_bowl(sampler, stem, stem_top)
-    inner, lip = _glass_lip(outer, wall, stem_top, depth)
-    profile = _glass_profile(
-        stem_top=stem_top,
-        depth=depth,
-        inner=inner,
-        foot=foot,
-        stem=stem,
-        outer=outer,
-        lip=lip,
-    )
+    foot_radius = sampler(3.5, low=2.9, high=4.2)
+    stem_radius = sampler(0.42, low=0.32, high=0.6)
+    stem_height = sampler(9.5, low=6.0, high=12.0)
+    bowl_of_glass = _glass_bowl(sampler, stem_radius, stem_height)
+    profile = _glass_profile(bowl_of_glass, foot_radius, stem_radius)
     body = shapes.lathe(profile, columns=52)
-    paints = _glass_paints(sampler, stem_top, depth)
     return Instance(
         shapes.transform_patches(body, SEAM_ROTATION),
-        paints,
+        _glass_paints(sampler, stem_height, bowl_of_glass.depth),
         sample_material(sampler, roughness=0.18, clearcoat=0.8, spread=0.12),
     )
 
 
 def _glass_bowl(
-    sampler: ParameterSampler, stem: float, stem_top: float
-) -> tuple[float, float, Array]:
+    sampler: ParameterSampler, stem_radius: float, stem_height: float
+) -> _GlassBowl:
     """Sample the bowl of a wine glass, with the upper part of its stem.
 
     Args:
         sampler: samples its proportions.
-        stem: radius of the stem.
-        stem_top: height at which the bowl begins.
-
-    Returns:
-        The depth of the bowl; the thickness of its wall; and its outer profile (36, 2),
-        points (r, z) from the stem up to the mouth.
+        stem_radius: radius of the stem.
+        stem_height: height at which the bowl begins.
     """
-    bowl = sampler(4.1, low=3.2, high=5.0)
+    radius = sampler(4.1, low=3.2, high=5.0)
     depth = sampler(9.8, low=6.5, high=11.5)
-    mouth = bowl * sampler(0.8, low=0.7, high=1.12)
-    wide_at = sampler(0.42, low=0.3, high=0.55)
+    mouth = radius * sampler(0.8, low=0.7, high=1.12)
+    widest = sampler(0.42, low=0.3, high=0.55)  # its height, as a fraction of the depth
     wall = sampler(0.24, low=0.2, high=0.3)
-    knob = sampler.chance(0.25)
-    neck = [
-        (stem * (2.2 if knob else 1.0), 0.78 * stem_top),
-        (stem * 1.1, 0.92 * stem_top),
+    # some stems have a knob, 2.2 times as thick
+    knob_factor = 2.2 if sampler.chance(0.25) else 1.0
+    stem = [
+        (stem_radius, 0.6 * stem_height),
+        (stem_radius * knob_factor, 0.78 * stem_height),
+        (stem_radius * 1.1, 0.92 * stem_height),
     ]
     cup = [
-        (0.5 * bowl, stem_top + 0.07 * depth),
-        (0.86 * bowl, stem_top + 0.2 * depth),
-        (bowl, stem_top + wide_at * depth),
-        (0.45 * bowl + 0.55 * mouth, stem_top + 0.76 * depth),
-        (mouth, stem_top + depth),
+        (0.5 * radius, stem_height + 0.07 * depth),
+        (0.86 * radius, stem_height + 0.2 * depth),
+        (radius, stem_height + widest * depth),
+        (0.45 * radius + 0.55 * mouth, stem_height + 0.76 * depth),
+        (mouth, stem_height + depth),
     ]
-    outer = shapes.spline([(stem, 0.6 * stem_top), *neck, *cup], count=36)
-    return depth, wall, outer
+    outer = shapes.spline([*stem, *cup], count=36)
+    return _GlassBowl(stem_height, depth, wall, outer)
 
 
-def _glass_lip(
-    outer: Array, wall: float, stem_top: float, depth: float
-) -> tuple[Array, Array]:
+def _glass_lip(glass: _GlassBowl) -> tuple[Array, Array]:
     """Return the profile of the inside of a wine glass, and that of its rounded lip.
-
-    Args:
-        outer: (K, 2) points (r, z) from the stem up to the mouth.
-        wall: thickness of the wall.
-        stem_top: height at which the bowl begins.
-        depth: depth of the bowl.
 
     Returns:
         The inside (n, 2) from the mouth downwards, without its floor; and three points
         (3, 2) of the half circle that joins the outside to it.
     """
-    # the tangent (dr, dz), then turned to the right, which is outwards
-    normal = np.gradient(outer, axis=0)
-    normal = np.stack([normal[:, 1], -normal[:, 0]], axis=1) / np.linalg.norm(
-        normal, axis=1, keepdims=True
-    )
-    inner = (outer - wall * normal)[::-1]
-    # what is lower belongs to the floor
-    inner = inner[inner[:, 1] > stem_top + 0.11 * depth]
+    tangent = np.gradient(glass.outer, axis=0)  # (dr, dz)
+    # turned to the right, which is outwards
+    normal = np.stack([tangent[:, 1], -tangent[:, 0]], axis=1)
+    normal = normal / np.linalg.norm(tangent, axis=1, keepdims=True)
+    inner = (glass.outer - glass.wall * normal)[::-1]
+    is_wall = inner[:, 1] > glass.bottom + 0.11 * glass.depth  # the floor is below
+    inner = inner[is_wall]
+    # A half circle around the middle of the wall's end, from its outside to its inside.
     angle = np.pi * np.arange(1, 4) / 4
-    # on along the profile, beyond the mouth
-    side = np.array([-normal[-1, 1], normal[-1, 0]])
-    curl = np.cos(angle)[:, None] * normal[-1] + np.sin(angle)[:, None] * side
-    # around the middle of the wall's end
-    lip = outer[-1] - wall / 2 * normal[-1] + wall / 2 * curl
+    outwards = normal[-1]
+    upwards = np.array([-outwards[1], outwards[0]])  # on along the profile
+    unit_circle = np.cos(angle)[:, None] * outwards + np.sin(angle)[:, None] * upwards
+    half_wall = glass.wall / 2
+    lip = glass.outer[-1] - half_wall * outwards + half_wall * unit_circle
     return inner, lip
 
 
 def _glass_profile(
-    stem_top: float,
-    depth: float,
-    inner: Array,
-    foot: float,
-    stem: float,
-    outer: Array,
-    lip: Array,
+    glass: _GlassBowl, foot_radius: float, stem_radius: float
 ) -> list[tuple[str, Array]]:
     """Return the tags and profiles of the parts of a wine glass, in order.
 
@@ -835,32 +843,37 @@ def _glass_profile(
     down the inside to the axis.
 
     Args:
-        stem_top: height of the top of the stem.
-        depth: depth of the bowl.
-        inner, outer, lip: profiles of the bowl (K, 2); `inner` leads downwards.
-        foot, stem: radii.
+        glass: the bowl.
+        foot_radius, stem_radius: radii.
     """
-    floor = stem_top + 0.08 * depth
-    edge = (inner[-1, 0] * 0.6, floor + 0.25 * (inner[-1, 1] - floor))
-    under = [(0.0, 0.12), (foot * 0.8, 0.12), (foot * 0.9, 0.0), (foot - 0.15, 0.0)]
-    rising = [
-        (foot, 0.28),
-        (0.55 * foot, 0.6),
-        (0.22 * foot, 1.25),
-        (stem * 1.15, 2.4),
-        (stem, 0.6 * stem_top),
+    inner, lip = _glass_lip(glass)
+    floor = glass.bottom + 0.08 * glass.depth
+    floor_edge = (inner[-1, 0] * 0.6, floor + 0.25 * (inner[-1, 1] - floor))
+    under = [
+        (0.0, 0.12),
+        (foot_radius * 0.8, 0.12),
+        (foot_radius * 0.9, 0.0),
+        (foot_radius - 0.15, 0.0),
     ]
+    rising = [
+        (foot_radius, 0.28),
+        (0.55 * foot_radius, 0.6),
+        (0.22 * foot_radius, 1.25),
+        (stem_radius * 1.15, 2.4),
+        (stem_radius, 0.6 * glass.bottom),
+    ]
+    upper_side = [under[-1], (foot_radius, 0.08), *shapes.spline(rising, count=14)]
     return [
         ("foot", shapes.subdivide(under, longest=1.5)),
-        ("foot", np.array([under[-1], (foot, 0.08), *shapes.spline(rising, count=14)])),
-        ("bowl", np.concatenate([outer, lip, inner[:1]])),
+        ("foot", np.array(upper_side)),
+        ("bowl", np.concatenate([glass.outer, lip, inner[:1]])),
         ("inside", inner),
-        ("inside", np.array([inner[-1], edge, (0.0, floor)])),
+        ("inside", np.array([inner[-1], floor_edge, (0.0, floor)])),
     ]
 
 
 def _glass_paints(
-    sampler: ParameterSampler, stem_top: float, depth: float
+    sampler: ParameterSampler, stem_height: float, depth: float
 ) -> dict[str, Paint]:
     """Sample the paints of a wine glass, which often has wine in it.
 
@@ -868,28 +881,37 @@ def _glass_paints(
 
     Args:
         sampler: samples the paints.
-        stem_top: height at which the bowl begins.
+        stem_height: height at which the bowl begins.
         depth: depth of the bowl.
     """
-    height = stem_top + depth
+    height = stem_height + depth
     tint = sampler.sample_color(
-        "c4dbe2", "d9e4e6", "e8d9c8", "8fb8a8", "c58a94", "7c9cc4", "f0f0ee", wild=0.3
+        "c4dbe2",
+        "d9e4e6",
+        "e8d9c8",
+        "8fb8a8",
+        "c58a94",
+        "7c9cc4",
+        "f0f0ee",
+        p_random=0.3,
     )
-    drink = sampler.sample_color("6d1526", "d8b45a", "c46a6a", "3f1420", wild=0.15)
-    level = stem_top + depth * sampler(0.48, low=0.3, high=0.62)
-    plain = gradient(shade(tint, 0.86), shade(tint, 1.08), low=0.0, high=height)
-    outside = inside = plain
-    if sampler.chance(0.5, canonical=True):
+    drink = sampler.sample_color("6d1526", "d8b45a", "c46a6a", "3f1420", p_random=0.15)
+    level = stem_height + depth * sampler(0.48, low=0.3, high=0.62)
+    glass = gradient(shade(tint, 0.86), shade(tint, 1.08), low=0.0, high=height)
+    outside = glass
+    inside = glass
+    if sampler.chance(0.5, canonical=True):  # filled
         wine = clouded(drink, factor=0.8, scale=3.0, offset=sampler.offset())
-        outside = over(plain, between(stem_top + 0.06 * depth, level, soft=0.1), wine)
-        inside = over(plain, between(0.0, level, soft=0.1), solid(drink))
-    outside = paint_or_random(sampler, height, outside, wild=0.3)
-    if sampler.chance(0.2, canonical=True):
-        outside = over(
-            outside, between(height - 0.35, 2 * height, soft=0.1), solid("c9a24b")
-        )
+        is_wine = between(stem_height + 0.06 * depth, level, soft=0.1)
+        outside = over(glass, is_wine, wine)
+        inside = over(glass, between(0.0, level, soft=0.1), solid(drink))
+    outside = paint_or_random(sampler, height, outside, p_random=0.3)
+    if sampler.chance(0.2, canonical=True):  # a golden rim
+        is_rim = between(height - 0.35, 2 * height, soft=0.1)
+        outside = over(outside, is_rim, solid("c9a24b"))
     if sampler.chance(0.7, canonical=True):
-        foot_paint = sampler.pick(plain, outside, plain)
+        # `glass` is named twice, to be sampled twice as often
+        foot_paint = sampler.pick(glass, outside, glass)
     else:
         foot_paint = sample_paint(sampler, height)
     return {"foot": foot_paint, "bowl": outside, "inside": inside}
