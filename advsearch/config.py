@@ -800,7 +800,7 @@ def _parse_positive(value: Any) -> float:
         raise ValueError("out of range")
     try:
         number = float(value)
-    except (TypeError, OverflowError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError("not a number") from None
     # what is smaller has no square in float32
     if not 1e-30 < number <= MAX_EPSILON:

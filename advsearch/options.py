@@ -181,7 +181,7 @@ def _find_expected(option_type: str, value: object) -> str:
     is_number = (
         isinstance(value, (int, float))
         and not isinstance(value, bool)
-        and not abs(value) > MAX_OPTION
+        and abs(value) <= MAX_OPTION  # which NaN is not
     )
     if option_type == "float" and not is_number:
         return f"a finite number from {-MAX_OPTION} to {MAX_OPTION}"

@@ -336,13 +336,14 @@ class Detection(ClassTask):
 
         Args:
             output: output of N images.
-            order: one of `HEADS` with a layout, if there are grids.
+            order: one of `HEADS` with a layout, if there are grids; "" if unknown,
+                as without names of classes.
         """
         for detections in output:
             if "map_channels" in detections and "grid" not in detections:
                 return True
         grids = [detections["grid"] for detections in output if "grid" in detections]
-        if not grids:
+        if not grids or not order:
             return False
         channel_axis = 0 if order.endswith(CHANNELS_FIRST) else 1
         n_channels = grids[0].shape[channel_axis]

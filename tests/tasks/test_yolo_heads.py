@@ -189,6 +189,10 @@ def test_an_order_says_what_a_head_is(order: str) -> None:
         Detection(order="boxes objectness")
 
 
+def test_a_head_of_unknown_order_has_no_masks_that_are_known() -> None:
+    assert not Detection()._has_mask_coefficients([{"grid": torch.zeros(40, 21)}], order="")
+
+
 @pytest.mark.parametrize("names", [dict(enumerate(NAMES)), list(NAMES)])
 def test_names_and_size_come_from_the_network(names: Any) -> None:
     network: Any = Head(first)

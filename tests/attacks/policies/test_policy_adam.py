@@ -1,12 +1,14 @@
 """The policy `adam`: steps in units of half a range, whatever the gradient's size."""
 
+import math
 from functools import partial
 
 import pytest
 import torch
 from torch import Tensor
 
-from advsearch.attacks import Adam, Block, Domain, Evaluation, Query, search
+from advsearch.attacks import Adam, Block, Domain, Evaluation, Query, make_policy, search
+from advsearch.errors import InputError
 
 
 def path(domain: Domain, slope: Tensor, policy: Adam, steps: int) -> list[Tensor]:
@@ -48,3 +50,9 @@ def test_the_rate_falls_in_a_line() -> None:
 
     history = search(partial(map, evaluate), domain, Adam(step_size=0.4), steps=10, seed=0, candidates=0).history
     assert [r.step_size for r in history] == pytest.approx([0.4 * (1 - k / 10) for k in range(10)])
+
+
+@pytest.mark.parametrize("step_size", [math.nan, math.inf, -1.0, 0.0])
+def test_a_step_that_is_no_positive_number_is_refused(step_size: float) -> None:
+    with pytest.raises(InputError, match="step_size"):
+        make_policy("adam", step_size=step_size)
