@@ -102,14 +102,18 @@ def find_interior(asset: assets.ObjectAsset) -> Vessel | None:
     heights = np.linspace(floor, floor + FILL_LIMIT * depth, WALL_ROWS)
     # just above the floor, since a ray along a flat floor might hit anything
     min_height = floor + 0.004 * depth
-    walls = [
-        _find_wall(mesh, axis, max(float(height), min_height)) for height in heights
-    ]
-    distances, faces = zip(*walls, strict=True)
+    distances = []
+    faces = []
+    for height in heights:
+        row_distances, row_faces = _find_wall(
+            mesh, axis, max(float(height), min_height)
+        )
+        distances.append(row_distances)
+        faces.append(row_faces)
     radii = _fill_missed_radii(np.stack(distances))
     if radii is None:
         return None
-    # of the lower half of the wall; -1 is no face
+    # what is seen through the liquid; -1 is a ray that hit no face
     lower_faces = np.concatenate(faces[: WALL_ROWS // 2])
     wall_color = _mean_face_color(asset, lower_faces[lower_faces >= 0])
     return Vessel(axis, heights, radii, wall_color)
@@ -362,22 +366,28 @@ class ContentsControl(Control):
     def __init__(self, name: str | None = None, **settings: object) -> None:
         """Find the bounds of each proportion, also of those that are not set.
 
-        If anything is searched, these go from 0 to what the others leave. Raises
-        InputError: the proportions cannot add up to 1.
+        Raises InputError: the proportions cannot add up to 1.
         """
         super().__init__(name, **settings)
         self.proportion_bounds = self._read_bounds()
-        least_total = sum(lower for lower, _ in self.proportion_bounds.values())
-        self._check_total(least_total)
-        is_searched = not self.has_requested_search or any(
+        min_total = sum(lower for lower, _ in self.proportion_bounds.values())
+        self._check_total(min_total)
+        self._add_default_bounds(rest=max(0.0, 1.0 - min_total))
+
+    def _add_default_bounds(self, rest: float) -> None:
+        """Add the bounds of the proportions that are not set.
+
+        If proportions are searched, they go from 0 to the rest that those set leave.
+        Otherwise the first of coffee, water and milk that is not set has all of it.
+        """
+        # all parameters are searched unless a range is set for some
+        are_searched = not self.has_requested_search or any(
             isinstance(self.specs.get(name), Range) for name in INGREDIENTS
         )
-        rest = max(0.0, 1.0 - least_total)
-        # If nothing is searched, the first of these that is not set has all the rest.
         for name in ("coffee", "water", "milk"):
             if name in self.proportion_bounds:
                 continue
-            if is_searched:
+            if are_searched:
                 self.proportion_bounds[name] = (0.0, rest)
             else:
                 self.proportion_bounds[name] = (rest, rest)
@@ -409,19 +419,22 @@ class ContentsControl(Control):
                 )
         return bounds
 
-    def _check_total(self, least_total: float) -> None:
-        """Check that the proportions can add up to 1. Raises InputError: they
-        cannot.
+    def _check_total(self, min_total: float) -> None:
+        """Check that the proportions can add up to 1. Raises InputError: they cannot.
+
+        `min_total` is the sum of the lower bounds of those that are set.
         """
-        largest_total = sum(upper for _, upper in self.proportion_bounds.values())
+        max_total = sum(upper for _, upper in self.proportion_bounds.values())
         all_set = len(self.proportion_bounds) == len(INGREDIENTS)
-        is_too_little = all_set and largest_total < 1.0 - SUM_TOLERANCE
-        if least_total <= 1.0 + SUM_TOLERANCE and not is_too_little:
+        # where one is not set, it makes up what is missing
+        is_too_little = all_set and max_total < 1.0 - SUM_TOLERANCE
+        is_too_much = min_total > 1.0 + SUM_TOLERANCE
+        if not is_too_little and not is_too_much:
             return
         stated = []
         for name in INGREDIENTS:
             if name in self.proportion_bounds:
-                # a dict, so that equal bounds are named once
+                # "water 0.2 to 0.5"; a dict, so that equal bounds are named once
                 bounds = dict.fromkeys(
                     f"{bound:g}" for bound in self.proportion_bounds[name]
                 )

@@ -176,7 +176,8 @@ class PatchControl(PictureControl):
             )
         # distributions are subclasses of Range
         is_plain_range = type(pixels) is Range
-        if pixels is not None and not isinstance(pixels, Fixed) and not is_plain_range:
+        is_valid = pixels is None or isinstance(pixels, Fixed) or is_plain_range
+        if not is_valid:
             got = "a distribution"
             if isinstance(pixels, OneOf):
                 got = f"a list of {len(pixels.values)}"
@@ -218,9 +219,6 @@ class PatchControl(PictureControl):
     def fit(self) -> None:
         """Prepare the painter, and let searched pixels start as the texture underneath.
 
-        Colors of the texture outside the range of the pixels are clipped to it, and the
-        start is recorded as an adjusted default.
-
         Raises:
             InputError: nothing is searched.
         """
@@ -244,19 +242,25 @@ class PatchControl(PictureControl):
         }
         self._painter = PatchPainter(self.scene, start_values, side)
         if isinstance(pixels.spec, Range):
-            low = pixels.spec.low
-            high = pixels.spec.high
-            # (side, side, 3), as fractions of the range
-            underneath = (self._painter.sample_underneath() - low) / (high - low)
-            # the pixels' coordinates come first
-            start = underneath.clamp(0.0, 1.0)
-            self.start[: pixels.n_coordinates] = start.reshape(-1)
-            if not torch.allclose(start, underneath, atol=1e-5):
-                self.record_adjusted_default(
-                    pixels.parameter,
-                    "the texture underneath",
-                    f"the nearest {pixels.spec}",
-                )
+            self._start_as_underneath(pixels.parameter, pixels.spec)
+
+    def _start_as_underneath(self, parameter: Parameter, pixel_range: Range) -> None:
+        """Let searched pixels start as the texture underneath the patch.
+
+        Colors outside their range are clipped to it, and the start is recorded as an
+        adjusted default. `parameter` is that of the pixels.
+        """
+        low = pixel_range.low
+        high = pixel_range.high
+        # (side, side, 3), as fractions of the range
+        underneath = (self._painter.sample_underneath() - low) / (high - low)
+        start = underneath.clamp(0.0, 1.0)
+        # the pixels' coordinates come first
+        self.start[: start.numel()] = start.reshape(-1)
+        if not torch.allclose(start, underneath, atol=1e-5):
+            self.record_adjusted_default(
+                parameter, "the texture underneath", f"the nearest {pixel_range}"
+            )
 
     def must_match_scene(
         self, parameter: Parameter, spec: Fixed | Range | OneOf
@@ -449,6 +453,7 @@ class PatchPainter:
         else:
             base = _resize_to_square(base, len(self._object_color))
         size = numbers["size"]
+        # in the order of the arguments of `_find_nearby_texels`
         texels = self._find_texels(
             *(float(numbers[name].detach()) for name in ("azimuth", "height", "size"))
         )

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, TypeGuard
@@ -297,12 +298,13 @@ def _explain_turn(parameter: Parameter, low: float, high: float) -> str:
     range is shifted by a turn, so that it ascends and stays within the parameter's
     bounds.
     """
+    # a turn back, or if the parameter does not go so far, on
     begin = low
     end = high + FULL_TURN
     if low - FULL_TURN >= parameter.low:
         begin = low - FULL_TURN
         end = high
-    # where the shorter range crosses the full turn, as an angle within it
+    # the multiple of a turn inside the range, by which messages name it
     through = 0 if begin <= 0 else FULL_TURN
     return (
         f"write [{begin:g}, {end:g}] for the {FULL_TURN - low + high:g} "
@@ -609,8 +611,9 @@ def _freeze_distribution(
 ) -> tuple[Any, str]:
     """Return a distribution of scipy with its arguments, and how messages write it.
 
-    Raises UnknownNameError or InputError: there is none of that name, or it does not
-    take the arguments.
+    Raises:
+        UnknownNameError: scipy has none of that name.
+        InputError: it does not take the arguments.
     """
     # takes a quarter of a second, and few runs draw by a distribution
     from scipy import stats
@@ -623,19 +626,14 @@ def _freeze_distribution(
             COMMON_DISTRIBUTIONS,
             "It is one of scipy.stats, of real numbers.",
         )
-    written = []
-    for key, value in arguments.items():
-        is_number = Parameter.is_number(value)
-        written.append(f"{key}={value:g}" if is_number else f"{key}={value!r:.20}")
-    text = f"{name}({', '.join(written)})"
-    try:
-        if not all(map(Parameter.is_number, arguments.values())):
-            raise TypeError("expected numbers")
-        frozen = family(**arguments)
-        # with arguments out of range, scipy's median is NaN
-        is_valid = np.isfinite(frozen.ppf(0.5))
-    except TypeError:
-        is_valid = False
+    text = f"{name}({_format_arguments(arguments)})"
+    frozen = None
+    is_valid = False
+    if all(map(Parameter.is_number, arguments.values())):
+        with suppress(TypeError):  # it has no such arguments, or lacks one
+            frozen = family(**arguments)
+            # with arguments out of range, scipy's median is NaN
+            is_valid = bool(np.isfinite(frozen.ppf(0.5)))
     if not is_valid:
         shapes = f"{family.shapes}, " if family.shapes else ""
         raise InputError(
@@ -643,6 +641,15 @@ def _freeze_distribution(
             f"{shapes}loc, scale, got {text}"
         )
     return frozen, text
+
+
+def _format_arguments(arguments: Mapping[str, Any]) -> str:
+    """Return arguments as ``loc=0, scale=2``; what is no number is cut short."""
+    written = []
+    for key, value in arguments.items():
+        is_number = Parameter.is_number(value)
+        written.append(f"{key}={value:g}" if is_number else f"{key}={value!r:.20}")
+    return ", ".join(written)
 
 
 def _read_python_quantiles(

@@ -215,11 +215,11 @@ class ProjectorControl(PictureControl):
         """Check that pattern, picture and ball go together. Raises InputError."""
         pattern = self._settings.get("pattern")
         picture = self.chosen["picture"]
-        # a pattern may be left out, be False or 0, or be its full range
-        is_full_range = isinstance(pattern, (list, tuple)) and [*pattern] == [0.0, 1.0]
-        # an empty list is false as well, but no way to leave the pattern out
-        is_empty_list = isinstance(pattern, (list, tuple)) and not pattern
-        if is_empty_list or (pattern and not is_full_range):
+        if isinstance(pattern, (list, tuple)):
+            is_valid = [*pattern] == [0.0, 1.0]  # its full range
+        else:
+            is_valid = not pattern  # left out, False or 0
+        if not is_valid:
             raise InputError(
                 f"{self.name}.pattern: expected no value but [0, 1], got {pattern!r}; "
                 f"a file is {self.name}.picture, "
@@ -281,9 +281,8 @@ class ProjectorControl(PictureControl):
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
         """Return a parameter with its default in this scene.
 
-        The projector stands beside the scene's camera, as far away and as high. The
-        ambient light is the environment's, if that has a unit. The light is
-        `DEFAULT_LUMENS`, or less if that is too bright for the ambient light.
+        By default the projector stands beside the scene's camera, as far away and as
+        high.
         """
         parameter = super().resolve_parameter(parameter)
         scene = self.scene
@@ -295,21 +294,10 @@ class ProjectorControl(PictureControl):
                 grey = START_GREY if self.chosen["start"] == "grey" else 0.0
                 return replace(parameter, default=grey)
             case "ambient":
-                lux = DEFAULT_AMBIENT_LUX
-                environment = scene.environment
-                if environment is not None and environment.candelas is not None:
-                    lux = environment.candelas * scene.metered_irradiance
-                    lux = min(max(lux, 1e-3), 2e5)  # the parameter's range
-                return replace(parameter, default=lux)
+                return replace(parameter, default=self._compute_ambient_lux())
             case "lumens":
-                # the light falls on an area that grows with the squared distance
-                max_lumens = (
-                    MAX_AMBIENT_FACTOR
-                    * float(self.get_clean_value("ambient"))
-                    * self.part.area
-                    * self._start_distance() ** 2
-                )
-                return replace(parameter, default=min(DEFAULT_LUMENS, max_lumens))
+                lumens = min(DEFAULT_LUMENS, self._compute_max_lumens())
+                return replace(parameter, default=lumens)
             case "azimuth":
                 azimuth = math.degrees(math.atan2(camera_offset[1], camera_offset[0]))
                 return replace(parameter, default=azimuth + DEFAULT_CAMERA_ANGLE)
@@ -317,13 +305,36 @@ class ProjectorControl(PictureControl):
                 elevation = math.degrees(math.asin(camera_offset[2] / camera_distance))
                 return replace(parameter, default=min(max(elevation, -89.0), 89.0))
             case "distance":
-                unit = (
-                    "object sizes" if scene.object.size_in_metres is None else "metres"
-                )
+                has_metres = scene.object.size_in_metres is not None
                 return replace(
-                    parameter, default=camera_distance * scene.size_in_metres, unit=unit
+                    parameter,
+                    default=camera_distance * scene.size_in_metres,
+                    unit="metres" if has_metres else "object sizes",
                 )
         return parameter
+
+    def _compute_ambient_lux(self) -> float:
+        """Return the illuminance by the environment, which may have no unit.
+
+        Then it is `DEFAULT_AMBIENT_LUX`.
+        """
+        environment = self.scene.environment
+        if environment is None or environment.candelas is None:
+            return DEFAULT_AMBIENT_LUX
+        lux = environment.candelas * self.scene.metered_irradiance
+        return min(max(lux, 1e-3), 2e5)  # the parameter's range
+
+    def _compute_max_lumens(self) -> float:
+        """Return the light that is `MAX_AMBIENT_FACTOR` times as bright as the ambient.
+
+        It falls on an area that grows with the squared distance.
+        """
+        return (
+            MAX_AMBIENT_FACTOR
+            * float(self.get_clean_value("ambient"))
+            * self.part.area
+            * self._start_distance() ** 2
+        )
 
     @property
     def sides(self) -> tuple[int, int]:
