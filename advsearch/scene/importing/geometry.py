@@ -137,14 +137,7 @@ def join_parts(
     """
     vertices = np.concatenate([part.vertices for part in parts])
     _check_finite(vertices, source)
-    vertex_starts = np.cumsum([0] + [len(part.vertices) for part in parts])
-    # Faces count the vertices of all parts, not of their own.
-    faces = np.concatenate(
-        [
-            part.faces + start
-            for part, start in zip(parts, vertex_starts[:-1], strict=True)
-        ]
-    )
+    faces = _concatenate_faces(parts)
     lower_corner = vertices[find_used(faces, len(vertices))].min(axis=0)
     extent = compute_extent(parts)
     _check_extent(extent, source)
@@ -171,6 +164,17 @@ def join_parts(
         colors=np.concatenate(colors),
         is_flat=np.array([part.flat for part in parts]).repeat(n_faces),
         stored_vertices=faces if has_movable else None,
+    )
+
+
+def _concatenate_faces(parts: Sequence[ImportedPart]) -> IntArray:
+    """Return the faces (F, 3) of all parts, as indices of all their vertices."""
+    vertex_starts = np.cumsum([0] + [len(part.vertices) for part in parts])
+    return np.concatenate(
+        [
+            part.faces + start
+            for part, start in zip(parts, vertex_starts[:-1], strict=True)
+        ]
     )
 
 

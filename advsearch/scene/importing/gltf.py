@@ -96,8 +96,8 @@ def _parse_content(path: Path, chunk: bytes) -> dict[str, Any]:
     upper bound of its values. Raises FileFormatError.
     """
     text = decode_text(chunk)
-    # Each value but the first of a list or an object follows a comma.
-    max_values = sum(map(text.count, ",[{"))
+    # Each value follows a comma, or the bracket that begins its list or object.
+    max_values = sum(text.count(character) for character in ",[{")
     check_most(
         path,
         max_values,

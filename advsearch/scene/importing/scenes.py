@@ -117,11 +117,12 @@ def import_scene(path: Path, node: str) -> ImportedScene:
     header = gltf.read_header(path, data)
     parts, notes = read_parts(path, data)
     node_poses = dict(iterate_poses(header))
+    # the named node with all below it is the object; the rest surrounds it
     object_nodes = header.find_descendants([_find_node(path, header, parts, node)])
     object_parts = [part for part in parts if part.node in object_nodes]
     lights = _find_node_lights(header, node_poses)
-    n_others = len({part.node for part in parts} - object_nodes)
-    _check_surroundings(path, n_others + len(lights))
+    n_other_meshes = len({part.node for part in parts} - object_nodes)
+    _check_surroundings(path, n_other_meshes + len(lights))
     front = find_front(path, header)
     frame = _compute_frame(object_parts, compute_rotation("y", front.axis))
     names = UniqueNames(RESERVED_NAMES)
@@ -479,11 +480,6 @@ def _make_lamp(
 ) -> PointLamp | SpotLamp:
     """Return a light of a file as a lamp.
 
-    A directional light has lux. It becomes a lamp so far away that its rays are
-    parallel, with an intensity of lux times squared distance, which is the same lux at
-    the object. Lengths of others are divided by the object's size, so that intensities
-    are divided by its square.
-
     Args:
         path: the file, for messages.
         name: name of the lamp.
@@ -495,15 +491,7 @@ def _make_lamp(
     Raises:
         InputError: it is too far away or too bright.
     """
-    intensity = np.array(light.color) * light.intensity / candela_per_unit
-    if light.type == "directional":
-        direction = frame.rotation @ pose[:3, 2]  # it shines along its -z
-        length = max(float(np.linalg.norm(direction)), 1e-12)  # not 0
-        position = gltf_parts.DIRECTIONAL_LIGHT_DISTANCE * direction / length
-        intensity = intensity * gltf_parts.DIRECTIONAL_LIGHT_DISTANCE**2
-    else:
-        position = frame.to_frame(frame.rotation @ pose[:3, 3])
-        intensity = intensity / frame.size**2
+    position, intensity = _position_light(light, candela_per_unit, pose, frame)
     # one limit for distances and intensities; NaN is out of range
     is_in_range = np.abs([*position, *intensity]) <= MAX_DISTANCE
     if not is_in_range.all():
@@ -526,6 +514,30 @@ def _make_lamp(
         cutoff=math.degrees(light.spot.outerConeAngle),
         beam=math.degrees(light.spot.innerConeAngle),
     )
+
+
+def _position_light(
+    light: LightEntry,
+    candela_per_unit: float,
+    pose: Float64Array,
+    frame: FileFrame,
+) -> tuple[Float64Array, Float64Array]:
+    """Return the position (3,) of a light and its radiant intensity (3,).
+
+    A directional light has lux. It becomes a lamp so far away that its rays are
+    parallel, with an intensity of lux times squared distance, which is the same lux at
+    the object. Lengths of others are divided by the object's size, so that intensities
+    are divided by its square. Arguments are those of `_make_lamp`.
+    """
+    intensity = np.array(light.color) * light.intensity / candela_per_unit
+    if light.type == "directional":
+        direction = frame.rotation @ pose[:3, 2]  # it shines along its -z
+        length = max(float(np.linalg.norm(direction)), 1e-12)  # not 0
+        position = gltf_parts.DIRECTIONAL_LIGHT_DISTANCE * direction / length
+        intensity = intensity * gltf_parts.DIRECTIONAL_LIGHT_DISTANCE**2
+        return position, intensity
+    position = frame.to_frame(frame.rotation @ pose[:3, 3])
+    return position, intensity / frame.size**2
 
 
 def _make_cameras(
