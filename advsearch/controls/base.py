@@ -684,7 +684,8 @@ class Control:
                     "two, or "
                     "leave one out"
                 )
-            if not isinstance(self.specs.get(parameter.name), Fixed):
+            is_fixed_by_user = isinstance(self.specs.get(parameter.name), Fixed)
+            if not is_fixed_by_user:
                 yield AdjustedDefault(
                     self.name,
                     setting if setting == ENVIRONMENT else label,

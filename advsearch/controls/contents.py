@@ -162,20 +162,18 @@ def _find_basin(mesh: assets.Mesh) -> tuple[assets.Float64Array, float, float] |
     """
     corner, cell, ground = _compute_height_map(mesh)
     water = _fill_with_water(ground)
+    water_depth = water - ground
     # Connected cells with water; 0 is dry, basins count from 1. A film of less than a
     # thousandth of the object is dry as well.
-    labels, count = ndimage.label(water - ground > 1e-3)
+    labels, count = ndimage.label(water_depth > 1e-3)
     if count == 0:
         return None
-    volumes = ndimage.sum_labels(water - ground, labels, np.arange(1, count + 1))
+    volumes = ndimage.sum_labels(water_depth, labels, np.arange(1, count + 1))
     is_largest = labels == 1 + int(np.argmax(volumes))
-    depth = np.where(is_largest, water - ground, 0.0)
+    depth = np.where(is_largest, water_depth, 0.0)
     if depth.max() < MIN_DEPTH or is_largest.sum() * cell * cell < MIN_OPENING:
         return None
-    row, column = np.nonzero(is_largest)
-    weight = depth[is_largest]
-    moments = np.array([(column * weight).sum(), (row * weight).sum()])
-    axis = corner + cell * moments / weight.sum()
+    axis = _find_weighted_center(depth, corner, cell)
     return axis, float(ground[is_largest].min()), float(water[is_largest].max())
 
 
@@ -254,6 +252,20 @@ def _fill_with_water(ground: assets.Float64Array) -> assets.Float64Array:
         if has_settled:
             return water
         water[1:-1, 1:-1] = level
+
+
+def _find_weighted_center(
+    weights: assets.Float64Array, corner: assets.Float64Array, cell: float
+) -> assets.Float64Array:
+    """Return the center (2,) of the cells of a grid, by their weights (rows, columns).
+
+    `corner` (2,) is the middle of the first cell, `cell` the side of each.
+    """
+    row, column = np.nonzero(weights)
+    weight = weights[row, column]
+    moments = np.array([(column * weight).sum(), (row * weight).sum()])
+    center: assets.Float64Array = corner + cell * moments / weight.sum()
+    return center
 
 
 def _find_wall(
@@ -543,12 +555,12 @@ class ContentsControl(Control):
         Args:
             cuts: coordinates in [0, 1] by ingredient.
         """
-        left = torch.ones_like(cuts[INGREDIENTS[0]])
+        remainder = torch.ones_like(cuts[INGREDIENTS[0]])
         proportions = dict[str, Tensor]()
         for name in INGREDIENTS:
-            lower, upper = self._possible_range(name, left)
+            lower, upper = self._possible_range(name, remainder)
             proportions[name] = lower + (upper - lower).clamp_min(0.0) * cuts[name]
-            left = left - proportions[name]
+            remainder = remainder - proportions[name]
         return proportions
 
     def find_cuts(self, proportions: Mapping[str, float]) -> dict[str, float]:
@@ -557,18 +569,18 @@ class ContentsControl(Control):
 
         It is the inverse of `cut_proportions`.
         """
-        left = torch.ones(())
+        remainder = torch.ones(())
         cuts = dict[str, float]()
         for name in INGREDIENTS:
-            lower, upper = map(float, self._possible_range(name, left))
+            lower, upper = map(float, self._possible_range(name, remainder))
             proportion = min(max(proportions[name], lower), max(lower, upper))
             cuts[name] = 0.0
             if upper > lower:
                 cuts[name] = (proportion - lower) / (upper - lower)
-            left = left - proportion
+            remainder = remainder - proportion
         return cuts
 
-    def _possible_range(self, name: str, left: Tensor) -> tuple[Tensor, Tensor]:
+    def _possible_range(self, name: str, remainder: Tensor) -> tuple[Tensor, Tensor]:
         """Return the least and the largest proportion () that an ingredient may have.
 
         They are its own bounds, narrowed so that the ingredients after it can make up
@@ -576,18 +588,18 @@ class ContentsControl(Control):
 
         Args:
             name: name of the ingredient.
-            left: () what the ingredients before it have left of 1.
+            remainder: () what the ingredients before it have left of 1.
         """
         index = INGREDIENTS.index(name)
-        limits = left.new_tensor(
+        limits = remainder.new_tensor(
             [self.proportion_bounds[ingredient] for ingredient in INGREDIENTS]
         )
         lower, upper = limits[index]
         # of all ingredients after this one together
         rest_lower, rest_upper = limits[index + 1 :].sum(dim=0)
-        return torch.maximum(lower, left - rest_upper), torch.minimum(
-            upper, left - rest_lower
-        )
+        least = torch.maximum(lower, remainder - rest_upper)
+        largest = torch.minimum(upper, remainder - rest_lower)
+        return least, largest
 
 
 # ---- how it looks

@@ -15,7 +15,7 @@ the map's mean radiance, inside an L2 ball.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -156,14 +156,8 @@ class EnvironmentControl(Control):
         else:
             environment = scene.require_environment(f"`controls` {self.name}")
             shows_photograph = scene.photograph is not None or environment.photographed
-            shows_files = bool(assets_by_file) and not shows_photograph
-            if shows_files and scene.get_number("ground.size") > 0.0:
-                names = ", ".join(Path(name).name for name in assets_by_file)
-                notes.append(
-                    f"{names}: the object stands on the scene's table there, too; "
-                    "ground.kind=photograph shows the "
-                    "floor of each picture instead"
-                )
+            if assets_by_file and not shows_photograph:
+                notes += _describe_table(scene, list(assets_by_file))
         return replace(scene, remarks=(*scene.remarks, *notes)) if notes else scene
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
@@ -246,6 +240,21 @@ class EnvironmentControl(Control):
                 0.0
             )
         return {"environment.data": lit}
+
+
+def _describe_table(scene: SceneDescription, files: Sequence[str]) -> list[str]:
+    """Return a note that the scene's table stays in environments from files.
+
+    There is none if the scene has no table.
+    """
+    if scene.get_number("ground.size") <= 0.0:
+        return []
+    names = ", ".join(Path(file).name for file in files)
+    return [
+        f"{names}: the object stands on the scene's table there, too; "
+        "ground.kind=photograph shows the "
+        "floor of each picture instead"
+    ]
 
 
 def _is_file(name: ParameterValue) -> bool:

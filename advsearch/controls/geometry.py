@@ -611,11 +611,15 @@ class GeometryControl(Control):
                 compute_shape_modes(self._mesh, int(self.chosen["modes"]))
             )
             group = Group("amplitudes", modes.shape[2], ESTIMATORS)
-            self._field: Callable[[Tensor], Tensor] = lambda a: modes.to(a.device) @ a
+            self._field: Callable[[Tensor], Tensor] = lambda amplitudes: (
+                modes.to(amplitudes.device) @ amplitudes
+            )
         else:
             precondition = Preconditioner(welded_mesh)
             group = Group("pushes", 3 * len(welded_mesh.positions), ESTIMATORS)
-            self._field = lambda a: PUSH_FACTOR * precondition(a.reshape(-1, 3))
+            self._field = lambda pushes: (
+                PUSH_FACTOR * precondition(pushes.reshape(-1, 3))
+            )
         self.groups = (group,)
         self.start = torch.full((group.size,), 0.5)
 

@@ -98,7 +98,8 @@ class HazeControl(Control):
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Add a ball of haze, or take over the scene's own."""
-        if (scene_haze := _find_haze(scene)) is not None:
+        scene_haze = _find_haze(scene)
+        if scene_haze is not None:
             renamed = replace(scene_haze, name=self.name)
             return replace(
                 scene,
@@ -108,11 +109,8 @@ class HazeControl(Control):
             )
         # from the origin, the center of the ball
         camera_distance = float(np.linalg.norm(geometry.camera_to_world(scene)[:3, 3]))
-        return scene.with_part(
-            parts.HazePart(
-                self.name, max(MIN_RADIUS, CAMERA_DISTANCE_FACTOR * camera_distance)
-            )
-        )
+        radius = max(MIN_RADIUS, CAMERA_DISTANCE_FACTOR * camera_distance)
+        return scene.with_part(parts.HazePart(self.name, radius))
 
     def scene_inputs(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]

@@ -269,12 +269,11 @@ def wood(grid: Grid) -> Float64Array:
     late_wood = _step(phase, edge=0.66, soft=0.6) * (
         1.0 - _step(phase, edge=0.96, soft=0.08)
     )
-    fibre = _noise((x + 0.6 * bend, y), cells=(120, 3), seed=13) + 0.6 * _noise(
-        (x + 0.6 * bend, y), cells=(240, 5), seed=18
+    bent_grid = (x + 0.6 * bend, y)
+    fibre = _noise(bent_grid, cells=(120, 3), seed=13) + 0.6 * _noise(
+        bent_grid, cells=(240, 5), seed=18
     )
-    pores = _step(
-        _noise((x + 0.6 * bend, y), cells=(170, 12), seed=14), edge=0.5, soft=0.2
-    )
+    pores = _step(_noise(bent_grid, cells=(170, 12), seed=14), edge=0.5, soft=0.2)
     tone = (
         0.30
         + 0.42 * late_wood
@@ -468,9 +467,8 @@ def _draw_rosettes(
     ring = _step(radius, edge=0.031, soft=0.008) * (
         1.0 - _step(radius, edge=outer_edge, soft=0.008)
     )
-    return ring * _step(waves, edge=-0.75, soft=0.5), 1.0 - _step(
-        radius, edge=0.042, soft=0.02
-    )
+    core = 1.0 - _step(radius, edge=0.042, soft=0.02)
+    return ring * _step(waves, edge=-0.75, soft=0.5), core
 
 
 @register_pattern(0.8, roughness=0.8, specular=0.2)

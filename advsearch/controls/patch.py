@@ -167,26 +167,10 @@ class PatchControl(PictureControl):
             InputError: they do not.
         """
         super().__init__(name, **settings)
-        pixels = self.specs.get("pixels")
-        picture = self.chosen["picture"]
-        if pixels is not None and picture is not None:
-            raise InputError(
-                f"{self.name}.pixels: expected none beside "
-                f"{self.name}.picture; leave one of them out"
-            )
-        # distributions are subclasses of Range
-        is_plain_range = type(pixels) is Range
-        is_valid = pixels is None or isinstance(pixels, Fixed) or is_plain_range
-        if not is_valid:
-            got = "a distribution"
-            if isinstance(pixels, OneOf):
-                got = f"a list of {len(pixels.values)}"
-            raise InputError(
-                f"{self.name}.pixels: expected [low, high] or one number, got {got}"
-            )
+        self._check_pixels()
         if self.is_searched_image:
             return
-        fixing_setting = "pixels" if picture is None else "picture"
+        fixing_setting = "pixels" if self.chosen["picture"] is None else "picture"
         for ball_setting in ("epsilon", "norm"):
             # "box" is the norm of no ball
             if self.chosen[ball_setting] not in (None, "box"):
@@ -195,6 +179,29 @@ class PatchControl(PictureControl):
                     "stay in, and these are fixed; leave it out, "
                     f"or leave out {self.name}.{fixing_setting}"
                 )
+
+    def _check_pixels(self) -> None:
+        """Check that the pixels are a range or one number, and not beside a picture.
+
+        Raises InputError: they are not.
+        """
+        pixels = self.specs.get("pixels")
+        if pixels is None:
+            return
+        if self.chosen["picture"] is not None:
+            raise InputError(
+                f"{self.name}.pixels: expected none beside "
+                f"{self.name}.picture; leave one of them out"
+            )
+        # distributions are subclasses of Range
+        is_plain_range = type(pixels) is Range
+        if not isinstance(pixels, Fixed) and not is_plain_range:
+            got = "a distribution"
+            if isinstance(pixels, OneOf):
+                got = f"a list of {len(pixels.values)}"
+            raise InputError(
+                f"{self.name}.pixels: expected [low, high] or one number, got {got}"
+            )
 
     def check_choices(self) -> None:
         """Let an epsilon without a norm mean the norm linf, and reject one with box."""

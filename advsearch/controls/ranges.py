@@ -590,20 +590,31 @@ def parse_distribution(
         # whether the distribution ends below and above
         has_end = np.isfinite(frozen.ppf(np.array([0.0, 1.0])))
     if outside > MAX_OUTSIDE_PROBABILITY:
-        raise InputError(
-            f"{label}: {100.0 * outside:.3g} % of {text} lies outside of "
-            f"{parameter.low:g} to {parameter.high:g} "
-            f"({parameter.unit}), and at most {100.0 * MAX_OUTSIDE_PROBABILITY:g} % is "
-            "cut off; "
-            "choose a narrower one, or cut it "
-            "yourself (truncnorm)"
-        )
+        raise _make_outside_error(label, parameter, text, outside)
     # an infinite tail is cut off
     lower_probability = max(lower_probability, 0.0 if has_end[0] else TAIL_PROBABILITY)
     upper_probability = min(
         upper_probability, 1.0 if has_end[1] else 1.0 - TAIL_PROBABILITY
     )
     return _make_range(label, frozen.ppf, lower_probability, upper_probability, text)
+
+
+def _make_outside_error(
+    label: str, parameter: Parameter, text: str, outside: float
+) -> InputError:
+    """Return the error that a distribution reaches too far beyond a parameter's bounds.
+
+    `text` is the distribution as messages write it, and `outside` the probability of
+    values out of the bounds.
+    """
+    return InputError(
+        f"{label}: {100.0 * outside:.3g} % of {text} lies outside of "
+        f"{parameter.low:g} to {parameter.high:g} "
+        f"({parameter.unit}), and at most {100.0 * MAX_OUTSIDE_PROBABILITY:g} % is "
+        "cut off; "
+        "choose a narrower one, or cut it "
+        "yourself (truncnorm)"
+    )
 
 
 def _freeze_distribution(
@@ -675,7 +686,20 @@ def _read_python_quantiles(
     probabilities = np.linspace(
         lower_probability, upper_probability, N_CHECKED_QUANTILES
     )
-    values = quantiles(probabilities)
+    _check_quantiles(label, parameter, name, quantiles(probabilities))
+    return _make_range(
+        label, quantiles, float(probabilities[0]), float(probabilities[-1]), name
+    )
+
+
+def _check_quantiles(
+    label: str, parameter: Parameter, name: str, values: NDArray[np.float64]
+) -> None:
+    """Check the values (n,) of an inverse CDF at ascending probabilities.
+
+    Raises InputError: they leave the parameter's bounds, or fall. `name` is that of the
+    function.
+    """
     is_inside = (values >= parameter.low) & (values <= parameter.high)
     if not is_inside.all():
         raise InputError(
@@ -691,9 +715,6 @@ def _read_python_quantiles(
             f"{values[index]:g} and then "
             f"{values[index + 1]:g} of {name}"
         )
-    return _make_range(
-        label, quantiles, float(probabilities[0]), float(probabilities[-1]), name
-    )
 
 
 def _make_range(

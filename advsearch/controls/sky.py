@@ -342,11 +342,9 @@ class SkyControl(Control):
         """
         super().fit()
         start = self.values(self.start)
-        # the sun's azimuth does not matter
-        arguments = torch.tensor(0.0), start["elevation"], start["turbidity"]
-        self._metered = make_sky(self.scene.ground_color, torch.device("cpu"))(
-            *arguments
-        )[1]
+        sky = make_sky(self.scene.ground_color, torch.device("cpu"))
+        azimuth = torch.tensor(0.0)  # it does not matter
+        _, self._metered = sky(azimuth, start["elevation"], start["turbidity"])
 
     def scene_inputs(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]

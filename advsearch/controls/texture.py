@@ -185,7 +185,7 @@ class TextureControl(Control):
 
     def get_mesh(self, scene: SceneDescription) -> MeshPart:
         """Return the mesh that it paints, which a material of the object may name."""
-        if self._named_material(scene):
+        if self._find_named_materials(scene):
             return scene.meshes[OBJECT]
         try:
             return super().get_mesh(scene)
@@ -198,7 +198,7 @@ class TextureControl(Control):
             known = [*scene.meshes, *materials]
             raise UnknownNameError(kind, self.mesh, known, hint) from None
 
-    def _named_material(self, scene: SceneDescription) -> list[str]:
+    def _find_named_materials(self, scene: SceneDescription) -> list[str]:
         """Return the materials of the object that the control's name means, as in
         `texture:paint`.
 
@@ -218,7 +218,7 @@ class TextureControl(Control):
 
     def list_materials(self, scene: SceneDescription) -> list[str] | None:
         """Return the materials that it paints in a scene; None for all of the mesh."""
-        return self._named_material(scene) or self.chosen["materials"]
+        return self._find_named_materials(scene) or self.chosen["materials"]
 
     def fit(self) -> None:
         """Make the painter of the form, and the texels that it paints.

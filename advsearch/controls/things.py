@@ -140,14 +140,26 @@ class ThingsControl(Control):
                     f"`controls` {self.name}: thing beside the object", thing, things
                 )
         super().fit()
+        # The rest stay where they are, or another control moves them.
+        moved = self._find_moved_things()
+        self._moved_things = tuple(name for name in things if name in moved)
+        self._check_things_stand_free()
+
+    def _find_moved_things(self) -> set[str]:
+        """Return the things with a searched parameter, or one that the user set."""
         moved = set()
         for slot in self.slots:
             thing, _, short_name = slot.parameter.name.rpartition(".")
             is_set = slot.parameter.name in self.specs or short_name in self.specs
             if slot.n_coordinates or is_set:
                 moved.add(thing)
-        # The rest stay where they are, or another control moves them.
-        self._moved_things = tuple(name for name in things if name in moved)
+        return moved
+
+    def _check_things_stand_free(self) -> None:
+        """Check the things that this control moves where the scene has them.
+
+        Raises InputError: one stands in something else.
+        """
         # with all parameters 0, things stand where the scene has them
         unmoved = {slot.parameter.name: torch.zeros(()) for slot in self.slots}
         for name, stand in self._compute_stands(unmoved, {}).items():

@@ -417,7 +417,7 @@ class PathControl(Control):
         """
         # choices that were left out by name, with the defaults taken for them
         assumed = dict[str, str]()
-        times = self._times_of(trajectory, assumed)
+        times = self._find_times(trajectory, assumed)
         check_times(path, times)
         positions, rotations = self._orient(path, trajectory, assumed)
         notes = list(trajectory.notes)
@@ -446,7 +446,7 @@ class PathControl(Control):
             notes=tuple(notes),
         )
 
-    def _times_of(
+    def _find_times(
         self, trajectory: Trajectory, assumed: dict[str, str]
     ) -> assets.Float64Array:
         """Return the times (n,) of a trajectory, in seconds.
@@ -947,12 +947,12 @@ def make_object_pose(start: Start, shift: Tensor, heading: Tensor) -> Tensor:
         shift: (3,) object sizes.
         heading: () degrees about the vertical through its middle.
     """
-    about = geometry.make_euler_rotation(heading, *heading.new_zeros(2))
+    turn = geometry.make_euler_rotation(heading, *heading.new_zeros(2))
     center = start.middle
-    posed: Tensor = (
-        geometry.make_affine(about, center - about @ center + shift) @ start.object
-    )
-    return posed
+    # it turns about the center, and not about the origin
+    movement = geometry.make_affine(turn, center - turn @ center + shift)
+    pose: Tensor = movement @ start.object
+    return pose
 
 
 def unwrap_headings(
@@ -1083,20 +1083,30 @@ def read_waypoints(
             notes=notes.get(HEADING_COLUMN, ()),
         )
     }
-    # what the object does in a file about the camera
+    object_notes = notes.get(OBJECT_HEADING_COLUMN, ())
+    object_waypoints = _make_object_waypoints(column, seconds, object_notes)
+    if object_waypoints is not None:
+        waypoints[OBJECT] = object_waypoints
+    return waypoints
+
+
+def _make_object_waypoints(
+    column: Mapping[str, assets.Float64Array], seconds: Tensor, notes: tuple[str, ...]
+) -> Waypoints | None:
+    """Return what the object does in a file about the camera; None for nothing.
+
+    Args:
+        column: the columns (n,) of the file by name.
+        seconds: (n,) times of the waypoints.
+        notes: the notes on the object's headings.
+    """
     shift = _stack_columns(column, OBJECT_SHIFT_COLUMNS)
     turn = _stack_columns(column, (OBJECT_HEADING_COLUMN,))
-    if shift is None and turn is not None:
-        shift = torch.zeros_like(positions)  # it only turns
-    if shift is not None:
-        waypoints[OBJECT] = Waypoints(
-            seconds,
-            shift,
-            targets=None,
-            headings=turn,
-            notes=notes.get(OBJECT_HEADING_COLUMN, ()),
-        )
-    return waypoints
+    if shift is None and turn is None:
+        return None
+    if shift is None:
+        shift = torch.zeros(len(seconds), 3)  # it only turns
+    return Waypoints(seconds, shift, targets=None, headings=turn, notes=notes)
 
 
 def _read_csv(path: Path, text: str) -> tuple[list[str], list[list[str]]]:

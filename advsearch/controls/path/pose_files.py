@@ -199,6 +199,20 @@ def _is_row(line: str) -> bool:
     return not line.startswith("#") and all(map(reading.is_number, _split(line)))
 
 
+def _find_column(name: str) -> str | None:
+    """Return our name for a column of a trajectory, such as qx; None if it is none."""
+    plain = UNIT.sub("", name).strip().lower()
+    if TIME_NAME.fullmatch(plain):
+        return "time"
+    position = POSITION_NAME.fullmatch(plain)
+    if position:
+        return position[1]
+    quaternion = QUATERNION_NAME.fullmatch(plain)
+    if quaternion:
+        return f"q{quaternion[1] or quaternion[2]}"
+    return None
+
+
 def _find_columns(names: Sequence[str]) -> dict[str, int]:
     """Return the index of each column of a trajectory by our names for them.
 
@@ -211,14 +225,8 @@ def _find_columns(names: Sequence[str]) -> dict[str, int]:
         return {}
     columns = dict[str, int]()
     for index, name in enumerate(names):
-        plain = UNIT.sub("", name).strip().lower()
-        if TIME_NAME.fullmatch(plain):
-            column = "time"
-        elif match := POSITION_NAME.fullmatch(plain):
-            column = match[1]
-        elif match := QUATERNION_NAME.fullmatch(plain):
-            column = f"q{match[1] or match[2]}"
-        else:
+        column = _find_column(name)
+        if column is None:
             continue
         if column in columns:
             return {}
