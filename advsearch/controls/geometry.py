@@ -55,6 +55,7 @@ N_SURFACE_SAMPLES = 20000
 as what they cover.
 """
 BANDWIDTH = 1.8  # standard deviation of the kernel, in cells
+MIN_EIGENVALUE = 0.05  # smallest one that a function is divided by; the largest is 1
 # largest displacement gradient along a face; below 1 no face can turn over
 MAX_FACE_STRAIN = 0.7
 # largest change of the distance between the two sides of a wall, as a fraction of it
@@ -177,7 +178,7 @@ def compute_shape_modes(mesh: Mesh, count: int) -> Float64Array:
     # Nystrom extension from the landmarks to all positions; small eigenvalues are
     # limited, since a division by them amplifies noise
     weights = _compute_landmark_weights(welded_mesh.positions, points, width, density)
-    extended = weights @ (functions / np.maximum(values, 0.05))
+    extended = weights @ (functions / np.maximum(values, MIN_EIGENVALUE))
     # p positions, s scalar functions, c axes, k fields
     fields = np.einsum("ps,sck->pck", extended, combination)
     return np.asarray(fields / np.linalg.norm(fields, axis=1).max(axis=0))

@@ -424,9 +424,9 @@ class ProjectorControl(PictureControl):
         """
         pose = make_projector_pose(
             self.scene,
-            azimuth=float(values["azimuth"].detach()),
-            elevation=float(values["elevation"].detach()),
-            distance=float(values["distance"].detach()),
+            float(values["azimuth"].detach()),
+            float(values["elevation"].detach()),
+            float(values["distance"].detach()),
         )
         pose = pose.to(values["distance"], copy=True)
         light = self.project_light(values)

@@ -386,10 +386,7 @@ class GltfSurfaces:
             "is used instead",
         )
         if texture is not None and (color_factor != 1.0).any():
-            linear = srgb_to_linear(texture[:, :, :3]) * color_factor
-            texture = np.concatenate(
-                [linear_to_srgb(linear), texture[:, :, 3:]], axis=2
-            )
+            texture = _multiply_colors(texture, color_factor)
         base_color: Float32Array | None = color
         if entry.baseColorTexture is not None and (color > 0.999).all():
             base_color = None  # plain white does not change a texture
@@ -654,15 +651,13 @@ class GltfSurfaces:
             The images; and the scale and shift by which a coordinate of an old image
             becomes that of the padded one, t -> scale t + shift.
         """
-        min_uv, max_uv = bounds
         sizes = [image.shape[axis] for image in images]
         # All images need pads of the same width in texture coordinates, and whole
         # texels. So each is divided into as many units as the greatest common divisor
         # of the sizes: a unit is a whole number of texels in each, and pads are whole
-        # units. One more on each side keeps filtering from reaching beyond them.
+        # units.
         n_units = int(np.gcd.reduce(sizes))
-        units_before = max(0, int(np.ceil(-min_uv * n_units))) + 1
-        units_after = max(0, int(np.ceil((max_uv - 1.0) * n_units))) + 1
+        units_before, units_after = _count_pad_units(n_units, bounds)
         padded_units = n_units + units_before + units_after
         if padded_units * (max(sizes) // n_units) > 2 * self._images.max_side:
             self.notes.warn(EDGES_NOTE)
@@ -684,6 +679,28 @@ class GltfSurfaces:
                 )
             )
         return padded, n_units / padded_units, units_before / padded_units
+
+
+def _multiply_colors(texture: Float32Array, factor: Float32Array) -> Float32Array:
+    """Multiply the colors of a texture (H, W, 3 or 4), sRGB, by a linear factor (3,)."""
+    linear = srgb_to_linear(texture[:, :, :3]) * factor
+    return np.concatenate([linear_to_srgb(linear), texture[:, :, 3:]], axis=2)
+
+
+def _count_pad_units(n_units: int, bounds: tuple[float, float]) -> tuple[int, int]:
+    """Return how many units the pads before and behind an image need.
+
+    They reach as far as texture coordinates, and one unit farther, so that filtering
+    does not reach beyond them.
+
+    Args:
+        n_units: number of units of the image itself, which is from 0 to 1.
+        bounds: smallest and largest texture coordinate.
+    """
+    min_uv, max_uv = bounds
+    units_before = max(0, int(np.ceil(-min_uv * n_units))) + 1
+    units_after = max(0, int(np.ceil((max_uv - 1.0) * n_units))) + 1
+    return units_before, units_after
 
 
 def _average_where_visible(
@@ -1089,6 +1106,22 @@ def _read_vertex_colors(
     return rgba[:, :3][faces], has_alpha
 
 
+def _read_packed_coordinates(
+    file: GltfFile,
+    attributes: Mapping[str, int],
+    material: MaterialEntry,
+    used: IntArray,
+) -> Float64Array | None:
+    """Return the UVs (V, 2) of the texture of roughness and metallic, if there is one.
+
+    None also if the primitive lacks them. `used` are the vertices that faces use.
+    """
+    texture = material.surface.metallicRoughnessTexture
+    if texture is None:
+        return None
+    return _read_texture_coordinates(file, attributes, texture, used)
+
+
 def read_primitive(
     file: GltfFile, primitive: Primitive, extras: object, is_skinned: bool
 ) -> PrimitiveData | None:
@@ -1112,12 +1145,7 @@ def read_primitive(
     if primitive.material is not None:
         material = file.header.materials[primitive.material]
     uvs = _read_texture_coordinates(file, attributes, material.layout_texture, used)
-    packed_uvs = None
-    roughness_texture = material.surface.metallicRoughnessTexture
-    if roughness_texture is not None:
-        packed_uvs = _read_texture_coordinates(
-            file, attributes, roughness_texture, used
-        )
+    packed_uvs = _read_packed_coordinates(file, attributes, material, used)
     colors, has_alpha = _read_vertex_colors(file, attributes, used, faces)
     normals = None
     if "NORMAL" in attributes:

@@ -15,6 +15,7 @@ from advsearch.scene.assets import Float64Array, IntArray
 from advsearch.scene.importing.files import UniqueNames, damaged, sanitize_name
 from advsearch.scene.importing.gltf import GltfFile
 from advsearch.scene.importing.gltf_entries import (
+    FLOAT32,
     Accessor,
     Animation,
     Channel,
@@ -78,9 +79,8 @@ def compute_matrix(node: Node) -> Float64Array:
     if node.matrix is not None:
         return np.asarray(np.array(node.matrix, dtype=np.float64).reshape(4, 4).T)
     matrix = np.eye(4)
-    # the norm of 1.0 is 1: that of the identity, which no rotation means
-    length = max(float(np.linalg.norm(node.rotation or 1.0)), 1e-12)
-    quaternion = np.array(node.rotation or [0.0, 0.0, 0.0, 1.0]) / length
+    quaternion = np.array(node.rotation or [0.0, 0.0, 0.0, 1.0])
+    quaternion = quaternion / max(float(np.linalg.norm(quaternion)), 1e-12)
     rotation = np.reshape(compute_rotation_entries(*quaternion), (3, 3))
     matrix[:3, :3] = rotation * np.array(node.scale or [1.0, 1.0, 1.0])
     matrix[:3, 3] = node.translation or [0.0, 0.0, 0.0]
@@ -334,6 +334,15 @@ def read_rest_weights(file: GltfFile, node: int, count: int) -> Float64Array:
     return np.array(weights, np.float64)
 
 
+def _count_vertices(header: Header, primitives: Sequence[Primitive]) -> int:
+    """Return the number of vertices of primitives; those without positions have none."""
+    return sum(
+        header.accessors[primitive.attributes["POSITION"]].count
+        for primitive in primitives
+        if "POSITION" in primitive.attributes
+    )
+
+
 def count_targets(file: GltfFile, mesh_nodes: Sequence[int]) -> dict[int, int]:
     """Return the number of morph targets of each node with a mesh.
 
@@ -359,12 +368,7 @@ def count_targets(file: GltfFile, mesh_nodes: Sequence[int]) -> dict[int, int]:
         n_targets[node] = max(counts, default=0)
         if entry.skin is not None:
             n_moves += len(primitives) * len(header.skins[entry.skin].joints)
-        n_vertices = sum(
-            header.accessors[primitive.attributes["POSITION"]].count
-            for primitive in primitives
-            if "POSITION" in primitive.attributes
-        )
-        n_moves += n_targets[node] * n_vertices
+        n_moves += n_targets[node] * _count_vertices(header, primitives)
     check_most(
         file.path,
         n_moves,
@@ -587,7 +591,7 @@ def _read_times(file: GltfFile, index: int) -> Float64Array:
     """
     path = file.path
     accessor = file.header.accessors[index]
-    is_float32 = accessor.componentType == 5126
+    is_float32 = accessor.componentType == FLOAT32
     if accessor.type != "SCALAR" or not is_float32 or not accessor.count:
         raise damaged(
             path,

@@ -341,10 +341,10 @@ def _convert_luminance(
     if "RY" not in planes:
         return dict.fromkeys("RGB", planes["Y"])
     luminance = planes["Y"].astype(np.float32)
-    red, blue = (
-        (_resample(planes[name].astype(np.float32), size) + 1.0) * luminance
-        for name in ("RY", "BY")
-    )
+    red_ratio = _resample(planes["RY"].astype(np.float32), size)
+    blue_ratio = _resample(planes["BY"].astype(np.float32), size)
+    red = (red_ratio + 1.0) * luminance
+    blue = (blue_ratio + 1.0) * luminance
     green = (luminance - LUMINANCE[0] * red - LUMINANCE[2] * blue) / LUMINANCE[1]
     colors = {"R": red, "G": green, "B": blue}
     return {
@@ -374,16 +374,17 @@ def _resample(plane: Plane, size: tuple[int, ...]) -> Plane:
     return plane
 
 
+def _shift_range(pixels: range, origin: int) -> slice:
+    """Return pixels of a grid as those of an array whose first one is `origin`."""
+    return slice(pixels.start - origin, pixels.stop - origin)
+
+
 def _intersect_ranges(
     data_start: int, data_length: int, start: int, length: int
-) -> slice:
-    """Return what two ranges of integers have in common.
-
-    Each is a start and a length. The slice stops before its start if they have nothing
-    in common.
-    """
+) -> range:
+    """Return what two ranges of integers, each a start and a length, have in common."""
     stop = min(data_start + data_length, start + length)
-    return slice(max(data_start, start), stop)
+    return range(max(data_start, start), stop)
 
 
 def _crop_to_display_window(
@@ -395,33 +396,25 @@ def _crop_to_display_window(
     file's data need not be all of its image. Pads are black; data that is cropped away
     is noted in `notes`. Planes have the size of the data window.
     """
-    (data_top, data_left), data_size = _read_window(header, "dataWindow")
-    (top, left), (height, width) = _read_window(header, "displayWindow")
-    if (data_top, data_left) == (top, left) and data_size == (height, width):
+    data_corner, data_size = _read_window(header, "dataWindow")
+    corner, size = _read_window(header, "displayWindow")
+    if data_corner == corner and data_size == size:
         return planes
-    rows = _intersect_ranges(data_top, data_size[0], top, height)
-    columns = _intersect_ranges(data_left, data_size[1], left, width)
-    is_cropped = (
-        rows.start > data_top
-        or columns.start > data_left
-        or rows.stop < data_top + data_size[0]
-        or columns.stop < data_left + data_size[1]
-    )
+    rows = _intersect_ranges(data_corner[0], data_size[0], corner[0], size[0])
+    columns = _intersect_ranges(data_corner[1], data_size[1], corner[1], size[1])
+    is_cropped = (len(rows), len(columns)) != data_size
     if is_cropped:
         notes.append("its data beyond the display window is left out")
 
+    # the pixels that both windows have, counted from the corner of either one
+    source = (_shift_range(rows, data_corner[0]), _shift_range(columns, data_corner[1]))
+    target = (_shift_range(rows, corner[0]), _shift_range(columns, corner[1]))
+
     def crop(plane: Plane) -> Plane:
         """Copy what both windows have into a black plane of the display window."""
-        result = np.zeros((height, width), plane.dtype)
-        if rows.stop > rows.start and columns.stop > columns.start:
-            # the same pixels, counted from the corner of either window
-            result[
-                rows.start - top : rows.stop - top,
-                columns.start - left : columns.stop - left,
-            ] = plane[
-                rows.start - data_top : rows.stop - data_top,
-                columns.start - data_left : columns.stop - data_left,
-            ]
+        result = np.zeros(size, plane.dtype)
+        if rows and columns:
+            result[target] = plane[source]
         return result
 
     red, green, blue = planes

@@ -297,18 +297,7 @@ class MtlReader:
         A texture is not multiplied by Kd, which is an exporter's default more often
         than a tint.
         """
-        argument = material.read_argument("kd")
-        color = None
-        values = parse_numbers(argument)
-        if values is not None and len(values) in (1, 3, 4):  # of four, three count
-            rgb = np.clip(np.broadcast_to(values[:3], (3,)), 0.0, 1.0)
-            color = rgb.astype(np.float32)
-        elif "kd" in material.statements:
-            statement = (
-                f"the Kd {format_name(argument)} of the material "
-                f"{format_name(material.name)}"
-            )
-            self.notes.warn(f"{statement} is no colour; neutral grey is used instead")
+        color = self._read_color(material)
         substitute = f"{describe_substitute(color)} is used instead"
         note_template = (
             f"{material.file} names the texture {{name}}, which {{why}}; {substitute}"
@@ -324,6 +313,24 @@ class MtlReader:
         if use is not None and color is not None and (color > 0.999).all():
             color = None  # plain white does not change a texture
         return color, texture
+
+    def _read_color(self, material: MtlMaterial) -> Float32Array | None:
+        """Return the color (3,) of ``Kd``; None, and a note, if it is no color.
+
+        Of four numbers, three count.
+        """
+        argument = material.read_argument("kd")
+        values = parse_numbers(argument)
+        if values is not None and len(values) in (1, 3, 4):
+            rgb = np.clip(np.broadcast_to(values[:3], (3,)), 0.0, 1.0)
+            return np.asarray(rgb, np.float32)
+        if "kd" in material.statements:
+            statement = (
+                f"the Kd {format_name(argument)} of the material "
+                f"{format_name(material.name)}"
+            )
+            self.notes.warn(f"{statement} is no colour; neutral grey is used instead")
+        return None
 
     def _note_unread(self, material: MtlMaterial) -> None:
         """Note the statements that are not read, unless they change nothing.

@@ -143,8 +143,8 @@ def _parse_header(
         match line.split():
             case ["format", kind, *_] if kind in _FORMATS:
                 byte_order = _FORMATS[kind]
-            case ["comment" | "obj_info", *_]:
-                comments.append(line.strip().partition(line.split()[0])[2].strip())
+            case ["comment" | "obj_info" as keyword, *_]:
+                comments.append(line.strip().removeprefix(keyword).strip())
             case ["element", name, count] if (
                 # no more digits than 64 bits have
                 count.isdecimal() and len(count) < 20 and name not in elements
@@ -709,18 +709,13 @@ class _Properties:
         texture = np.full(len(counts), -1)
         if not names:
             return texture
-        element = None
-        for candidate in ("face", "vertex"):
-            scalars = self._get_scalars(candidate)
-            if self._find_group(candidate, scalars, [("texnumber",)]):
-                element = candidate
-                break
+        element = self._find_element_with_texture_number()
         if element is None:
             if len(names) > 1:
-                used_texture = (
-                    f"of its {len(names)} textures only {format_name(names[0])} is used"
+                self.notes.warn(
+                    f"of its {len(names)} textures only {format_name(names[0])} is "
+                    "used, as its faces have no texnumber"
                 )
-                self.notes.warn(f"{used_texture}, as its faces have no texnumber")
             return np.zeros(len(counts), np.int64)
         numbers = _to_integers(self.elements[element].scalars["texnumber"])
         if element == "face":
@@ -729,13 +724,22 @@ class _Properties:
             # The first corner of an empty polygon at the end would be out of range.
             first_corner = np.cumsum(counts) - counts
             texture = numbers[corners[np.minimum(first_corner, len(corners) - 1)]]
-        n_wrong = int(((texture < -1) | (texture >= len(names))).sum())
+        is_wrong = (texture < -1) | (texture >= len(names))
+        n_wrong = int(is_wrong.sum())
         if n_wrong:
             self.notes.warn(
                 f"{n_wrong:,} faces have a texnumber of a texture that it "
                 "does not name; they have none"
             )
-        return np.where((texture >= 0) & (texture < len(names)), texture, -1)
+        return np.where(is_wrong, -1, texture)
+
+    def _find_element_with_texture_number(self) -> str | None:
+        """Return which element has a `texnumber`: faces, else vertices, or none."""
+        for element in ("face", "vertex"):
+            scalars = self._get_scalars(element)
+            if self._find_group(element, scalars, [("texnumber",)]):
+                return element
+        return None
 
     def make_surfaces(
         self, names: Sequence[str], *, has_no_colors: bool

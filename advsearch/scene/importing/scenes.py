@@ -572,21 +572,34 @@ def _make_camera(
     aspect_ratio = camera.perspective.aspectRatio
     half_tangent = math.tan(camera.perspective.yfov / 2.0)
     fov = math.degrees(2.0 * math.atan(half_tangent * max(aspect_ratio or 1.0, 1.0)))
-    is_mirrored = np.linalg.det(axes) < 0.0
+    problem = _find_camera_problem(matrix, fov)
+    if problem:
+        raise InputError(f"{path}: expected the camera {name} {problem}, or remove it")
+    return PosedCamera(matrix, fov, upright=aspect_ratio is None)
+
+
+def _find_camera_problem(matrix: Float64Array, fov: float) -> str | None:
+    """Return why a camera cannot be imported, as the end of a message, or None.
+
+    Args:
+        matrix: (4, 4) its pose, with unit vectors as axes.
+        fov: its field of view in degrees.
+    """
+    axes = matrix[:3, :3]
     if not (np.abs(matrix[:3, 3]) <= MAX_DISTANCE).all():  # NaN is not
-        problem = f"within {MAX_DISTANCE:g} object sizes, got more; correct its place"
-    elif not np.allclose(np.linalg.norm(axes, axis=0), 1.0):
-        problem = (
+        return f"within {MAX_DISTANCE:g} object sizes, got more; correct its place"
+    if not np.allclose(np.linalg.norm(axes, axis=0), 1.0):
+        return (
             "to look somewhere, got axes without length; correct the scale of its node"
         )
-    elif not np.allclose(axes.T @ axes, np.eye(3), atol=MAX_AXIS_COSINE) or is_mirrored:
+    is_mirrored = np.linalg.det(axes) < 0.0
+    is_rectangular = np.allclose(axes.T @ axes, np.eye(3), atol=MAX_AXIS_COSINE)
+    if is_mirrored or not is_rectangular:
         got = "mirrored" if is_mirrored else "sheared"
         advice = "apply the scale of the nodes above it (in Blender Ctrl A)"
-        problem = f"under nodes that turn, move and scale it, got {got} axes; {advice}"
-    elif not 0.0 < fov <= MAX_FOV:
-        problem = (
+        return f"under nodes that turn, move and scale it, got {got} axes; {advice}"
+    if not 0.0 < fov <= MAX_FOV:
+        return (
             f"with a field of view up to {MAX_FOV:g} degrees, got {fov:.4g}; correct it"
         )
-    else:
-        return PosedCamera(matrix, fov, upright=aspect_ratio is None)
-    raise InputError(f"{path}: expected the camera {name} {problem}, or remove it")
+    return None

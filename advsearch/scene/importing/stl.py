@@ -46,16 +46,9 @@ def read_stl(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
         (n_facets,) = struct.unpack_from("<I", data, _HEADER_SIZE)
     expected_size = _FACETS_START + _FACET_DTYPE.itemsize * n_facets
     corner_colors = None
-    surface = ImportedSurface()
     if len(data) == expected_size:
         notes.check_faces(n_facets)
-        facets = np.frombuffer(data, _FACET_DTYPE, offset=_FACETS_START)
-        points = facets["vertices"].astype(np.float64).reshape(-1, 3)
-        colors = _read_colors(data[:_HEADER_SIZE], facets["attribute"], notes)
-        if colors is not None:
-            corner_colors = np.repeat(colors[:, None], 3, axis=1)
-            # white, which the colors of facets multiply
-            surface = ImportedSurface(color=np.ones(3, np.float32))
+        points, corner_colors = _read_facets(data, notes)
     elif data.lstrip()[:5].lower() == b"solid" and b"\x00" not in data:
         points = _parse_text(data, notes)
     else:
@@ -70,12 +63,29 @@ def read_stl(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
         raise FileFormatError(
             f"{path}: expected a mesh with faces, got none; export triangles"
         )
+    surface = ImportedSurface()
+    if corner_colors is not None:
+        # white, which the colors of facets multiply
+        surface = ImportedSurface(color=np.ones(3, np.float32))
     faces = np.arange(len(points)).reshape(-1, 3)
     return [
         ImportedPart(
             vertices=points, faces=faces, colors=corner_colors, surface=surface
         )
     ]
+
+
+def _read_facets(data: bytes, notes: Notes) -> tuple[Float64Array, Float64Array | None]:
+    """Return the points (3 F, 3) and the linear colors (F, 3, 3) of a binary file.
+
+    They are those of the corners of its facets; colors are None if it has none.
+    """
+    facets = np.frombuffer(data, _FACET_DTYPE, offset=_FACETS_START)
+    points = facets["vertices"].astype(np.float64).reshape(-1, 3)
+    colors = _read_colors(data[:_HEADER_SIZE], facets["attribute"], notes)
+    if colors is None:
+        return points, None
+    return points, np.repeat(colors[:, None], 3, axis=1)
 
 
 def _read_magics_color(head: bytes, notes: Notes) -> Float32Array | None:

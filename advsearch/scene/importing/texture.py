@@ -114,19 +114,14 @@ def apply_textures(
     if is_uniform and has_uniform_factor:
         if not first_surface.images:
             return _texture_plain(soup, first_surface, material)
-        is_untinted = first_surface.texture is None or soup.colors.min() == 1.0
-        if is_untinted and np.isfinite(soup.uvs).all():
-            uvs, images = _crop_to_window(
-                _move_into_unit_square(soup),
-                pictures=first_surface.images,
-                colors=first_surface.texture,
-            )
-            if _is_usable(soup, uvs):
-                is_lit_twice = _is_lit_twice(uvs, first_surface, images)
-                if not is_lit_twice:
-                    return _texture_with_images(
-                        soup, uvs, first_surface.with_images(images)
-                    )
+        cropped = _crop_images(soup, first_surface)
+        if cropped is not None:
+            uvs, images = cropped
+            is_lit_twice = _is_lit_twice(uvs, first_surface, images)
+            if not is_lit_twice:
+                return _texture_with_images(
+                    soup, uvs, first_surface.with_images(images)
+                )
     unwrapped_soup = unwrap(soup, material)
     maps = bake(unwrapped_soup.uvs, soup, surfaces)
     reason = SHARED_LIGHT_REASON
@@ -349,6 +344,23 @@ def _move_into_unit_square(soup: TriangleSoup) -> Float64Array:
     return uvs
 
 
+def _crop_images(
+    soup: TriangleSoup, surface: ImportedSurface
+) -> tuple[Float64Array, Sequence[Float32Array]] | None:
+    """Return the file's UVs (F, 3, 2) moved into [0, 1], and the images for them.
+
+    None if these cannot be used: colors change the texture, faces lack UVs, or the UVs
+    are unusable. `surface` is that of all faces, and has images.
+    """
+    is_untinted = surface.texture is None or soup.colors.min() == 1.0
+    if not is_untinted or not np.isfinite(soup.uvs).all():
+        return None
+    uvs, images = _crop_to_window(
+        _move_into_unit_square(soup), pictures=surface.images, colors=surface.texture
+    )
+    return (uvs, images) if _is_usable(soup, uvs) else None
+
+
 def _crop_to_window(
     uvs: Float64Array, pictures: Sequence[Float32Array], colors: Float32Array | None
 ) -> tuple[Float64Array, Sequence[Float32Array]]:
@@ -447,23 +459,45 @@ def bake(
         part_texels = texels.select(index)
         file_uvs = part_texels.interpolate(soup.uvs)
         color = _sample_base_color(surface, file_uvs, soup, surfaces)
-        y = part_texels.row
-        x = part_texels.column
-        maps.color[y, x, : color.shape[1]] = _tint(color, factor[index])
-        has_uvs = bool(np.isfinite(file_uvs).all())
-        if has_uvs and maps.normals is not None and surface.normal_map is not None:
-            maps.normals[y, x] = convert_normals(
-                sample_texture(surface.normal_map, file_uvs),
-                soup,
-                uvs,
-                part_texels.face,
-                part_texels.weights,
-            )
-        if has_uvs and maps.emission is not None and surface.emission is not None:
-            maps.emission[y, x] = sample_texture(surface.emission, file_uvs)
+        tinted_color = _tint(color, factor[index])
+        maps.color[part_texels.row, part_texels.column, : color.shape[1]] = tinted_color
+        if np.isfinite(file_uvs).all():
+            _bake_bumps_and_emission(maps, surface, part_texels, file_uvs, soup, uvs)
     is_inside = np.zeros((size, size), np.bool_)
     is_inside[texels.row, texels.column] = True
     return _fill_gaps(maps, is_inside)
+
+
+def _bake_bumps_and_emission(
+    maps: SurfaceMaps,
+    surface: ImportedSurface,
+    texels: _Texels,
+    file_uvs: Float64Array,
+    soup: TriangleSoup,
+    uvs: Float64Array,
+) -> None:
+    """Fill in the normals and the emission of a part, as far as it has some.
+
+    Args:
+        maps: the maps of the object.
+        surface: the surface of the part.
+        texels: the texels that the part covers.
+        file_uvs: (T, 2) UVs of the file at these texels.
+        soup: the object.
+        uvs: (F, 3, 2) new UVs of its faces.
+    """
+    y = texels.row
+    x = texels.column
+    if maps.normals is not None and surface.normal_map is not None:
+        maps.normals[y, x] = convert_normals(
+            sample_texture(surface.normal_map, file_uvs),
+            soup,
+            uvs,
+            texels.face,
+            texels.weights,
+        )
+    if maps.emission is not None and surface.emission is not None:
+        maps.emission[y, x] = sample_texture(surface.emission, file_uvs)
 
 
 class _Texels(NamedTuple):
@@ -630,11 +664,12 @@ def _compute_sample_weights(steps: int) -> Float64Array:
     # grid points at which a small triangle of either kind begins within the large one
     is_up = i + j < steps
     is_down = i + j < steps - 1
-    # of the second and the third corner: steps along the two sides, as fractions
-    weight_b, weight_c = (
-        np.concatenate([index[is_up] + 1.0 / 3.0, index[is_down] + 2.0 / 3.0]) / steps
-        for index in (i, j)
-    )
+    # steps from the first corner to each center along the two sides
+    center_i = np.concatenate([i[is_up] + 1.0 / 3.0, i[is_down] + 2.0 / 3.0])
+    center_j = np.concatenate([j[is_up] + 1.0 / 3.0, j[is_down] + 2.0 / 3.0])
+    # as fractions of a side they are the weights of the second and the third corner
+    weight_b = center_i / steps
+    weight_c = center_j / steps
     return np.stack([1.0 - weight_b - weight_c, weight_b, weight_c], axis=1)
 
 
@@ -794,9 +829,10 @@ def _compute_tangents(
     used_faces, used_index = np.unique(face, return_inverse=True)
     a, b, c = (soup.points[soup.faces[used_faces, k]] for k in range(3))
     uvs = soup.uvs[used_faces]
+    v = uvs[:, :, 1]
     # v of the second and third corner, from the first one
-    (_, v1) = (uvs[:, 1] - uvs[:, 0]).T
-    (_, v2) = (uvs[:, 2] - uvs[:, 0]).T
+    v1 = v[:, 1] - v[:, 0]
+    v2 = v[:, 2] - v[:, 0]
     handedness = np.sign(compute_doubled_areas(uvs))[:, None]
     # d position / d u is (b - a) v2 - (c - a) v1 over the UVs' doubled area, of which
     # only the sign matters here

@@ -170,9 +170,8 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     tables = {kind: lines.read_table(kind) for kind in TABLES}
     if not len(tables["v"]):
         raise notes.damaged(EXPECTED, data)
-    corners, corner_counts, face_rows = lines.read_faces(
-        {kind: len(table) for kind, table in tables.items()}
-    )
+    faces = lines.read_faces({kind: len(table) for kind, table in tables.items()})
+    _, corner_counts, _ = faces
     if (corner_counts < 3).all():
         raise FileFormatError(
             f"{path}: expected a mesh with faces, got points or "
@@ -187,6 +186,34 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
         lambda name, square: triangles.measure_mapped_faces(name, square),
     )
     _read_libraries(reader, statements.library_lines, notes)
+    triangles = _make_triangles(lines, tables, faces, statements, reader)
+    names_libraries = bool(statements.library_lines)
+    return [
+        _make_part(triangles, group, reader, names_libraries)
+        for group in group_faces(
+            triangles.material, triangles.has_uvs, triangles.is_flat, triangles.square
+        )
+    ]
+
+
+def _make_triangles(
+    lines: ObjLines,
+    tables: Mapping[str, Float64Array],
+    faces: tuple[IntArray, IntArray, IntArray],
+    statements: _Statements,
+    reader: MtlReader,
+) -> _Triangles:
+    """Return the triangles of a file's faces, with what the statements set.
+
+    Args:
+        lines: lines of the file.
+        tables: the rows of the file's points, UVs and normals.
+        faces: what `ObjLines.read_faces` returns.
+        statements: statements of the file.
+        reader: reader of the materials.
+    """
+    notes = lines.notes
+    corners, corner_counts, face_rows = faces
     position, uv, normal, polygon = _triangulate_faces(
         tables, corners, corner_counts, notes
     )
@@ -195,7 +222,7 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     notes.check_most(len(names), MAX_MATERIALS, "at most {} materials")
     is_flat = _find_flat_faces(statements.smoothing_changes, rows, normal, notes)
     vertex_colors = _read_colors(lines, tables["v"], notes)
-    triangles = _Triangles(
+    return _Triangles(
         position=position,
         uv=uv,
         normal=normal,
@@ -206,13 +233,6 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
         is_flat=is_flat,
         has_uvs=np.asarray((uv.rows >= 0).all(axis=1)),
     )
-    names_libraries = bool(statements.library_lines)
-    return [
-        _make_part(triangles, group, reader, names_libraries)
-        for group in group_faces(
-            triangles.material, triangles.has_uvs, triangles.is_flat, triangles.square
-        )
-    ]
 
 
 def _make_part(
@@ -641,13 +661,10 @@ class ObjLines:
                 corner_ends = np.cumsum(sizes)
                 corner = int(kind_indices.argmax())
                 face = np.searchsorted(corner_ends, corner, side="right")
-                got = (
-                    f"{counts[kind]}, and a face on line {rows[face] + 1} that refers "
-                    f"to number {largest}"
-                )
                 raise self.notes.damaged(
                     f"at least {largest} {kind!r} lines",
-                    f"{got} (is the file cut short?)",
+                    f"{counts[kind]}, and a face on line {rows[face] + 1} that refers "
+                    f"to number {largest} (is the file cut short?)",
                 )
         return corners - 1, sizes, rows  # the file counts from 1, and has 0 for none
 

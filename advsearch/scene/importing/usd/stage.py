@@ -170,19 +170,11 @@ class Conversion:
             self._note("is animated; what is there first is read")
         header = self.header
         header["nodes"].append(self._make_stage_node())
-        name_counts = Counter(prim.GetName() for prim in self._iterate_prims())
-        node_of_path: dict[Any, int] = {}
-        has_splats = False
-        for prim in self._iterate_prims():
-            if str(prim.GetTypeName()).startswith(PARTICLES_PREFIX):
-                has_splats = True
-            self._note_left_out(prim)
-            if prim.IsA(UsdGeom.Imageable) and not prim.IsA(UsdGeom.Subset):
-                is_unique = name_counts[prim.GetName()] == 1
-                self._add_node(prim, is_unique, node_of_path)
-        for node in header["nodes"]:
-            if not node["children"]:
-                del node["children"]
+        self._add_nodes()
+        has_splats = any(
+            str(prim.GetTypeName()).startswith(PARTICLES_PREFIX)
+            for prim in self._iterate_prims()
+        )
         header["scenes"] = [{"nodes": [0]}]
         header["scene"] = 0
         if has_splats and not header["meshes"]:
@@ -197,6 +189,19 @@ class Conversion:
         return self.buffer.to_bytes(
             {key: value for key, value in header.items() if value or key == "asset"}
         )
+
+    def _add_nodes(self) -> None:
+        """Add the prims below the stage's node, and note what is left out of them."""
+        name_counts = Counter(prim.GetName() for prim in self._iterate_prims())
+        node_of_path: dict[Any, int] = {}
+        for prim in self._iterate_prims():
+            self._note_left_out(prim)
+            if prim.IsA(UsdGeom.Imageable) and not prim.IsA(UsdGeom.Subset):
+                is_unique = name_counts[prim.GetName()] == 1
+                self._add_node(prim, is_unique, node_of_path)
+        for node in self.header["nodes"]:
+            if not node["children"]:
+                del node["children"]
 
     def _make_stage_node(self) -> dict[str, Any]:
         """Return the node that turns and scales the stage to glTF's axes and metres."""
@@ -362,10 +367,7 @@ class Conversion:
         kind = prim.GetTypeName()
         stops = _get_first(light, "Exposure")
         radiance = _get_first(light, "Intensity") * 2.0**stops
-        color = np.array(_get_first(light, "Color"), np.float64)
-        if _get_first(light, "EnableColorTemperature"):
-            temperature = _get_first(light, "ColorTemperature")
-            color *= np.array(UsdLux.BlackbodyTemperatureAsRgb(temperature))
+        color = _read_light_color(light)
         if kind == "DistantLight":
             entry: dict[str, Any] = {"type": "directional"}
             intensity = _compute_illuminance(prim, radiance)
@@ -380,9 +382,7 @@ class Conversion:
                 "`controls=light` light a scene"
             )
             return
-        has_valid_power = math.isfinite(intensity) and intensity >= 0.0
-        has_valid_color = np.isfinite(color).all() and (color >= 0.0).all()
-        if not has_valid_power or not has_valid_color:
+        if not _is_valid_power(np.array([*color, intensity])):
             raise errors.FileFormatError(
                 f"{self.source}: expected the light {node['name']} to have a power of "
                 "at least 0"
@@ -736,9 +736,6 @@ class Conversion:
     def _pose_at_rest(self, prim: Any, points: Array) -> tuple[Array | None, Array]:
         """Pose the points of a mesh by its skeleton at rest.
 
-        A joint moves points by the inverse of its bind transform, then its rest
-        transform. USD's matrices are for rows, so that the first one is on the left.
-
         Returns:
             The matrix (4, 4) of the skeleton, for rows, and the points (P, 3) in it;
             (None, points) if the mesh has no skeleton, or one that cannot be posed.
@@ -750,26 +747,54 @@ class Conversion:
         skeleton_query = self._skins.GetSkelQuery(skeleton) if skeleton else None
         if not skeleton_query:
             return None, points
-        rest_transforms = skeleton_query.ComputeJointSkelTransforms(
-            FIRST_TIME, atRest=True
-        )
-        bind_transforms = skeleton_query.GetJointWorldBindTransforms()
-        if not rest_transforms or len(rest_transforms) != len(bind_transforms):
+        transforms = _compute_joint_transforms(skinning, skeleton_query)
+        if transforms is None:
             return None, points
-        transforms = [
-            bind.GetInverse() * joint
-            for bind, joint in zip(bind_transforms, rest_transforms, strict=True)
-        ]
-        mapper = skinning.GetJointMapper()
-        if mapper and not mapper.IsNull() and not mapper.IsIdentity():
-            transforms = mapper.RemapTransforms(type(rest_transforms)(transforms))
         skinned = Vt.Vec3fArray([Gf.Vec3f(*map(float, point)) for point in points])
-        matrices = Vt.Matrix4dArray(list(transforms))
+        matrices = Vt.Matrix4dArray(transforms)
         if not skinning.ComputeSkinnedPoints(matrices, skinned, FIRST_TIME):
             return None, points
         xformable = UsdGeom.Xformable(skeleton.GetPrim())
         to_world = xformable.ComputeLocalToWorldTransform(FIRST_TIME)
         return np.array(to_world), _to_array(skinned, np.float64, 3)
+
+
+def _compute_joint_transforms(skinning: Any, skeleton_query: Any) -> list[Any] | None:
+    """Return how each joint of a skin moves points at rest, or None if that is unknown.
+
+    It is the inverse of its bind transform, then its rest transform. USD's matrices are
+    for rows, so that the first one is on the left.
+
+    Args:
+        skinning: query of the skin, which may have its joints in an order of its own.
+        skeleton_query: query of the skeleton.
+    """
+    rest_transforms = skeleton_query.ComputeJointSkelTransforms(FIRST_TIME, atRest=True)
+    bind_transforms = skeleton_query.GetJointWorldBindTransforms()
+    if not rest_transforms or len(rest_transforms) != len(bind_transforms):
+        return None
+    transforms = [
+        bind.GetInverse() * joint
+        for bind, joint in zip(bind_transforms, rest_transforms, strict=True)
+    ]
+    mapper = skinning.GetJointMapper()
+    if mapper and not mapper.IsNull() and not mapper.IsIdentity():
+        transforms = mapper.RemapTransforms(type(rest_transforms)(transforms))
+    return list(transforms)
+
+
+def _is_valid_power(powers: Array) -> bool:
+    """Return whether all of some powers (N,) are finite and at least 0."""
+    return bool((np.isfinite(powers) & (powers >= 0.0)).all())
+
+
+def _read_light_color(light: Any) -> Array:
+    """Return the linear color (3,) of a light: its own times that of its temperature."""
+    color = np.array(_get_first(light, "Color"), np.float64)
+    if _get_first(light, "EnableColorTemperature"):
+        temperature = _get_first(light, "ColorTemperature")
+        color *= np.array(UsdLux.BlackbodyTemperatureAsRgb(temperature))
+    return color
 
 
 def _make_point_light(prim: Any) -> dict[str, Any]:

@@ -490,10 +490,8 @@ class PreviewSurface:
                 "diffuse colour is read"
             )
         shader.inputs.mark_read("clearcoatRoughness")  # named with the clearcoat
-        if (
-            str(shader.get_value("opacityMode") or "presence") != "presence"
-            and entry.get("alphaMode") == "BLEND"
-        ):
+        opacity_mode = str(shader.get_value("opacityMode") or "presence")
+        if opacity_mode != "presence" and entry.get("alphaMode") == "BLEND":
             self.surfaces.note(
                 "has materials with opacityMode transparent; here "
                 "highlights fade with the opacity too"
@@ -973,6 +971,14 @@ class PreviewSurface:
                 "says; write raw if it holds numbers"
             )
 
+    def _note_constant_normal(self) -> None:
+        """Note a normal that is no image, unless it is upright."""
+        normal = self.shader.get_numbers("normal", UPRIGHT)
+        if not np.allclose(normal, UPRIGHT, atol=1e-3):
+            self.surfaces.note(
+                "has materials with one normal everywhere, which is left out"
+            )
+
     def _add_normal(self, entry: dict[str, Any]) -> None:
         """Fill in the normal map.
 
@@ -981,11 +987,7 @@ class PreviewSurface:
         channel, is left out with a note. `entry` is the glTF material.
         """
         if self.shader.find_source("normal") is None:
-            normal = self.shader.get_numbers("normal", UPRIGHT)
-            if not np.allclose(normal, UPRIGHT, atol=1e-3):
-                self.surfaces.note(
-                    "has materials with one normal everywhere, which is left out"
-                )
+            self._note_constant_normal()
             return
         use = self._find_texture("normal")
         if isinstance(use, tuple) or use is None:
