@@ -70,8 +70,9 @@ def make_control(
     control = CONTROLS[kind]
     if parameter is not None:
         options.setdefault(parameter, _get_default_range(control, parameter))
-    known = [choice.name for choice in control.choices] + [
-        known.name for known in control.declare_parameters(options)
+    known = [choice.name for choice in control.choices]
+    known += [
+        known_parameter.name for known_parameter in control.declare_parameters(options)
     ]
     for setting in options:  # "name" is set below, and no setting of a user
         if setting not in known:
@@ -117,13 +118,13 @@ def _parse_name(
     name is that of a class of controls, or KIND, KIND:NAME, KIND.PARAMETER or
     KIND.PARAMETER:NAME.
     """
-    kind, colon, name = control_name.partition(":")
-    kind, dot, parameter = kind.partition(".")
     kind_setting = settings.pop("kind", None)
     if kind_setting is not None:
         return str(kind_setting), control_name, None
     if CONTROLS.names_class(control_name):
         return control_name, CONTROLS[control_name].kind, None
+    head, colon, name = control_name.partition(":")
+    kind, dot, parameter = head.partition(".")
     check_instance_name(f"`controls` {control_name}", name, colon)
     return kind, make_instance_name(kind, name), parameter if dot else None
 
@@ -240,27 +241,27 @@ def make_space(controls: Sequence[Control], scene: SceneDescription) -> Space:
         raise InputError(f"controls: expected at least one of {', '.join(CONTROLS)}")
     space = compose(controls, scene)
     if not len(space.start):
-        first = space.controls[0]
         names = ", ".join(control.name for control in controls)
-        example = f"{first.name}:KEY=[0.2, 0.8]"
-        if first.parameters:
-            # one that has a default range, if there is one
-            parameter = next(
-                (
-                    parameter
-                    for parameter in first.instance_parameters
-                    if parameter.search is not None
-                ),
-                first.instance_parameters[0],
-            )
-            low, high = parameter.search or (parameter.low, parameter.high)
-            example = f"{first.name}={{{parameter.name}: [{low:g}, {high:g}]}}"
         raise InputError(
             f"`controls` {names}: every parameter is fixed, so there is nothing to "
             "search; give one a range, "
-            f"such as {example}"
+            f"such as {_make_example_range(space.controls[0])}"
         )
     return space
+
+
+def _make_example_range(control: Control) -> str:
+    """Return how a user could write a range of one of a control's parameters.
+
+    It is a parameter that has a default range, if there is one.
+    """
+    if not control.parameters:
+        return f"{control.name}:KEY=[0.2, 0.8]"
+    parameters = control.instance_parameters
+    searchable = [parameter for parameter in parameters if parameter.search is not None]
+    parameter = searchable[0] if searchable else parameters[0]
+    low, high = parameter.search or (parameter.low, parameter.high)
+    return f"{control.name}={{{parameter.name}: [{low:g}, {high:g}]}}"
 
 
 def _check_names_no_mesh(controls: Sequence[Control], scene: SceneDescription) -> None:
@@ -297,17 +298,7 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
         InputError: two controls of one name, one that the scene cannot take, or one
             that leaves out what was requested of the scene.
     """
-    names = [control.name for control in controls]
-    if len(set(names)) != len(names):
-        raise InputError(
-            "controls: every instance needs a name of its own, got "
-            f"{', '.join(names)}; write KIND:NAME, such as "
-            f"light:key,light:fill"
-        )
-    _check_names_no_mesh(controls, scene)
-    if scene.backdrop_photograph is not None:
-        _check_controls_in_photograph(controls, scene.backdrop_photograph.spec)
-    _check_photograph_is_chosen(controls, scene)
+    _check_controls(controls, scene)
     described_scene = scene
     adjusted = list[AdjustedDefault]()
     for control in controls:
@@ -320,6 +311,7 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
     bound = tuple(control.bind(scene) for control in controls)
     for control in bound:
         adjusted += control.adjusted_defaults
+    names = [control.name for control in controls]
     adjusted.sort(key=lambda default: names.index(default.control))
     environments = [
         str(default.used) for default in adjusted if default.parameter == ENVIRONMENT
@@ -328,6 +320,24 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
         environments.append(scene.environment_spec)
     environment = environments[0] if environments else None
     return Space(bound, scene, tuple(adjusted), environment)
+
+
+def _check_controls(controls: Sequence[Control], scene: SceneDescription) -> None:
+    """Check that controls go together, and with a scene that none has prepared.
+
+    Raises InputError: they do not, or two have one name.
+    """
+    names = [control.name for control in controls]
+    if len(set(names)) != len(names):
+        raise InputError(
+            "controls: every instance needs a name of its own, got "
+            f"{', '.join(names)}; write KIND:NAME, such as "
+            f"light:key,light:fill"
+        )
+    _check_names_no_mesh(controls, scene)
+    if scene.backdrop_photograph is not None:
+        _check_controls_in_photograph(controls, scene.backdrop_photograph.spec)
+    _check_photograph_is_chosen(controls, scene)
 
 
 def _check_photograph_is_chosen(

@@ -79,26 +79,17 @@ class BackdropControl(Control):
                 f"`controls` {self.name}: chooses among the photographs of a folder, "
                 "and there is none; give `backdrop=FOLDER`"
             )
-        scenes = folder.scenes
         allowed = [str(name) for name in self._list_names(scene)]
         for name in allowed:
-            if name not in scenes:
+            if name not in folder.scenes:
                 raise InputError(
                     f"{self.name}.which: {folder.path} has no photograph "
-                    f"{name}; it has {', '.join(scenes)[:200]}"
+                    f"{name}; it has {', '.join(folder.scenes)[:200]}"
                 )
-        first = scenes[allowed[0]]
-        lenses = [_get_lens(scenes[name]) for name in allowed]
-        for name, lens in zip(allowed, lenses, strict=True):
-            if lens.kind != lenses[0].kind:
-                raise InputError(
-                    f"`controls` {self.name}: {name} has a {lens.kind} lens and "
-                    f"{allowed[0]} a {lenses[0].kind} one; choose among photographs "
-                    f"of one kind, with {self.name}.which"
-                )
-            _check_compatible(name, scenes[name], first)
-        has_model = any(scenes[name].camera_model is not None for name in allowed)
-        # the first of the folder need not be the first that is allowed
+        views = {name: folder.scenes[name] for name in allowed}
+        self._check_views(views)
+        first = views[allowed[0]]
+        # The scene shows the first photograph of the folder, which may not be allowed.
         if first.backdrop_photograph is not scene.backdrop_photograph:
             scene = replace(
                 scene,
@@ -106,13 +97,30 @@ class BackdropControl(Control):
                 camera=first.camera,
                 values=first.values,
             )
-        allowed_scenes = {name: scenes[name] for name in allowed}
-        model = lenses[0] if has_model else None
+        has_model = any(view.camera_model is not None for view in views.values())
         return replace(
             scene,
-            camera_model=model,
-            photographs=replace(folder, scenes=allowed_scenes),
+            camera_model=_get_lens(first) if has_model else None,
+            photographs=replace(folder, scenes=views),
         )
+
+    def _check_views(self, views: Mapping[str, SceneDescription]) -> None:
+        """Raise InputError if two photographs can not be shown in one scene.
+
+        `views` are the scenes in the photographs, by name. All are compared with the
+        first.
+        """
+        first_name, first = next(iter(views.items()))
+        first_lens = _get_lens(first)
+        for name, view in views.items():
+            lens = _get_lens(view)
+            if lens.kind != first_lens.kind:
+                raise InputError(
+                    f"`controls` {self.name}: {name} has a {lens.kind} lens and "
+                    f"{first_name} a {first_lens.kind} one; choose among photographs "
+                    f"of one kind, with {self.name}.which"
+                )
+            _check_compatible(name, view, first)
 
     def _list_names(self, scene: SceneDescription) -> tuple[ParameterValue, ...]:
         """Return the names of the photographs that may be chosen."""
@@ -205,19 +213,29 @@ def _check_compatible(
             f"`controls` backdrop: {name} has a light of its own beside it; state one "
             "`environment` for all photographs, or sweep over them"
         )
-    carry = _compute_carry(view, first)
-    # how far z is from staying z
-    up_change = carry[2, :3] - [0.0, 0.0, 1.0]
-    is_level = np.abs(up_change).max() <= PLANE_TOLERANCE and carry[2, 2] > 0.0
-    level_change = (
-        carry[2, 3] + view.get_number("ground.level") - first.get_number("ground.level")
-    )
-    same_plane = has_plane(view) == has_plane(first) and (
-        not has_plane(first) or abs(level_change) <= PLANE_TOLERANCE
-    )
-    if not (is_level and same_plane):
+    if not _stands_alike(view, first):
         raise InputError(
             f"`controls` backdrop: the object stands in {name} with another side down, "
             "or at another height above its plane, than in the first photograph; leave "
             f"it out of backdrop.which, or sweep over the photographs"
         )
+
+
+def _stands_alike(view: SceneDescription, first: SceneDescription) -> bool:
+    """Return whether the object stands on the plane of a view as on that of the first.
+
+    That is with the same side down and at the same height; or on no plane in both.
+    """
+    carry = _compute_carry(view, first)
+    # Row 2 of the map gives z in the first scene: it has to be z, but for a shift.
+    up_change = carry[2, :3] - [0.0, 0.0, 1.0]
+    is_upright = np.abs(up_change).max() <= PLANE_TOLERANCE and carry[2, 2] > 0.0
+    if not is_upright or has_plane(view) != has_plane(first):
+        return False
+    if not has_plane(first):
+        return True
+    # how much higher the view's plane is than the first's, once carried there
+    level_change = (
+        carry[2, 3] + view.get_number("ground.level") - first.get_number("ground.level")
+    )
+    return bool(abs(level_change) <= PLANE_TOLERANCE)

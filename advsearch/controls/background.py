@@ -85,9 +85,13 @@ class BackgroundControl(Control):
         """Check that something can be searched. Raises InputError."""
         super().__init__(name, **settings)
         # a list for `what` alone leaves the colour to be searched
-        self.has_requested_search = any(
-            not isinstance(self.specs.get(name, Fixed(0.0)), Fixed)
-            for name in COLOR_PARAMETERS
+        color_specs = [
+            self.specs[parameter_name]
+            for parameter_name in COLOR_PARAMETERS
+            if parameter_name in self.specs
+        ]
+        self.has_requested_search = not all(
+            isinstance(spec, Fixed) for spec in color_specs
         )
         if self.specs.get("what") == Fixed("environment"):
             raise InputError(

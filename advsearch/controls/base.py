@@ -130,22 +130,9 @@ def list_replaced_settings(
     Raises:
         InputError: the user set a value that was replaced.
     """
-    if after.environment is not None and after.environment is not before.environment:
-        check_single_environment(after.parts, f"`controls` {control}")
-        if ENVIRONMENT in before.requested:
-            raise InputError(
-                f"`environment={before.environment_spec}` and `controls` {control} "
-                "contradict each other: the control "
-                f"puts {after.environment.name} in its place; leave one of the two out"
-            )
-        if after.environment_spec == before.environment_spec:
-            yield AdjustedDefault(
-                control,
-                ENVIRONMENT,
-                "name",
-                before.environment_spec,
-                after.environment.name,
-            )
+    environment = _find_replaced_environment(control, before, after)
+    if environment is not None:
+        yield environment
     for name, value in after.values.items():
         value_before = before.values[name]
         if value is None or value_before is None or is_same_value(value, value_before):
@@ -158,6 +145,33 @@ def list_replaced_settings(
                 f"{format_rounded(value)}; change one of the two, or leave one out"
             )
         yield AdjustedDefault(control, name, SETTINGS[name].unit, value_before, value)
+
+
+def _find_replaced_environment(
+    control: str, before: SceneDescription, after: SceneDescription
+) -> AdjustedDefault | None:
+    """Return the environment that a control replaced in a scene; None if it did not.
+
+    None, too, if the scene after it states the new environment in its
+    `environment_spec`: then it is no default that was adjusted.
+
+    Raises:
+        InputError: the user set the environment that was replaced.
+    """
+    if after.environment is None or after.environment is before.environment:
+        return None
+    check_single_environment(after.parts, f"`controls` {control}")
+    if ENVIRONMENT in before.requested:
+        raise InputError(
+            f"`environment={before.environment_spec}` and `controls` {control} "
+            "contradict each other: the control "
+            f"puts {after.environment.name} in its place; leave one of the two out"
+        )
+    if after.environment_spec != before.environment_spec:
+        return None
+    return AdjustedDefault(
+        control, ENVIRONMENT, "name", before.environment_spec, after.environment.name
+    )
 
 
 NO_INPUTS: Mapping[str, Tensor] = MappingProxyType({})  # no scene inputs yet
@@ -203,29 +217,39 @@ class Choice:
         """
         if value is None and self.default is None:
             return
-        expected = ""
-        is_valid = True
-        if self.options:
-            expected = f"one of {', '.join(self.options)}"
-            is_valid = value in self.options
-        elif self.whole is not None:
-            low, high = self.whole
-            expected = f"a whole number from {low} to {high}"
-            is_valid = (
-                Parameter.is_number(value)
-                and low <= value <= high
-                and value == int(value)
-            )
-        elif self.most is not None and self.signed:
-            expected = f"a number from {-self.most:g} to {self.most:g}"
-            is_valid = Parameter.is_number(value) and abs(value) <= self.most
-        elif self.most is not None:
-            expected = f"a number over 0 and up to {self.most:g}"
-            is_valid = Parameter.is_number(value) and 0.0 < value <= self.most
-        if not is_valid:
+        expected = self._describe_expected()
+        if expected is not None and not self._is_valid(value):
             raise InputError(
                 f"{control}.{self.name}: expected {expected}, got {value!r}"
             )
+
+    def _describe_expected(self) -> str | None:
+        """Return a phrase about what can be chosen; None if anything can."""
+        if self.options:
+            return f"one of {', '.join(self.options)}"
+        if self.whole is not None:
+            low, high = self.whole
+            return f"a whole number from {low} to {high}"
+        if self.most is None:
+            return None
+        if self.signed:
+            return f"a number from {-self.most:g} to {self.most:g}"
+        return f"a number over 0 and up to {self.most:g}"
+
+    def _is_valid(self, value: object) -> bool:
+        """Return whether a value is among those of `_describe_expected`."""
+        if self.options:
+            return value in self.options
+        return Parameter.is_number(value) and self._is_in_bounds(value)
+
+    def _is_in_bounds(self, value: float) -> bool:
+        """Return whether a number can be chosen where numbers can be."""
+        if self.whole is not None:
+            low, high = self.whole
+            return low <= value <= high and value == int(value)
+        if self.most is None:
+            return True
+        return abs(value) <= self.most if self.signed else 0.0 < value <= self.most
 
 
 Values = Mapping[str, Tensor]
@@ -328,6 +352,27 @@ class Control:
             for setting, value in settings.items()
         }
         self.instance_parameters = self.declare_parameters(settings)
+        self._check_setting_names(settings)
+        # A setting of None counts as left out.
+        self._settings: dict[str, Any] = {
+            setting: to_plain_value(value)
+            for setting, value in settings.items()
+            if value is not None
+        }
+        self.chosen: dict[str, Any] = {
+            choice.name: self._settings.get(choice.name, choice.default)
+            for choice in self.choices
+        }
+        for choice in self.choices:
+            choice.check(self.name, self.chosen[choice.name])
+        self.check_choices()
+        self.specs = self._parse_specs()
+        self.has_requested_search = any(
+            not isinstance(spec, Fixed) for spec in self.specs.values()
+        )
+
+    def _check_setting_names(self, settings: Iterable[str]) -> None:
+        """Raise UnknownNameError for a setting that is no parameter and no choice."""
         parameter_names = [parameter.name for parameter in self.instance_parameters]
         known = parameter_names + [choice.name for choice in self.choices]
         for setting in settings:
@@ -335,29 +380,17 @@ class Control:
                 raise UnknownNameError(
                     f"setting of control {self.kind}", setting, known
                 )
-        settings_by_name = {
-            setting: to_plain_value(value)
-            for setting, value in settings.items()
-            if value is not None
-        }
-        self._settings: dict[str, Any] = settings_by_name
-        self.chosen: dict[str, Any] = {
-            choice.name: settings_by_name.get(choice.name, choice.default)
-            for choice in self.choices
-        }
-        for choice in self.choices:
-            choice.check(self.name, self.chosen[choice.name])
-        self.check_choices()
-        self.specs: dict[str, Spec] = {}
+
+    def _parse_specs(self) -> dict[str, Spec]:
+        """Return what parameters are set to, by name; only of those with a setting."""
+        specs: dict[str, Spec] = {}
         for parameter in self.instance_parameters:
-            if parameter.name in settings_by_name:
-                label = f"{self.name}.{parameter.name}"
-                self.specs[parameter.name] = parse_spec(
-                    label, parameter, settings_by_name[parameter.name]
+            name = parameter.name
+            if name in self._settings:
+                specs[name] = parse_spec(
+                    f"{self.name}.{name}", parameter, self._settings[name]
                 )
-        self.has_requested_search = any(
-            not isinstance(spec, Fixed) for spec in self.specs.values()
-        )
+        return specs
 
     @classmethod
     def declare_parameters(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
@@ -428,15 +461,18 @@ class Control:
         return f"{self.kind if self.mesh == OBJECT else self.name}.{parameter.name}"
 
     def select_form(self, forms: Sequence[str]) -> str:
-        """Return which form of itself a control takes.
+        """Return the form in which a control acts, such as "palette" of `texture`.
 
-        Each of its parameters stands for one form, and the choice `form` for any.
+        The user requests a form by the setting `form`, or by naming the parameter that
+        stands for it.
 
         Args:
-            forms: the forms, in the order of the parameters; the first is the default.
+            forms: the forms, one for each parameter in their order; the first is the
+                default.
 
         Raises:
-            InputError: two forms are requested, or a parameter has a range of its own.
+            InputError: two forms are requested, or a parameter is set to a narrower
+                range than its full one.
             UnknownNameError: there is no such form.
         """
         requested = []
@@ -444,11 +480,8 @@ class Control:
             value = self._settings.get(parameter.name)
             if value is None:
                 continue
-            # the full range only names the form: it cannot be narrowed
-            if value not in (
-                [parameter.low, parameter.high],
-                (parameter.low, parameter.high),
-            ):
+            full_range = [parameter.low, parameter.high]
+            if value not in (full_range, tuple(full_range)):
                 raise InputError(
                     f"{self.name}.{parameter.name}: expected no value but "
                     f"[{parameter.low:g}, {parameter.high:g}], got "
@@ -533,8 +566,9 @@ class Control:
             dtype=torch.float32,
         )
         self.groups = tuple(self._group(slot) for slot in slots if slot.n_coordinates)
-        # Lower bound and width of the range of each slot, for `values`; a slot without a
-        # range gets one that is not used.
+        # For `values`: the lower bound and the width of the range of each coordinate,
+        # (d,) each. All coordinates of a slot have the same range; a slot without one
+        # gets a range that is not used.
         ranges = [
             slot.spec if isinstance(slot.spec, Range) else Range(0.0, 1.0)
             for slot in slots
@@ -543,8 +577,6 @@ class Control:
             [(spec.low, spec.high - spec.low) for spec in ranges], dtype=torch.float64
         ).reshape(-1, 2)
         counts = torch.tensor([slot.n_coordinates for slot in slots], dtype=torch.long)
-        # a slot of several values has the same range for each coordinate
-        # (d,) each
         self._low, self._span = low_and_span.T.repeat_interleave(counts, dim=1)
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
@@ -652,7 +684,8 @@ class Control:
                     "two, or "
                     "leave one out"
                 )
-            if not isinstance(self.specs.get(parameter.name), Fixed):
+            is_fixed_by_user = isinstance(self.specs.get(parameter.name), Fixed)
+            if not is_fixed_by_user:
                 yield AdjustedDefault(
                     self.name,
                     setting if setting == ENVIRONMENT else label,
@@ -762,9 +795,11 @@ class Control:
     def scene_inputs(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return what the values do to the scene, by differentiable torch operations.
+        """Return the scene inputs that the values set, by name; differentiable.
 
-        See `inputs`.
+        None by default: subclasses that act on the scene override it, and those that
+        act on the finished image override `on_picture`. `earlier_inputs` is as for
+        `inputs`.
         """
         return {}
 

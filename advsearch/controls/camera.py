@@ -255,12 +255,15 @@ class CameraControl(Control):
         name = parameter.name
         if name in COEFFICIENTS and scene.camera_model is not None:
             return scene.camera_model.values[name]
+        # all three are how far the camera is away: it is focused on the object
         if name in ("distance", "focus", "sizes"):
             fixed_lens_scene = self._with_fixed_lens()
             camera_position = camera_to_world(fixed_lens_scene)[:3, 3]
             offset = camera_position - compute_center(fixed_lens_scene)
-            distance = float(np.linalg.norm(offset))  # in object sizes
-            return distance if name == "sizes" else distance * scene.size_in_metres
+            distance_in_sizes = float(np.linalg.norm(offset))
+            if name == "sizes":
+                return distance_in_sizes
+            return distance_in_sizes * scene.size_in_metres
         if name == "height":
             camera_height = float(camera_to_world(self._with_fixed_lens())[2, 3])
             return camera_height * scene.size_in_metres
@@ -323,11 +326,9 @@ class CameraControl(Control):
             inputs["camera.fov"] = fov.reshape(1)
         if scene.thin_lens and ("aperture" in self.specs or "focus" in self.specs):
             inputs["camera.aperture"] = values["aperture"].clamp_min(1e-5).reshape(1)
-            focus = (
-                values["focus"] / scene.size_in_metres
-                if "focus" in self.specs
-                else distance
-            )
+            focus = distance
+            if "focus" in self.specs:
+                focus = values["focus"] / scene.size_in_metres
             inputs["camera.focus"] = focus.reshape(1)
         if scene.camera_model is None and self._is_shifted:
             inputs["camera.shift"] = torch.stack([values["shift_x"], values["shift_y"]])
@@ -387,18 +388,16 @@ class CameraControl(Control):
     def _compute_distance(self, values: Values, fov: Tensor) -> Tensor:
         """Return the camera's distance () from the object's center, in object sizes.
 
-        It is `sizes` or `distance`, if the user set one of them, or the scene's
-        setting; else the distance at which a field of view of `fov` degrees frames the
-        object.
+        It is that of `sizes` or `distance`, if the user or the scene sets one of them,
+        or if all parameters are searched. Otherwise only others are: then it is the
+        distance at which a field of view of `fov` degrees frames the object.
         """
         scene = self.scene
         if "sizes" in self.specs:
             return values["sizes"]
-        if (
-            "distance" in self.specs
-            or not self.has_requested_search
-            or scene.values.get("camera.distance") is not None
-        ):
+        scene_has_distance = scene.values.get("camera.distance") is not None
+        searches_all = not self.has_requested_search
+        if "distance" in self.specs or searches_all or scene_has_distance:
             return values["distance"] / scene.size_in_metres
         return compute_framing_distance(scene, fov, scene.aspect).float()
 
@@ -458,11 +457,9 @@ def adapt_length_unit(parameter: Parameter, has_metres: bool) -> Parameter:
 
     Without a size of the object in metres, lengths are in object sizes.
     """
-    return (
-        replace(parameter, unit="object sizes")
-        if parameter.unit == "metres" and not has_metres
-        else parameter
-    )
+    if parameter.unit == "metres" and not has_metres:
+        return replace(parameter, unit="object sizes")
+    return parameter
 
 
 def _compute_fov(focal_length: Tensor) -> Tensor:

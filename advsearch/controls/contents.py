@@ -102,14 +102,18 @@ def find_interior(asset: assets.ObjectAsset) -> Vessel | None:
     heights = np.linspace(floor, floor + FILL_LIMIT * depth, WALL_ROWS)
     # just above the floor, since a ray along a flat floor might hit anything
     min_height = floor + 0.004 * depth
-    walls = [
-        _find_wall(mesh, axis, max(float(height), min_height)) for height in heights
-    ]
-    distances, faces = zip(*walls, strict=True)
+    distances = []
+    faces = []
+    for height in heights:
+        row_distances, row_faces = _find_wall(
+            mesh, axis, max(float(height), min_height)
+        )
+        distances.append(row_distances)
+        faces.append(row_faces)
     radii = _fill_missed_radii(np.stack(distances))
     if radii is None:
         return None
-    # of the lower half of the wall; -1 is no face
+    # what is seen through the liquid; -1 is a ray that hit no face
     lower_faces = np.concatenate(faces[: WALL_ROWS // 2])
     wall_color = _mean_face_color(asset, lower_faces[lower_faces >= 0])
     return Vessel(axis, heights, radii, wall_color)
@@ -158,20 +162,18 @@ def _find_basin(mesh: assets.Mesh) -> tuple[assets.Float64Array, float, float] |
     """
     corner, cell, ground = _compute_height_map(mesh)
     water = _fill_with_water(ground)
+    water_depth = water - ground
     # Connected cells with water; 0 is dry, basins count from 1. A film of less than a
     # thousandth of the object is dry as well.
-    labels, count = ndimage.label(water - ground > 1e-3)
+    labels, count = ndimage.label(water_depth > 1e-3)
     if count == 0:
         return None
-    volumes = ndimage.sum_labels(water - ground, labels, np.arange(1, count + 1))
+    volumes = ndimage.sum_labels(water_depth, labels, np.arange(1, count + 1))
     is_largest = labels == 1 + int(np.argmax(volumes))
-    depth = np.where(is_largest, water - ground, 0.0)
+    depth = np.where(is_largest, water_depth, 0.0)
     if depth.max() < MIN_DEPTH or is_largest.sum() * cell * cell < MIN_OPENING:
         return None
-    row, column = np.nonzero(is_largest)
-    weight = depth[is_largest]
-    moments = np.array([(column * weight).sum(), (row * weight).sum()])
-    axis = corner + cell * moments / weight.sum()
+    axis = _find_weighted_center(depth, corner, cell)
     return axis, float(ground[is_largest].min()), float(water[is_largest].max())
 
 
@@ -250,6 +252,20 @@ def _fill_with_water(ground: assets.Float64Array) -> assets.Float64Array:
         if has_settled:
             return water
         water[1:-1, 1:-1] = level
+
+
+def _find_weighted_center(
+    weights: assets.Float64Array, corner: assets.Float64Array, cell: float
+) -> assets.Float64Array:
+    """Return the center (2,) of the cells of a grid, by their weights (rows, columns).
+
+    `corner` (2,) is the middle of the first cell, `cell` the side of each.
+    """
+    row, column = np.nonzero(weights)
+    weight = weights[row, column]
+    moments = np.array([(column * weight).sum(), (row * weight).sum()])
+    center: assets.Float64Array = corner + cell * moments / weight.sum()
+    return center
 
 
 def _find_wall(
@@ -362,22 +378,28 @@ class ContentsControl(Control):
     def __init__(self, name: str | None = None, **settings: object) -> None:
         """Find the bounds of each proportion, also of those that are not set.
 
-        If anything is searched, these go from 0 to what the others leave. Raises
-        InputError: the proportions cannot add up to 1.
+        Raises InputError: the proportions cannot add up to 1.
         """
         super().__init__(name, **settings)
         self.proportion_bounds = self._read_bounds()
-        least_total = sum(lower for lower, _ in self.proportion_bounds.values())
-        self._check_total(least_total)
-        is_searched = not self.has_requested_search or any(
+        min_total = sum(lower for lower, _ in self.proportion_bounds.values())
+        self._check_total(min_total)
+        self._add_default_bounds(rest=max(0.0, 1.0 - min_total))
+
+    def _add_default_bounds(self, rest: float) -> None:
+        """Add the bounds of the proportions that are not set.
+
+        If proportions are searched, they go from 0 to the rest that those set leave.
+        Otherwise the first of coffee, water and milk that is not set has all of it.
+        """
+        # all parameters are searched unless a range is set for some
+        are_searched = not self.has_requested_search or any(
             isinstance(self.specs.get(name), Range) for name in INGREDIENTS
         )
-        rest = max(0.0, 1.0 - least_total)
-        # If nothing is searched, the first of these that is not set has all the rest.
         for name in ("coffee", "water", "milk"):
             if name in self.proportion_bounds:
                 continue
-            if is_searched:
+            if are_searched:
                 self.proportion_bounds[name] = (0.0, rest)
             else:
                 self.proportion_bounds[name] = (rest, rest)
@@ -409,19 +431,22 @@ class ContentsControl(Control):
                 )
         return bounds
 
-    def _check_total(self, least_total: float) -> None:
-        """Check that the proportions can add up to 1. Raises InputError: they
-        cannot.
+    def _check_total(self, min_total: float) -> None:
+        """Check that the proportions can add up to 1. Raises InputError: they cannot.
+
+        `min_total` is the sum of the lower bounds of those that are set.
         """
-        largest_total = sum(upper for _, upper in self.proportion_bounds.values())
+        max_total = sum(upper for _, upper in self.proportion_bounds.values())
         all_set = len(self.proportion_bounds) == len(INGREDIENTS)
-        is_too_little = all_set and largest_total < 1.0 - SUM_TOLERANCE
-        if least_total <= 1.0 + SUM_TOLERANCE and not is_too_little:
+        # where one is not set, it makes up what is missing
+        is_too_little = all_set and max_total < 1.0 - SUM_TOLERANCE
+        is_too_much = min_total > 1.0 + SUM_TOLERANCE
+        if not is_too_little and not is_too_much:
             return
         stated = []
         for name in INGREDIENTS:
             if name in self.proportion_bounds:
-                # a dict, so that equal bounds are named once
+                # "water 0.2 to 0.5"; a dict, so that equal bounds are named once
                 bounds = dict.fromkeys(
                     f"{bound:g}" for bound in self.proportion_bounds[name]
                 )
@@ -530,12 +555,12 @@ class ContentsControl(Control):
         Args:
             cuts: coordinates in [0, 1] by ingredient.
         """
-        left = torch.ones_like(cuts[INGREDIENTS[0]])
+        remainder = torch.ones_like(cuts[INGREDIENTS[0]])
         proportions = dict[str, Tensor]()
         for name in INGREDIENTS:
-            lower, upper = self._possible_range(name, left)
+            lower, upper = self._possible_range(name, remainder)
             proportions[name] = lower + (upper - lower).clamp_min(0.0) * cuts[name]
-            left = left - proportions[name]
+            remainder = remainder - proportions[name]
         return proportions
 
     def find_cuts(self, proportions: Mapping[str, float]) -> dict[str, float]:
@@ -544,18 +569,18 @@ class ContentsControl(Control):
 
         It is the inverse of `cut_proportions`.
         """
-        left = torch.ones(())
+        remainder = torch.ones(())
         cuts = dict[str, float]()
         for name in INGREDIENTS:
-            lower, upper = map(float, self._possible_range(name, left))
+            lower, upper = map(float, self._possible_range(name, remainder))
             proportion = min(max(proportions[name], lower), max(lower, upper))
             cuts[name] = 0.0
             if upper > lower:
                 cuts[name] = (proportion - lower) / (upper - lower)
-            left = left - proportion
+            remainder = remainder - proportion
         return cuts
 
-    def _possible_range(self, name: str, left: Tensor) -> tuple[Tensor, Tensor]:
+    def _possible_range(self, name: str, remainder: Tensor) -> tuple[Tensor, Tensor]:
         """Return the least and the largest proportion () that an ingredient may have.
 
         They are its own bounds, narrowed so that the ingredients after it can make up
@@ -563,18 +588,18 @@ class ContentsControl(Control):
 
         Args:
             name: name of the ingredient.
-            left: () what the ingredients before it have left of 1.
+            remainder: () what the ingredients before it have left of 1.
         """
         index = INGREDIENTS.index(name)
-        limits = left.new_tensor(
+        limits = remainder.new_tensor(
             [self.proportion_bounds[ingredient] for ingredient in INGREDIENTS]
         )
         lower, upper = limits[index]
         # of all ingredients after this one together
         rest_lower, rest_upper = limits[index + 1 :].sum(dim=0)
-        return torch.maximum(lower, left - rest_upper), torch.minimum(
-            upper, left - rest_lower
-        )
+        least = torch.maximum(lower, remainder - rest_upper)
+        largest = torch.minimum(upper, remainder - rest_lower)
+        return least, largest
 
 
 # ---- how it looks

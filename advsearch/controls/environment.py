@@ -15,7 +15,7 @@ the map's mean radiance, inside an L2 ball.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -118,7 +118,9 @@ class EnvironmentControl(Control):
         return (replace(which, options=options), *others)
 
     def check_choices(self) -> None:
-        """Check that there are harmonics if a ball is set for them. Raises InputError."""
+        """Raise InputError if an epsilon, which limits the harmonics, is set without
+        them.
+        """
         epsilon = self.chosen["epsilon"]
         if "epsilon" in self._settings and "harmonics" not in self._settings:
             raise InputError(
@@ -129,25 +131,24 @@ class EnvironmentControl(Control):
             )
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        """Give the scene the first allowed environment, if its own is not allowed and
-        `which` is fixed or has a file.
+        """Give the scene the first allowed environment, or let it keep its own.
 
-        Otherwise the scene keeps its own, which it must have. Notes of files, and one
-        on the ground that photographs of environments stand on, become remarks.
+        It keeps its own, which it must have, if that is allowed, or if several bundled
+        ones are searched. Notes on files become remarks.
         """
-        spec = self.specs.get("which")
         allowed = self.list_allowed_values("which", SCENE_ENVIRONMENT)
-        maps = {
+        assets_by_file = {
             str(name): _load_environment(str(name))
             for name in allowed
             if _is_file(name)
         }
-        notes = [note for asset in maps.values() for note in asset.warnings]
+        notes = [note for asset in assets_by_file.values() for note in asset.warnings]
         may_keep = (
             SCENE_ENVIRONMENT in allowed
             or self._find_scene_environment_name(scene) is not None
         )
-        if not may_keep and (isinstance(spec, Fixed) or maps):
+        is_fixed = isinstance(self.specs.get("which"), Fixed)
+        if not may_keep and (is_fixed or assets_by_file):
             name = str(allowed[0])
             scene = replace(
                 scene, environment=_load_environment(name), environment_spec=name
@@ -155,13 +156,8 @@ class EnvironmentControl(Control):
         else:
             environment = scene.require_environment(f"`controls` {self.name}")
             shows_photograph = scene.photograph is not None or environment.photographed
-            if maps and not shows_photograph and scene.get_number("ground.size") > 0.0:
-                names = ", ".join(Path(name).name for name in maps)
-                notes.append(
-                    f"{names}: the object stands on the scene's table there, too; "
-                    "ground.kind=photograph shows the "
-                    "floor of each picture instead"
-                )
+            if assets_by_file and not shows_photograph:
+                notes += _describe_table(scene, list(assets_by_file))
         return replace(scene, remarks=(*scene.remarks, *notes)) if notes else scene
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
@@ -246,7 +242,23 @@ class EnvironmentControl(Control):
         return {"environment.data": lit}
 
 
+def _describe_table(scene: SceneDescription, files: Sequence[str]) -> list[str]:
+    """Return a note that the scene's table stays in environments from files.
+
+    There is none if the scene has no table.
+    """
+    if scene.get_number("ground.size") <= 0.0:
+        return []
+    names = ", ".join(Path(file).name for file in files)
+    return [
+        f"{names}: the object stands on the scene's table there, too; "
+        "ground.kind=photograph shows the "
+        "floor of each picture instead"
+    ]
+
+
 def _is_file(name: ParameterValue) -> bool:
+    """Return whether the name of an environment is that of a file, none bundled."""
     return (
         isinstance(name, str) and name not in EnvironmentControl.parameters[0].options
     )
@@ -255,15 +267,14 @@ def _is_file(name: ParameterValue) -> bool:
 def _is_scene_environment(name: ParameterValue, scene: SceneDescription) -> bool:
     """Return whether an environment, a bundled name or a file, is the scene's own."""
     environment = scene.environment
-    if environment is None or not _is_file(name):
-        return (
-            environment is not None
-            and environment.source == library.BUNDLED_ENVIRONMENT
-            and environment.name == name
-        )
-    return bool(environment.source) and os.path.realpath(str(name)) == os.path.realpath(
-        environment.source
-    )
+    if environment is None:
+        return False
+    if not _is_file(name):
+        is_bundled = environment.source == library.BUNDLED_ENVIRONMENT
+        return is_bundled and environment.name == name
+    if not environment.source:
+        return False
+    return os.path.realpath(str(name)) == os.path.realpath(environment.source)
 
 
 def _load_environment(name: str) -> EnvironmentAsset:

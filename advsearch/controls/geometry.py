@@ -55,6 +55,7 @@ N_SURFACE_SAMPLES = 20000
 as what they cover.
 """
 BANDWIDTH = 1.8  # standard deviation of the kernel, in cells
+MIN_EIGENVALUE = 0.05  # smallest one that a function is divided by; the largest is 1
 # largest displacement gradient along a face; below 1 no face can turn over
 MAX_FACE_STRAIN = 0.7
 # largest change of the distance between the two sides of a wall, as a fraction of it
@@ -163,7 +164,7 @@ def compute_shape_modes(mesh: Mesh, count: int) -> Float64Array:
         the largest length is 1 in each.
     """
     welded_mesh = get_welded_mesh(mesh)
-    points, cell = _landmarks(welded_mesh)
+    points, cell = _sample_landmarks(welded_mesh)
     # each function gives three fields, one for each axis; two functions more than
     # needed, for the rotations that are removed
     n_scalars = min(math.ceil(count / 3) + 2, len(points) - 1)
@@ -177,7 +178,7 @@ def compute_shape_modes(mesh: Mesh, count: int) -> Float64Array:
     # Nystrom extension from the landmarks to all positions; small eigenvalues are
     # limited, since a division by them amplifies noise
     weights = _compute_landmark_weights(welded_mesh.positions, points, width, density)
-    extended = weights @ (functions / np.maximum(values, 0.05))
+    extended = weights @ (functions / np.maximum(values, MIN_EIGENVALUE))
     # p positions, s scalar functions, c axes, k fields
     fields = np.einsum("ps,sck->pck", extended, combination)
     return np.asarray(fields / np.linalg.norm(fields, axis=1).max(axis=0))
@@ -228,24 +229,25 @@ def _fix_signs(vectors: Float64Array) -> Float64Array:
     return np.asarray(vectors * np.where(largest < 0.0, -1.0, 1.0))
 
 
-def _landmarks(solid: WeldedMesh) -> tuple[Float64Array, float]:
+def _sample_landmarks(welded_mesh: WeldedMesh) -> tuple[Float64Array, float]:
     """Return points (N, 3) spread evenly over the surface, and the side of their cells.
 
     The surface is sampled evenly by area, and its vertices are added. Each landmark is
     the mean of all that lies in one cubic cell. Cells are enlarged until there are at
     most `MAX_LANDMARKS`.
     """
-    corners = solid.positions[solid.faces]
+    corners = welded_mesh.positions[welded_mesh.faces]
     areas = np.linalg.norm(compute_area_vectors(corners), axis=1)
     generator = np.random.default_rng(0)
-    # faces by their areas: at even steps along the sum of all areas
+    # The face of each sample, by its area: samples are even steps along the sum of all
+    # areas.
     quantiles = (np.arange(N_SURFACE_SAMPLES) + 0.5) / N_SURFACE_SAMPLES
     face = np.searchsorted(np.cumsum(areas) / areas.sum(), quantiles)
     face = face.clip(max=len(areas) - 1)
     barycentric = generator.dirichlet((1.0, 1.0, 1.0), N_SURFACE_SAMPLES)
     samples = np.einsum("nk,nkc->nc", barycentric, corners[face])
-    pool = np.concatenate([samples, solid.positions])
-    cell = CELL_SIZE * solid.extent
+    pool = np.concatenate([samples, welded_mesh.positions])
+    cell = CELL_SIZE * welded_mesh.extent
     while True:
         cubes = np.floor((pool - pool.min(axis=0)) / cell).astype(np.int64)
         # index of the occupied cell that each point lies in
@@ -319,16 +321,15 @@ class Preconditioner:
         The system is the identity plus the Laplacian times the squared smoothing
         length.
         """
-        count = len(welded_mesh.positions)
-        laplacian, mean_length = _wall_laplacian(welded_mesh)
-        strength = (SMOOTHING_LENGTH * welded_mesh.extent / mean_length) ** 2
-        self._factor = sparse_linalg.splu(
-            (sparse.identity(count) + strength * laplacian).tocsc()
-        )
-        centered = welded_mesh.positions - welded_mesh.positions.mean(axis=0)
-        shifts = [
-            np.broadcast_to(axis, welded_mesh.positions.shape) for axis in np.eye(3)
-        ]
+        positions = welded_mesh.positions
+        laplacian, mean_edge_length = _compute_wall_laplacian(welded_mesh)
+        # in mean edges, which have length 1 for the Laplacian
+        smoothing_edges = SMOOTHING_LENGTH * welded_mesh.extent / mean_edge_length
+        system = sparse.identity(len(positions)) + smoothing_edges**2 * laplacian
+        self._factor = sparse_linalg.splu(system.tocsc())
+        # displacement fields (P, 3) by a shift along and a small turn about each axis
+        shifts = [np.broadcast_to(axis, positions.shape) for axis in np.eye(3)]
+        centered = positions - positions.mean(axis=0)
         turns = [np.cross(axis, centered) for axis in np.eye(3)]
         motions = np.stack([field.reshape(-1) for field in (*shifts, *turns)], axis=1)
         self._rigid = torch.from_numpy(np.asarray(linalg.orth(motions)))
@@ -342,25 +343,31 @@ class Preconditioner:
         return (vector - rigid @ (rigid.T @ vector)).reshape(smooth.shape)
 
 
-def _wall_laplacian(solid: WeldedMesh) -> tuple[Any, float]:
+def _compute_wall_laplacian(welded_mesh: WeldedMesh) -> tuple[Any, float]:
     """Return the Laplacian (P, P) of a mesh with links through its walls, sparse, and
     the mean length of an edge.
 
     Edges are weighted by the inverse square of their length, links through walls by
     `WALL_WEIGHT`.
     """
-    count = len(solid.positions)
+    count = len(welded_mesh.positions)
     edges = np.concatenate(
-        [solid.faces[:, [0, 1]], solid.faces[:, [1, 2]], solid.faces[:, [2, 0]]]
+        [
+            welded_mesh.faces[:, [0, 1]],
+            welded_mesh.faces[:, [1, 2]],
+            welded_mesh.faces[:, [2, 0]],
+        ]
     )
     edges = np.unique(np.sort(edges, axis=1), axis=0)
-    edge_vectors = solid.positions[edges[:, 0]] - solid.positions[edges[:, 1]]
+    edge_vectors = (
+        welded_mesh.positions[edges[:, 0]] - welded_mesh.positions[edges[:, 1]]
+    )
     lengths = np.linalg.norm(edge_vectors, axis=1)
     mean_length = float(lengths.mean())
     # 1 for an edge of mean length; limited for very short ones
     edge_weights = (mean_length / lengths.clip(0.1 * mean_length)) ** 2
-    wall_weights = np.full(len(solid.walls), WALL_WEIGHT)
-    links = np.concatenate([edges, solid.walls])
+    wall_weights = np.full(len(welded_mesh.walls), WALL_WEIGHT)
+    links = np.concatenate([edges, welded_mesh.walls])
     weights = np.concatenate([edge_weights, wall_weights])
     adjacency = sparse.coo_matrix(
         (weights, (links[:, 0], links[:, 1])), shape=(count, count)
@@ -405,8 +412,8 @@ class DisplacementLimits:
     Attributes:
         epsilon: largest displacement, in the mesh's units.
         _faces: (F, 3) indices of positions, without slivers.
-        _inverse_axes: (F, 3) elements of the matrix that turns differences along the
-            edges of a face into a gradient, see `_compute_squared_gradients`.
+        _inverse_axes: (F, 3) numbers of a face that turn differences along its edges
+            into a gradient, see `_compute_squared_gradients`.
         _walls: (W, 2) indices of positions.
         _wall_widths: (W,) distances of the sides.
         _positions: (P, 3) of the mesh.
@@ -426,14 +433,13 @@ class DisplacementLimits:
         edge_1 = edge_1[is_sound]
         edge_2 = edge_2[is_sound]
         double_area = double_area[is_sound]
-        # In axes along edge 1 and across it, the edges are (length, 0) and (along,
-        # height). With d1 and d2 the differences of the displacement along them, its
-        # gradient is [d1 d2] [[length, along], [0, height]]^-1.
+        # see `_compute_squared_gradients`
         length = np.linalg.norm(edge_1, axis=1)
-        along_1 = (edge_1 * edge_2).sum(axis=1) / length
+        edge_2_along = (edge_1 * edge_2).sum(axis=1) / length
+        inverse_height = length / double_area
         self._faces = torch.from_numpy(welded_mesh.faces[is_sound])
         self._inverse_axes = torch.from_numpy(
-            np.stack([1.0 / length, along_1 / length, length / double_area], axis=1)
+            np.stack([1.0 / length, edge_2_along / length, inverse_height], axis=1)
         )
         self._walls = torch.from_numpy(welded_mesh.walls)
         wall_vectors = (
@@ -473,18 +479,21 @@ class DisplacementLimits:
     def _compute_squared_gradients(self, field: Tensor) -> Tensor:
         """Return the squared norm (F,) of the gradient of a field (P, 3) on each face.
 
-        In two axes of the face, along edge 1 and across it, the gradient's columns are
-        d1 / length and (d2 - d1 along / length) length / double area. `_inverse_axes`
-        has the three factors.
+        The field changes by d1 along edge 1 of the face, and by d2 along edge 2. Edge 2
+        is `along` times edge 1 plus a height across it. So the field changes by d1 /
+        length per unit along edge 1, and by (d2 - along d1) / height across.
         """
         inverse_axes = self._inverse_axes.to(field.device)
+        # (F, 1) each: 1 / length, along, and 1 / height
+        inverse_length, along, inverse_height = inverse_axes.split(1, dim=1)
         face_corners = self._faces.to(field.device)
         corners = [field.index_select(0, corner) for corner in face_corners.T]
         d1 = corners[1] - corners[0]
         d2 = corners[2] - corners[0]
-        gradient_1 = d1 * inverse_axes[:, :1]
-        gradient_2 = (d2 - d1 * inverse_axes[:, 1:2]) * inverse_axes[:, 2:]
-        return (gradient_1.square() + gradient_2.square()).sum(dim=1)
+        along_gradient = d1 * inverse_length
+        across_gradient = (d2 - d1 * along) * inverse_height
+        squared_norm: Tensor = along_gradient.square() + across_gradient.square()
+        return squared_norm.sum(dim=1)
 
     def limit(self, field: Tensor) -> Tensor:
         """Return offsets (P, 3) within all bounds for a field d (P, 3), float64.
@@ -603,11 +612,15 @@ class GeometryControl(Control):
                 compute_shape_modes(self._mesh, int(self.chosen["modes"]))
             )
             group = Group("amplitudes", modes.shape[2], ESTIMATORS)
-            self._field: Callable[[Tensor], Tensor] = lambda a: modes.to(a.device) @ a
+            self._field: Callable[[Tensor], Tensor] = lambda amplitudes: (
+                modes.to(amplitudes.device) @ amplitudes
+            )
         else:
             precondition = Preconditioner(welded_mesh)
             group = Group("pushes", 3 * len(welded_mesh.positions), ESTIMATORS)
-            self._field = lambda a: PUSH_FACTOR * precondition(a.reshape(-1, 3))
+            self._field = lambda pushes: (
+                PUSH_FACTOR * precondition(pushes.reshape(-1, 3))
+            )
         self.groups = (group,)
         self.start = torch.full((group.size,), 0.5)
 

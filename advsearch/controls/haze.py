@@ -59,28 +59,31 @@ class HazeControl(Control):
     )
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
-        """Return a parameter with the value of the scene's own haze, if it has one.
-
-        Without one the density is 0 in the clean scene; but if only the color is
-        searched, it is `DEFAULT_DENSITY`, since the color would not show otherwise. The
-        adjoint of a density needs a range that does not begin at 0.
-        """
+        """Return a parameter with the value of the scene's own haze, if it has one."""
         scene_haze = _find_haze(self.scene)
+        if parameter.name == "density":
+            return self._resolve_density(parameter, scene_haze)
+        if scene_haze is None:
+            return parameter
+        # the others are the channels of the color
+        linear_albedo = np.asarray(scene_haze.albedo, np.float32)
+        albedo = color.linear_to_srgb(linear_albedo).tolist()
+        return replace(parameter, default=albedo[color.CHANNELS.index(parameter.name)])
+
+    def _resolve_density(
+        self, parameter: Parameter, scene_haze: parts.HazePart | None
+    ) -> Parameter:
+        """Return the density with its default and its estimators in this scene.
+
+        Without haze in the scene the default is 0; but if only the color is searched,
+        it is `DEFAULT_DENSITY`, since the color would not show otherwise.
+        """
         default = parameter.default
-        is_color = parameter.name != "density"
-        if is_color:
-            if scene_haze is None:
-                return parameter
-            albedo = color.linear_to_srgb(
-                np.asarray(scene_haze.albedo, np.float32)
-            ).tolist()
-            return replace(
-                parameter, default=albedo[color.CHANNELS.index(parameter.name)]
-            )
         if scene_haze is not None:
             default = scene_haze.density
         elif self.has_requested_search and not self.is_searched("density"):
             default = DEFAULT_DENSITY
+        # the adjoint needs a density over 0
         spec = self.specs.get("density")
         has_adjoint = isinstance(spec, Range) and spec.low > 0.0
         return replace(
@@ -95,7 +98,8 @@ class HazeControl(Control):
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Add a ball of haze, or take over the scene's own."""
-        if (scene_haze := _find_haze(scene)) is not None:
+        scene_haze = _find_haze(scene)
+        if scene_haze is not None:
             renamed = replace(scene_haze, name=self.name)
             return replace(
                 scene,
@@ -105,11 +109,8 @@ class HazeControl(Control):
             )
         # from the origin, the center of the ball
         camera_distance = float(np.linalg.norm(geometry.camera_to_world(scene)[:3, 3]))
-        return scene.with_part(
-            parts.HazePart(
-                self.name, max(MIN_RADIUS, CAMERA_DISTANCE_FACTOR * camera_distance)
-            )
-        )
+        radius = max(MIN_RADIUS, CAMERA_DISTANCE_FACTOR * camera_distance)
+        return scene.with_part(parts.HazePart(self.name, radius))
 
     def scene_inputs(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]

@@ -138,13 +138,18 @@ class LensControl(Control):
         return {self.name: draw_dots(checkerboard, self._spread_dots(values))}
 
     def _spread_dots(self, values: Values) -> dict[str, Tensor]:
-        """Return the values, with the dots spread along an axis that was not set."""
+        """Return the values, with the dots spread along an axis that stays fixed.
+
+        An axis that was not set is fixed if other parameters are searched, and then all
+        dots have the same default there. A searched axis starts spread already.
+        """
+        if not self.has_requested_search:
+            return dict(values)
+        positions = spread_positions(self.n_dots)
         spread_values = dict(values)
         for axis, name in enumerate(POSITION_PARAMETERS):
-            if self.has_requested_search and name not in self.specs:
-                spread_values[name] = spread_positions(self.n_dots)[axis].to(
-                    values[name].device
-                )
+            if name not in self.specs:
+                spread_values[name] = positions[axis].to(values[name].device)
         return spread_values
 
 

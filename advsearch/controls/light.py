@@ -50,13 +50,14 @@ def compute_metered_irradiance(scene: SceneDescription) -> float:
 def _make_coordinate(
     name: str, low: float, high: float, default: float, description: str
 ) -> Parameter:
-    """Return a parameter for a coordinate of the lamp."""
+    """Return a parameter for a coordinate of the lamp, searched from `low` to `high`."""
+    limit = 1000.0
     return Parameter.moving(
         ("differences",),
         name,
         "object sizes",
-        -1000.0,
-        1000.0,
+        -limit,
+        limit,
         default,
         description,
         (low, high),
@@ -145,8 +146,8 @@ class LightControl(Control):
     ) -> dict[str, Tensor]:
         """Return where the lamp is, and how bright.
 
-        A power of 1 is the metered irradiance of the scene at a distance of 1; a ball
-        of the same intensity has that over its area as seen from afar.
+        At a distance of 1, a power of 1 is the scene's metered irradiance: that which
+        shows a white surface just below white.
         """
         position = torch.stack([values[axis] for axis in ("x", "y", "z")])
         intensity = (
@@ -160,6 +161,8 @@ class LightControl(Control):
                 f"{self.name}.intensity": intensity,
             }
         radius = values["size"] / 2.0
+        # A ball with the intensity of a point: its radiance times the disk that it
+        # covers from afar.
         return {
             f"{self.name}.ball": make_ball_pose(position, radius),
             f"{self.name}.radiance": intensity / (math.pi * radius**2),

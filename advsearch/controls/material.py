@@ -137,14 +137,14 @@ def _clouds(
     return total / (2.0 - 0.5 ** (octaves - 1))
 
 
-def _warped(grid: Grid, cells: int, amount: float, seed: int) -> Grid:
+def _warp_grid(grid: Grid, cells: int, amount: float, seed: int) -> Grid:
     """Return coordinates displaced by up to about `amount` by noise."""
     right = _clouds(grid, cells=(cells, cells), octaves=2, seed=seed)
     down = _clouds(grid, cells=(cells, cells), octaves=2, seed=seed + 7)
     return grid[0] + amount * right, grid[1] + amount * down
 
 
-def _scattered(count: int, seed: int) -> Float64Array:
+def _scatter_points(count: int, seed: int) -> Float64Array:
     """Return irregular points of a torus, far from each other: (count, 2) in [0, 1).
 
     Best candidate sampling (Mitchell 1991): each point is the farthest from those
@@ -162,13 +162,20 @@ def _scattered(count: int, seed: int) -> Float64Array:
     return np.asarray(points)
 
 
-def _cells(
+def _find_nearest_points(
     grid: Grid, points: Float64Array, count: int = 2
 ) -> tuple[Float64Array, npt.NDArray[np.int64]]:
-    """Return the nearest points on the torus, nearest first.
+    """Find the points that are nearest to each texel of a tile, nearest first.
+
+    The tile is a torus: distances go on across its borders.
+
+    Args:
+        grid: coordinates of the texels, in tiles.
+        points: (N, 2) in [0, 1).
+        count: how many of the nearest points are returned.
 
     Returns:
-        Distances (SIDE, SIDE, count), and indices of the points.
+        Distances (SIDE, SIDE, count) in tiles, and indices of the points.
     """
     positions = np.stack([grid[0] % 1.0, grid[1] % 1.0], axis=-1)
     # the tree wants positions below 1, to which a remainder may be rounded
@@ -177,7 +184,7 @@ def _cells(
     return np.asarray(distance), np.asarray(index, dtype=np.int64)
 
 
-def _turing(
+def _grow_turing_pattern(
     wavelength: tuple[float, float], bias: float, seed: int, rounds: int = 12
 ) -> Float64Array:
     """Return animal stripes or spots (SIDE, SIDE) in [-1, 1].
@@ -262,12 +269,11 @@ def wood(grid: Grid) -> Float64Array:
     late_wood = _step(phase, edge=0.66, soft=0.6) * (
         1.0 - _step(phase, edge=0.96, soft=0.08)
     )
-    fibre = _noise((x + 0.6 * bend, y), cells=(120, 3), seed=13) + 0.6 * _noise(
-        (x + 0.6 * bend, y), cells=(240, 5), seed=18
+    bent_grid = (x + 0.6 * bend, y)
+    fibre = _noise(bent_grid, cells=(120, 3), seed=13) + 0.6 * _noise(
+        bent_grid, cells=(240, 5), seed=18
     )
-    pores = _step(
-        _noise((x + 0.6 * bend, y), cells=(170, 12), seed=14), edge=0.5, soft=0.2
-    )
+    pores = _step(_noise(bent_grid, cells=(170, 12), seed=14), edge=0.5, soft=0.2)
     tone = (
         0.30
         + 0.42 * late_wood
@@ -287,8 +293,8 @@ def marble(grid: Grid) -> Float64Array:
 
     Numbers are chosen by eye.
     """
-    warped = _warped(grid, cells=2, amount=0.22, seed=21)
-    finely_warped = _warped(warped, cells=6, amount=0.03, seed=22)
+    warped = _warp_grid(grid, cells=2, amount=0.22, seed=21)
+    finely_warped = _warp_grid(warped, cells=6, amount=0.03, seed=22)
     x, y = finely_warped
     clouds = 0.5 + 0.5 * _clouds(warped, cells=(3, 3), octaves=4, seed=25)
     veins = np.zeros((TILE_SIDE, TILE_SIDE))
@@ -327,7 +333,7 @@ def brick(grid: Grid) -> Float64Array:
 
     Numbers are chosen by eye.
     """
-    x, y = _warped(grid, cells=12, amount=0.0035, seed=31)
+    x, y = _warp_grid(grid, cells=12, amount=0.0035, seed=31)
     rows = 8
     columns = 4
     row = np.floor(y * rows)
@@ -370,7 +376,7 @@ def fabric(grid: Grid) -> Float64Array:
 
     Numbers are chosen by eye.
     """
-    x, y = _warped(grid, cells=6, amount=0.004, seed=41)
+    x, y = _warp_grid(grid, cells=6, amount=0.004, seed=41)
     count = 16
     thread_x = x * count
     thread_y = y * count
@@ -390,13 +396,13 @@ def fabric(grid: Grid) -> Float64Array:
         _noise((x, y), cells=(count, count * 8), seed=43),
     )
     generator = np.random.Generator(np.random.PCG64(44))
-    warp = _color("b9a77f") * _thread_tones(generator, thread_x, count)
-    weft = _color("3f5f86") * _thread_tones(generator, thread_y, count)
+    warp = _color("b9a77f") * _draw_thread_tones(generator, thread_x, count)
+    weft = _color("3f5f86") * _draw_thread_tones(generator, thread_y, count)
     thread = np.where(warp_is_over[..., None], warp, weft)
     return thread * (0.25 + 0.75 * height**0.7 + 0.14 * fibres)[..., None]
 
 
-def _thread_tones(
+def _draw_thread_tones(
     generator: np.random.Generator, position: Float64Array, count: int
 ) -> Float64Array:
     """Return the random tone (SIDE, SIDE, 1) of the thread that each texel is in."""
@@ -410,17 +416,19 @@ def leopard(grid: Grid) -> Float64Array:
 
     Numbers are chosen by eye, lengths in tiles.
     """
-    warped = _warped(
-        _warped(grid, cells=4, amount=0.03, seed=51), cells=12, amount=0.012, seed=52
+    warped = _warp_grid(
+        _warp_grid(grid, cells=4, amount=0.03, seed=51), cells=12, amount=0.012, seed=52
     )
-    points = _scattered(count=42, seed=53)
-    distance, index = _cells(warped, points)
+    points = _scatter_points(count=42, seed=53)
+    distance, index = _find_nearest_points(warped, points)
     rosettes, core = _draw_rosettes(warped, points, distance[..., 0], index[..., 0])
     fur = _clouds(grid, cells=(24, 90), octaves=2, seed=55)
     shade = 0.5 + 0.5 * _clouds(grid, cells=(3, 3), octaves=2, seed=56)
     coat = _mix(_color("d8a861"), _color("e7c58c"), shade)
     coat = _mix(coat, _color("a9692f"), 0.75 * core)
-    dot_distance, _ = _cells(warped, _scattered(count=150, seed=57), 1)
+    dot_distance, _ = _find_nearest_points(
+        warped, _scatter_points(count=150, seed=57), 1
+    )
     between_rosettes = _step(distance[..., 0], edge=0.07, soft=0.012)
     dots = 1.0 - _step(
         dot_distance.reshape(TILE_SIDE, TILE_SIDE), edge=0.011, soft=0.006
@@ -459,14 +467,13 @@ def _draw_rosettes(
     ring = _step(radius, edge=0.031, soft=0.008) * (
         1.0 - _step(radius, edge=outer_edge, soft=0.008)
     )
-    return ring * _step(waves, edge=-0.75, soft=0.5), 1.0 - _step(
-        radius, edge=0.042, soft=0.02
-    )
+    core = 1.0 - _step(radius, edge=0.042, soft=0.02)
+    return ring * _step(waves, edge=-0.75, soft=0.5), core
 
 
 @register_pattern(0.8, roughness=0.8, specular=0.2)
 def zebra(grid: Grid) -> Float64Array:
-    stripes = _turing((0.42, 0.125), 0.0, 61)
+    stripes = _grow_turing_pattern((0.42, 0.125), 0.0, 61)
     black = _step(
         stripes + 0.12 * _noise(grid, cells=(10, 40), seed=62), edge=0.0, soft=0.7
     )
@@ -487,7 +494,7 @@ def rust(grid: Grid) -> Float64Array:
 
     Numbers are chosen by eye.
     """
-    warped = _warped(grid, cells=4, amount=0.06, seed=71)
+    warped = _warp_grid(grid, cells=4, amount=0.06, seed=71)
     broad = 0.5 + 0.5 * _clouds(warped, cells=(3, 3), octaves=5, seed=72)
     grain = _clouds(grid, cells=(48, 48), octaves=3, seed=73)
     tone = np.clip(1.5 * (broad - 0.5) + 0.5 + 0.22 * grain, 0.0, 1.0)
@@ -497,7 +504,7 @@ def rust(grid: Grid) -> Float64Array:
         + 0.05 * _clouds(grid, cells=(20, 20), octaves=2, seed=74)[..., None]
     )
     flakes = _clouds(
-        _warped(warped, cells=16, amount=0.015, seed=75),
+        _warp_grid(warped, cells=16, amount=0.015, seed=75),
         cells=(4, 4),
         octaves=4,
         seed=76,
@@ -585,18 +592,18 @@ def elephant(grid: Grid) -> Float64Array:
 
     Numbers are chosen by eye.
     """
-    warped = _warped(
-        _warped(grid, cells=3, amount=0.05, seed=91), cells=14, amount=0.012, seed=92
+    warped = _warp_grid(
+        _warp_grid(grid, cells=3, amount=0.05, seed=91), cells=14, amount=0.012, seed=92
     )
     folds = np.zeros((TILE_SIDE, TILE_SIDE))
     for count, width, depth, seed in ((45, 0.013, 0.75, 93), (320, 0.006, 0.42, 94)):
-        points = _scattered(count, seed)
-        distance, _ = _cells(warped, points)
+        points = _scatter_points(count, seed)
+        distance, _ = _find_nearest_points(warped, points)
         # folds run where the two nearest points are equally far
         folds += depth * np.exp(-(((distance[..., 1] - distance[..., 0]) / width) ** 2))
     long_folds = np.abs(
         _clouds(
-            _warped(grid, cells=5, amount=0.04, seed=95),
+            _warp_grid(grid, cells=5, amount=0.04, seed=95),
             cells=(3, 14),
             octaves=3,
             seed=96,
@@ -660,7 +667,7 @@ def make_covering(mesh: Mesh, name: str, side: int = TILE_SIDE) -> Float32Array:
     Returns:
         (side, side, 3) float32 display-referred sRGB in [0, 1], row 0 at v = 1.
     """
-    positions, normals = _texel_surface(mesh, side)
+    positions, normals = _compute_texel_surface(mesh, side)
     scale = TILE_SIDE / PATTERNS[name].size
     weights = np.abs(normals) ** BLEND_EXPONENT
     weights /= weights.sum(axis=-1, keepdims=True)
@@ -675,7 +682,7 @@ def make_covering(mesh: Mesh, name: str, side: int = TILE_SIDE) -> Float32Array:
 
 
 @lru_cache(maxsize=2)
-def _texel_surface(mesh: Mesh, side: int) -> tuple[Float32Array, Float32Array]:
+def _compute_texel_surface(mesh: Mesh, side: int) -> tuple[Float32Array, Float32Array]:
     """Positions and normals (side, side, 3) behind the texels of a mesh."""
     charts = rasterize_charts(mesh, side)
     return charts.compute_positions(), charts.compute_normals()
@@ -706,10 +713,9 @@ class MaterialControl(Control):
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Check that the mesh has a principled surface. Raises InputError."""
-        varied = [name for name in SURFACE_PARAMETERS if self._is_set(name)]
-        if self.get_mesh(scene).surface is not None and (
-            varied or self._material_names != (OBJECT_SURFACE,)
-        ):
+        varies_surface = any(self._is_set(name) for name in SURFACE_PARAMETERS)
+        has_mitsuba_surface = self.get_mesh(scene).surface is not None
+        if has_mitsuba_surface and (varies_surface or self._may_change_material):
             raise InputError(
                 f"`controls` {self.name}: the {self.mesh} has a surface of Mitsuba's "
                 "own; search red, green or blue, "
@@ -727,22 +733,17 @@ class MaterialControl(Control):
         """
         if parameter.name not in SURFACE_PARAMETERS:
             return parameter
-        first = (
-            OBJECT_SURFACE
-            if OBJECT_SURFACE in self._material_names
-            else str(self._material_names[0])
-        )
-        return replace(
-            parameter, default=float(getattr(self._get_material(first), parameter.name))
-        )
+        name = str(self._material_names[0])
+        if OBJECT_SURFACE in self._material_names:
+            name = OBJECT_SURFACE
+        material = self._get_material(name)
+        return replace(parameter, default=float(getattr(material, parameter.name)))
 
     def get_scene_value(self, parameter: Parameter) -> ParameterValue:
-        is_requested = self.setting_name(parameter) in self.scene.requested
-        return (
-            self.scene.get_number(self.setting_name(parameter))
-            if is_requested
-            else parameter.default
-        )
+        setting = self.setting_name(parameter)
+        if setting in self.scene.requested:
+            return self.scene.get_number(setting)
+        return parameter.default
 
     @property
     def refines(self) -> frozenset[str]:
@@ -758,17 +759,16 @@ class MaterialControl(Control):
         for name in SURFACE_PARAMETERS:
             if self._is_set(name):
                 inputs[f"{self.mesh}.{name}"] = values[name].reshape(1)
-            elif self._material_names != (OBJECT_SURFACE,):
-                inputs[f"{self.mesh}.{name}"] = values["which"].new_tensor(
-                    [float(getattr(material, name))]
-                )
+            elif self._may_change_material:
+                number = float(getattr(material, name))
+                inputs[f"{self.mesh}.{name}"] = values["which"].new_tensor([number])
         if self._changes_color():
             mesh = self.get_mesh(self.scene)
             tint = color.combine_channels(values)
-            # what the controls before made of the texture
+            # what the controls before made of the texture, which a pattern replaces
             base = earlier_inputs.get(self._base_color)
             if which != OBJECT_SURFACE:
-                base = _linear_covering(mesh.mesh, which)
+                base = _make_linear_covering(mesh.mesh, which)
             elif base is None:
                 base = srgb_to_linear(torch.from_numpy(mesh.base_color.copy()))
             inputs[self._base_color] = tint * base.to(tint.device)
@@ -794,6 +794,11 @@ class MaterialControl(Control):
     def _material_names(self) -> tuple[ParameterValue, ...]:
         return self.list_allowed_values("which", OBJECT_SURFACE)
 
+    @property
+    def _may_change_material(self) -> bool:
+        """Whether another material than the object's own surface can be chosen."""
+        return self._material_names != (OBJECT_SURFACE,)
+
     def _is_set(self, name: str) -> bool:
         """Return whether a parameter was set or is searched.
 
@@ -802,18 +807,15 @@ class MaterialControl(Control):
         return name in self.specs or not self.has_requested_search
 
     def _changes_color(self) -> bool:
-        return self._material_names != (OBJECT_SURFACE,) or any(
-            self._is_set(name) for name in CHANNELS
-        )
+        is_tinted = any(self._is_set(name) for name in CHANNELS)
+        return self._may_change_material or is_tinted
 
     def _get_material(self, which: str) -> Material:
-        return (
-            self.get_mesh(self.scene).material
-            if which == OBJECT_SURFACE
-            else PATTERNS[which].material
-        )
+        if which == OBJECT_SURFACE:
+            return self.get_mesh(self.scene).material
+        return PATTERNS[which].material
 
 
 @lru_cache(maxsize=len(PATTERNS))
-def _linear_covering(mesh: Mesh, which: str) -> Tensor:
+def _make_linear_covering(mesh: Mesh, which: str) -> Tensor:
     return srgb_to_linear(torch.from_numpy(make_covering(mesh, which)))

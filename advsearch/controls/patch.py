@@ -167,25 +167,10 @@ class PatchControl(PictureControl):
             InputError: they do not.
         """
         super().__init__(name, **settings)
-        pixels = self.specs.get("pixels")
-        picture = self.chosen["picture"]
-        if pixels is not None and picture is not None:
-            raise InputError(
-                f"{self.name}.pixels: expected none beside "
-                f"{self.name}.picture; leave one of them out"
-            )
-        # distributions are subclasses of Range
-        is_plain_range = type(pixels) is Range
-        if pixels is not None and not isinstance(pixels, Fixed) and not is_plain_range:
-            got = "a distribution"
-            if isinstance(pixels, OneOf):
-                got = f"a list of {len(pixels.values)}"
-            raise InputError(
-                f"{self.name}.pixels: expected [low, high] or one number, got {got}"
-            )
+        self._check_pixels()
         if self.is_searched_image:
             return
-        fixing_setting = "pixels" if picture is None else "picture"
+        fixing_setting = "pixels" if self.chosen["picture"] is None else "picture"
         for ball_setting in ("epsilon", "norm"):
             # "box" is the norm of no ball
             if self.chosen[ball_setting] not in (None, "box"):
@@ -194,6 +179,29 @@ class PatchControl(PictureControl):
                     "stay in, and these are fixed; leave it out, "
                     f"or leave out {self.name}.{fixing_setting}"
                 )
+
+    def _check_pixels(self) -> None:
+        """Check that the pixels are a range or one number, and not beside a picture.
+
+        Raises InputError: they are not.
+        """
+        pixels = self.specs.get("pixels")
+        if pixels is None:
+            return
+        if self.chosen["picture"] is not None:
+            raise InputError(
+                f"{self.name}.pixels: expected none beside "
+                f"{self.name}.picture; leave one of them out"
+            )
+        # distributions are subclasses of Range
+        is_plain_range = type(pixels) is Range
+        if not isinstance(pixels, Fixed) and not is_plain_range:
+            got = "a distribution"
+            if isinstance(pixels, OneOf):
+                got = f"a list of {len(pixels.values)}"
+            raise InputError(
+                f"{self.name}.pixels: expected [low, high] or one number, got {got}"
+            )
 
     def check_choices(self) -> None:
         """Let an epsilon without a norm mean the norm linf, and reject one with box."""
@@ -218,9 +226,6 @@ class PatchControl(PictureControl):
     def fit(self) -> None:
         """Prepare the painter, and let searched pixels start as the texture underneath.
 
-        Colors of the texture outside the range of the pixels are clipped to it, and the
-        start is recorded as an adjusted default.
-
         Raises:
             InputError: nothing is searched.
         """
@@ -244,19 +249,25 @@ class PatchControl(PictureControl):
         }
         self._painter = PatchPainter(self.scene, start_values, side)
         if isinstance(pixels.spec, Range):
-            low = pixels.spec.low
-            high = pixels.spec.high
-            # (side, side, 3), as fractions of the range
-            underneath = (self._painter.sample_underneath() - low) / (high - low)
-            # the pixels' coordinates come first
-            start = underneath.clamp(0.0, 1.0)
-            self.start[: pixels.n_coordinates] = start.reshape(-1)
-            if not torch.allclose(start, underneath, atol=1e-5):
-                self.record_adjusted_default(
-                    pixels.parameter,
-                    "the texture underneath",
-                    f"the nearest {pixels.spec}",
-                )
+            self._start_as_underneath(pixels.parameter, pixels.spec)
+
+    def _start_as_underneath(self, parameter: Parameter, pixel_range: Range) -> None:
+        """Let searched pixels start as the texture underneath the patch.
+
+        Colors outside their range are clipped to it, and the start is recorded as an
+        adjusted default. `parameter` is that of the pixels.
+        """
+        low = pixel_range.low
+        high = pixel_range.high
+        # (side, side, 3), as fractions of the range
+        underneath = (self._painter.sample_underneath() - low) / (high - low)
+        start = underneath.clamp(0.0, 1.0)
+        # the pixels' coordinates come first
+        self.start[: start.numel()] = start.reshape(-1)
+        if not torch.allclose(start, underneath, atol=1e-5):
+            self.record_adjusted_default(
+                parameter, "the texture underneath", f"the nearest {pixel_range}"
+            )
 
     def must_match_scene(
         self, parameter: Parameter, spec: Fixed | Range | OneOf
@@ -449,6 +460,7 @@ class PatchPainter:
         else:
             base = _resize_to_square(base, len(self._object_color))
         size = numbers["size"]
+        # in the order of the arguments of `_find_nearby_texels`
         texels = self._find_texels(
             *(float(numbers[name].detach()) for name in ("azimuth", "height", "size"))
         )

@@ -70,8 +70,8 @@ class PoseControl(Control):
     ) -> dict[str, Tensor]:
         """Return the pose of the mesh, scaled and turned about its center.
 
-        On the ground its lowest point is at its former height plus z, however it
-        turns; else its center is.
+        z is added to the former height of its lowest point if it stays on the ground
+        however it is turned, and otherwise to the former height of its center.
         """
         mesh = self.get_mesh(self.scene)
         device = values["scale"].device
@@ -85,15 +85,16 @@ class PoseControl(Control):
             values["yaw"], values["pitch"], values["roll"]
         )
         linear = values["scale"] * rotation
-        # height of the lowest point over the center
+        # height of the lowest point over the center, negative
         if self.chosen["on_ground"] in ("yes", True):
-            # of the mesh as it is turned and scaled
+            # that of the turned and scaled mesh: its lowest point is put on the floor
             lowest = ((vertices - center) @ linear[2]).amin()
         else:
+            # that of the mesh as it was: the center keeps its height
             lowest = floor - center[2]
-        shift = torch.stack([values["x"], values["y"], floor + values["z"] - lowest])
-        # Turned about its center, the mesh stays above where that was; the height of
-        # the center is in `shift`.
+        center_height = floor + values["z"] - lowest
+        # x and y are shifts of the center; its height is absolute.
+        shift = torch.stack([values["x"], values["y"], center_height])
         level_center = torch.cat([center[:2], center.new_zeros(1)])
         translation = shift - linear @ center + level_center
         return {f"{mesh.name}.to_world": make_affine(linear, translation) @ base}

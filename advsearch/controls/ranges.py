@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, TypeGuard
@@ -297,12 +298,13 @@ def _explain_turn(parameter: Parameter, low: float, high: float) -> str:
     range is shifted by a turn, so that it ascends and stays within the parameter's
     bounds.
     """
+    # a turn back, or if the parameter does not go so far, on
     begin = low
     end = high + FULL_TURN
     if low - FULL_TURN >= parameter.low:
         begin = low - FULL_TURN
         end = high
-    # where the shorter range crosses the full turn, as an angle within it
+    # the multiple of a turn inside the range, by which messages name it
     through = 0 if begin <= 0 else FULL_TURN
     return (
         f"write [{begin:g}, {end:g}] for the {FULL_TURN - low + high:g} "
@@ -588,14 +590,7 @@ def parse_distribution(
         # whether the distribution ends below and above
         has_end = np.isfinite(frozen.ppf(np.array([0.0, 1.0])))
     if outside > MAX_OUTSIDE_PROBABILITY:
-        raise InputError(
-            f"{label}: {100.0 * outside:.3g} % of {text} lies outside of "
-            f"{parameter.low:g} to {parameter.high:g} "
-            f"({parameter.unit}), and at most {100.0 * MAX_OUTSIDE_PROBABILITY:g} % is "
-            "cut off; "
-            "choose a narrower one, or cut it "
-            "yourself (truncnorm)"
-        )
+        raise _make_outside_error(label, parameter, text, outside)
     # an infinite tail is cut off
     lower_probability = max(lower_probability, 0.0 if has_end[0] else TAIL_PROBABILITY)
     upper_probability = min(
@@ -604,13 +599,32 @@ def parse_distribution(
     return _make_range(label, frozen.ppf, lower_probability, upper_probability, text)
 
 
+def _make_outside_error(
+    label: str, parameter: Parameter, text: str, outside: float
+) -> InputError:
+    """Return the error that a distribution reaches too far beyond a parameter's bounds.
+
+    `text` is the distribution as messages write it, and `outside` the probability of
+    values out of the bounds.
+    """
+    return InputError(
+        f"{label}: {100.0 * outside:.3g} % of {text} lies outside of "
+        f"{parameter.low:g} to {parameter.high:g} "
+        f"({parameter.unit}), and at most {100.0 * MAX_OUTSIDE_PROBABILITY:g} % is "
+        "cut off; "
+        "choose a narrower one, or cut it "
+        "yourself (truncnorm)"
+    )
+
+
 def _freeze_distribution(
     where: str, name: object, arguments: Mapping[str, Any]
 ) -> tuple[Any, str]:
     """Return a distribution of scipy with its arguments, and how messages write it.
 
-    Raises UnknownNameError or InputError: there is none of that name, or it does not
-    take the arguments.
+    Raises:
+        UnknownNameError: scipy has none of that name.
+        InputError: it does not take the arguments.
     """
     # takes a quarter of a second, and few runs draw by a distribution
     from scipy import stats
@@ -623,19 +637,14 @@ def _freeze_distribution(
             COMMON_DISTRIBUTIONS,
             "It is one of scipy.stats, of real numbers.",
         )
-    written = []
-    for key, value in arguments.items():
-        is_number = Parameter.is_number(value)
-        written.append(f"{key}={value:g}" if is_number else f"{key}={value!r:.20}")
-    text = f"{name}({', '.join(written)})"
-    try:
-        if not all(map(Parameter.is_number, arguments.values())):
-            raise TypeError("expected numbers")
-        frozen = family(**arguments)
-        # with arguments out of range, scipy's median is NaN
-        is_valid = np.isfinite(frozen.ppf(0.5))
-    except TypeError:
-        is_valid = False
+    text = f"{name}({_format_arguments(arguments)})"
+    frozen = None
+    is_valid = False
+    if all(map(Parameter.is_number, arguments.values())):
+        with suppress(TypeError):  # it has no such arguments, or lacks one
+            frozen = family(**arguments)
+            # with arguments out of range, scipy's median is NaN
+            is_valid = bool(np.isfinite(frozen.ppf(0.5)))
     if not is_valid:
         shapes = f"{family.shapes}, " if family.shapes else ""
         raise InputError(
@@ -643,6 +652,15 @@ def _freeze_distribution(
             f"{shapes}loc, scale, got {text}"
         )
     return frozen, text
+
+
+def _format_arguments(arguments: Mapping[str, Any]) -> str:
+    """Return arguments as ``loc=0, scale=2``; what is no number is cut short."""
+    written = []
+    for key, value in arguments.items():
+        is_number = Parameter.is_number(value)
+        written.append(f"{key}={value:g}" if is_number else f"{key}={value!r:.20}")
+    return ", ".join(written)
 
 
 def _read_python_quantiles(
@@ -668,7 +686,20 @@ def _read_python_quantiles(
     probabilities = np.linspace(
         lower_probability, upper_probability, N_CHECKED_QUANTILES
     )
-    values = quantiles(probabilities)
+    _check_quantiles(label, parameter, name, quantiles(probabilities))
+    return _make_range(
+        label, quantiles, float(probabilities[0]), float(probabilities[-1]), name
+    )
+
+
+def _check_quantiles(
+    label: str, parameter: Parameter, name: str, values: NDArray[np.float64]
+) -> None:
+    """Check the values (n,) of an inverse CDF at ascending probabilities.
+
+    Raises InputError: they leave the parameter's bounds, or fall. `name` is that of the
+    function.
+    """
     is_inside = (values >= parameter.low) & (values <= parameter.high)
     if not is_inside.all():
         raise InputError(
@@ -684,9 +715,6 @@ def _read_python_quantiles(
             f"{values[index]:g} and then "
             f"{values[index + 1]:g} of {name}"
         )
-    return _make_range(
-        label, quantiles, float(probabilities[0]), float(probabilities[-1]), name
-    )
 
 
 def _make_range(

@@ -156,17 +156,16 @@ class ShadowControl(Control):
         """Return a parameter, with the direction of the strongest light as the
         default.
         """
-        x, y, z = find_strongest_light(self.scene)[0]
+        light_direction, _ = find_strongest_light(self.scene)
+        x, y, z = light_direction
         match parameter.name:
             case "radii":
                 return replace(parameter, shape=(int(self.chosen["corners"]),))
             case "azimuth":
                 return replace(parameter, default=math.degrees(math.atan2(y, x)))
             case "elevation":
-                return replace(
-                    parameter,
-                    default=max(math.degrees(math.asin(min(z, 1.0))), MIN_ELEVATION),
-                )
+                elevation = math.degrees(math.asin(min(z, 1.0)))
+                return replace(parameter, default=max(elevation, MIN_ELEVATION))
         return parameter
 
     def scene_inputs(
@@ -256,16 +255,20 @@ class ShadowControl(Control):
             .numpy()
         )
         cone_angle = self._image_cone_angle(earlier_inputs)
-        # [1] is the lamp's distance
-        max_distance = MAX_LAMP_FRACTION * find_strongest_light(self.scene)[1]
+        max_distance = self._compute_max_distance()
         for factor in np.geomspace(1.0, MAX_DISTANCE_FACTOR, N_DISTANCES):
             distance = min(requested * factor, max_distance)
             card = geometry.compute_center(self.scene) + distance * outwards + offset
-            # a row times the rotation is its transpose, the inverse, times the column
+            # into the camera's axes, the columns of its pose
             in_camera = (card - camera[:3, 3]) @ camera[:3, :3]
             if _is_outside_cone(in_camera, size, cone_angle):
                 return float(distance)
         return None
+
+    def _compute_max_distance(self) -> float:
+        """Return the distance up to which the card stays nearer than the lamp."""
+        _, lamp_distance = find_strongest_light(self.scene)
+        return MAX_LAMP_FRACTION * lamp_distance
 
     def _image_cone_angle(self, earlier_inputs: Mapping[str, Tensor]) -> float:
         """Return the angle of the image's corners from the camera's axis, radians."""

@@ -46,6 +46,7 @@ SUN_UNIT_FACTOR = 467.069280386
 """Factor from the unit of the sun's coefficients to that of the sky's, as in Mitsuba's
 plugin.
 """
+SUN_PIECES = 45  # pieces of the sun's model, by its elevation
 TURBIDITIES = (1.0, 10.0)  # what the coefficients cover
 EPSILON = 1e-12
 
@@ -84,16 +85,19 @@ def _at_turbidity(table: Tensor, turbidity: Tensor) -> Tensor:
     the ends. The authors of the table interpolate linearly: then the derivative jumps
     at integers, the default of 3 among them.
     """
-    below = min(8, max(0, int(turbidity.detach()) - 1))
+    last = len(table) - 1
+    # Row 0 is turbidity 1. At the last row the one before it, which has a next one.
+    below = min(last - 1, max(0, int(turbidity.detach()) - 1))
     t = turbidity - 1.0 - below  # from 0 at the entry below to 1 at the next
     lower = table[below]
     upper = table[below + 1]
     slopes = []
     for index in (below, below + 1):
         before = max(0, index - 1)
-        after = min(9, index + 1)
+        after = min(last, index + 1)
         slopes.append((table[after] - table[before]) / (after - before))
-    # the spline, as a correction of the straight line
+    # The straight line between both entries, and a cubic that is 0 at both and gives
+    # the curve the two slopes there.
     rise = upper - lower
     return torch.lerp(lower, upper, t) + t * (1.0 - t) * (
         (1.0 - t) * (slopes[0] - rise) - t * (slopes[1] - rise)
@@ -103,24 +107,26 @@ def _at_turbidity(table: Tensor, turbidity: Tensor) -> Tensor:
 def compute_sun_irradiance(elevation: Tensor, turbidity: Tensor) -> Tensor:
     """Return the sun's irradiance (3,) on a surface that faces it.
 
-    Its unit is that of the sky's radiance times steradian. The model has 45 pieces,
-    whose bounds are even in the cube root of the elevation. A piece is a cubic in the
-    elevation above its lower bound. A term cos(psi)^j of the darkening towards the limb
-    has the mean 2 / (j + 2) over the disk.
+    Its unit is that of the sky's radiance times steradian. The model of the radiance
+    has `SUN_PIECES` pieces, whose bounds are even in the cube root of the elevation. A
+    piece is a cubic in the elevation above its lower bound, for each of 6 powers of
+    cos(psi), by which the disk darkens towards its limb.
     """
     radians = torch.deg2rad(elevation)
     fraction = float(radians.detach()) / (math.pi / 2.0)
-    piece = min(44, int(45.0 * max(0.0, fraction) ** (1.0 / 3.0)))
-    above = radians - (math.pi / 2.0) * (piece / 45.0) ** 3
-    terms = _at_turbidity(load_tables(radians.device)[2], turbidity)[piece]
-    limb = torch.tensor(
+    piece = min(SUN_PIECES - 1, int(SUN_PIECES * max(0.0, fraction) ** (1.0 / 3.0)))
+    above = radians - (math.pi / 2.0) * (piece / SUN_PIECES) ** 3
+    _, _, sun_table = load_tables(radians.device)
+    # (channel, power of the elevation, power of cos(psi))
+    terms = _at_turbidity(sun_table, turbidity)[piece]
+    elevation_powers = torch.stack([above**power for power in range(4)])
+    # the means of the powers of cos(psi) over the disk
+    limb_means = torch.tensor(
         [2.0 / (power + 2.0) for power in range(6)], device=radians.device
     )
-    powers = torch.stack([above**power for power in range(4)])
+    radiance = torch.einsum("ckj,k,j->c", terms, elevation_powers, limb_means)
     solid_angle = 2.0 * math.pi * (1.0 - math.cos(REAL_SUN_RADIUS))
-    return (
-        torch.einsum("ckj,k,j->c", terms, powers, limb) * solid_angle * SUN_UNIT_FACTOR
-    ).clamp_min(0.0)
+    return (radiance * solid_angle * SUN_UNIT_FACTOR).clamp_min(0.0)
 
 
 class Sky:
@@ -139,23 +145,25 @@ class Sky:
         Row 0 of the map is straight up. `ground` (3,) is the ground's albedo.
         """
         self.ground = ground
-        upper = MAP_ROWS // 2
-        elevation = 90.0 - 180.0 * torch.arange(upper, device=ground.device) / (
-            MAP_ROWS - 1
-        )
+        n_upper_rows = MAP_ROWS // 2
+        row = torch.arange(n_upper_rows, device=ground.device)
+        elevation = 90.0 - 180.0 * row / (MAP_ROWS - 1)
         azimuth = (
             90.0
             - 360.0
             * (torch.arange(MAP_COLUMNS, device=ground.device) + 0.5)
             / MAP_COLUMNS
         )
-        rows, columns = torch.meshgrid(elevation, azimuth, indexing="ij")
-        self.directions = (
-            compute_direction(rows * 0.0 + columns, rows).permute(1, 2, 0).contiguous()
-        )
+        # (H, W) each, of the texels
+        elevations, azimuths = torch.meshgrid(elevation, azimuth, indexing="ij")
+        # stored texel by texel, and not as one row that is repeated
+        dense_azimuths = elevations * 0.0 + azimuths
+        directions = compute_direction(dense_azimuths, elevations)  # (3, H, W)
+        self.directions = directions.permute(1, 2, 0).contiguous()
         self.cosines = self.directions[..., 2:3].clamp_min(0.0)
+        # height times width of a texel at the horizon, radians
         texel = (math.pi / (MAP_ROWS - 1)) * (2.0 * math.pi / MAP_COLUMNS)
-        self.solid_angles = torch.cos(torch.deg2rad(rows))[..., None] * texel
+        self.solid_angles = torch.cos(torch.deg2rad(elevations))[..., None] * texel
 
     def compute_dome(self, sun: Tensor, elevation: Tensor, turbidity: Tensor) -> Tensor:
         """Return the radiance of the sky above the horizon, without the sun's disk.
@@ -169,10 +177,11 @@ class Sky:
             (H, W, 3). The letters are the coefficients of Hosek and Wilkie's formula,
                 in the order of its tables.
         """
+        coefficient_table, level_table, _ = load_tables(sun.device)
         a, b, c, d, e, f, g, i, h = self._interpolated(
-            load_tables(sun.device)[0], elevation, turbidity
+            coefficient_table, elevation, turbidity
         ).unbind(-1)
-        level = self._interpolated(load_tables(sun.device)[1], elevation, turbidity)
+        level = self._interpolated(level_table, elevation, turbidity)
         # of the angle between a direction and the sun; `self.cosines` are of that
         # between a direction and the zenith
         cosine = (self.directions @ sun)[..., None]
@@ -333,11 +342,9 @@ class SkyControl(Control):
         """
         super().fit()
         start = self.values(self.start)
-        # the sun's azimuth does not matter
-        arguments = torch.tensor(0.0), start["elevation"], start["turbidity"]
-        self._metered = make_sky(self.scene.ground_color, torch.device("cpu"))(
-            *arguments
-        )[1]
+        sky = make_sky(self.scene.ground_color, torch.device("cpu"))
+        azimuth = torch.tensor(0.0)  # it does not matter
+        _, self._metered = sky(azimuth, start["elevation"], start["turbidity"])
 
     def scene_inputs(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]

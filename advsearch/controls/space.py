@@ -70,10 +70,10 @@ class Space:
 
     @cached_property
     def groups(self) -> tuple[Group, ...]:
-        """Every group of coordinates in the order of u.
+        """Groups of coordinates, in the order of u; their estimators are chosen later.
 
-        They have no estimator yet. The material form is not among the valid ones if the
-        scene does not support it.
+        The valid ones of a group lack "material", the adjoint in material form, if the
+        scene does not support that.
         """
         lacks_material_form = not self._has_material_form()
         groups = []
@@ -90,11 +90,11 @@ class Space:
         return tuple(groups)
 
     def _has_material_form(self) -> bool:
-        """Return whether the material form of derivatives is valid in the scene.
+        """Return whether the scene's derivatives can be computed in material form.
 
-        It knows neither a medium nor a backdrop nor a lens nor the edges of cut-outs,
-        nor where a normal of a normal map turns away from the camera, nor meshes that
-        emit light.
+        That adjoint follows points of a moving surface. It has no terms for a medium, a
+        backdrop, a lens, the edges of cut-out texels, normal maps, or meshes that emit
+        light.
         """
         scene = self.scene
         if scene is None:
@@ -329,14 +329,16 @@ class Space:
         )
 
     def _sample_camera_views(self, scene: SceneDescription) -> list[CameraView]:
-        """Return views of the camera in configurations of the control that moves it.
+        """Return views of the camera, spread over the box of the control that moves it.
 
-        They are spread over the box of its coordinates. If no control moves the camera,
-        it is the one view of the scene.
+        That is the first control that sets the camera's pose. If none does, the only
+        view is that of the scene.
         """
         for control, start in self.split_by_control(self.start):
-            has_coordinates = bool(control.slots) or isinstance(control, _FixedControl)
-            if has_coordinates and "camera.to_world" in control.inputs(start):
+            # A control without slots, such as a texture, moves no camera. A fixed one
+            # has none of its own, but may hold a control that does.
+            may_move_camera = bool(control.slots) or isinstance(control, _FixedControl)
+            if may_move_camera and "camera.to_world" in control.inputs(start):
                 return [
                     _view_of_inputs(scene, control.inputs(u))
                     for u in _spread_over_box(len(start))
@@ -386,7 +388,10 @@ class _FixedControl(Control):
     """A bound control that stays at one configuration, and takes no coordinates."""
 
     def __init__(self, control: Control, u: Tensor) -> None:
-        """Fix a control at a slice of u: it has no coordinates any more."""
+        """Fix a bound control at a slice of u (k,).
+
+        It passes that slice on in place of its own, which is empty.
+        """
         self._control = control
         self._u = u
         self.name = control.name
@@ -441,6 +446,8 @@ EXPECTED_INPUTS: Mapping[str, tuple[tuple[int | None, ...] | None, float, float]
 part of their names; None for any number or any shape.
 """
 
+# of inputs of other names, which may have any shape and any values
+ANY_INPUT = (None, -math.inf, math.inf)
 RANGE_TOLERANCE = 1e-4  # how far past its range rounding may put a colour
 
 
@@ -462,9 +469,9 @@ def _check_inputs(control: str, inputs: object) -> None:
                 f"`controls` {control}: {name}: expected a tensor of real "
                 f"numbers, got {got}"
             )
-        # inputs that are not known may have any shape and any values
-        anything = (None, -math.inf, math.inf)
-        shape, low, high = EXPECTED_INPUTS.get(name.rpartition(".")[2], anything)
+        # "base_color" of "object.base_color"
+        kind = name.rpartition(".")[2]
+        shape, low, high = EXPECTED_INPUTS.get(kind, ANY_INPUT)
         if shape is not None and not _has_shape(value, shape):
             sides = ", ".join("N" if side is None else str(side) for side in shape)
             if len(shape) == 1:

@@ -185,7 +185,7 @@ class TextureControl(Control):
 
     def get_mesh(self, scene: SceneDescription) -> MeshPart:
         """Return the mesh that it paints, which a material of the object may name."""
-        if self._named_material(scene):
+        if self._find_named_materials(scene):
             return scene.meshes[OBJECT]
         try:
             return super().get_mesh(scene)
@@ -198,7 +198,7 @@ class TextureControl(Control):
             known = [*scene.meshes, *materials]
             raise UnknownNameError(kind, self.mesh, known, hint) from None
 
-    def _named_material(self, scene: SceneDescription) -> list[str]:
+    def _find_named_materials(self, scene: SceneDescription) -> list[str]:
         """Return the materials of the object that the control's name means, as in
         `texture:paint`.
 
@@ -218,7 +218,7 @@ class TextureControl(Control):
 
     def list_materials(self, scene: SceneDescription) -> list[str] | None:
         """Return the materials that it paints in a scene; None for all of the mesh."""
-        return self._named_material(scene) or self.chosen["materials"]
+        return self._find_named_materials(scene) or self.chosen["materials"]
 
     def fit(self) -> None:
         """Make the painter of the form, and the texels that it paints.
@@ -231,11 +231,11 @@ class TextureControl(Control):
         self._original = self._resample_original(part, names)
         shape = (self._original.shape[0], self._original.shape[1])
         if names is None:
-            self._painted_mask = None
+            self._painted_mask = None  # all texels
             mask = torch.ones(shape, dtype=torch.bool)
         else:
-            self._painted_mask = torch.from_numpy(self._texels_of(part, names, shape))
-            mask = self._painted_mask
+            mask = torch.from_numpy(self._find_painted_texels(part, names, shape))
+            self._painted_mask = mask
         self._mesh_name = part.name
         self._materials = ", ".join(names or ())
         self._painter = self._make_painter(part, mask)
@@ -271,7 +271,7 @@ class TextureControl(Control):
         texels = self._original[mask]
         norm = self.chosen["norm"]
         if self.form == "palette":
-            weight = _texel_areas(part, mask)
+            weight = _compute_texel_areas(part, mask)
             centers = compute_palette(
                 self._original, weight, int(self.chosen["colors"])
             )
@@ -280,7 +280,8 @@ class TextureControl(Control):
         if self.form == "waves":
             max_change = self._compute_radius(norm, texels.numel())
             if norm == "l2":
-                # so that all values at the maximum are on the edge of the ball
+                # The radius is the norm of all changes: n equal ones of radius /
+                # sqrt(n) reach it.
                 max_change = max_change / math.sqrt(texels.numel())
             n_waves = int(self.chosen["waves"])
             return make_wave_painter(texels, mask, n_waves, max_change)
@@ -289,13 +290,13 @@ class TextureControl(Control):
         return Painter(texels.reshape(-1), group, to_texels)
 
     def _compute_radius(self, norm: str, count: int) -> float:
-        """Return the radius of the ball that `count` values stay in."""
+        """Return how far `count` values may go from the original, in a norm."""
         epsilon = self._settings.get("epsilon")
         if epsilon is None:
             return compute_default_radius(norm, count)
         return float(epsilon)
 
-    def _texels_of(
+    def _find_painted_texels(
         self, part: MeshPart, names: Sequence[str], shape: tuple[int, int]
     ) -> BoolArray:
         """Return which texels (h, w) are read for some materials and for no others.
@@ -335,9 +336,11 @@ class TextureControl(Control):
     def inputs(
         self, u: Tensor, earlier_inputs: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Tensor]:
-        return {f"{self._mesh_name}.base_color": srgb_to_linear(self._texels(u))}
+        return {
+            f"{self._mesh_name}.base_color": srgb_to_linear(self._compute_texture(u))
+        }
 
-    def _texels(self, u: Tensor) -> Tensor:
+    def _compute_texture(self, u: Tensor) -> Tensor:
         """Return the full texture (h, w, 3) at a slice of u.
 
         Texels that are not painted have their original color.
@@ -363,7 +366,7 @@ class TextureControl(Control):
         return described | describe_color_change(self.name, change)
 
     def get_printable_colors(self, u: Tensor) -> Tensor | None:
-        texels = self._texels(u)
+        texels = self._compute_texture(u)
         if self._painted_mask is None:
             return texels
         return torch.cat([texels, self._painted_mask.to(texels)[..., None]], dim=-1)
@@ -372,7 +375,7 @@ class TextureControl(Control):
         self, u: Tensor, earlier_inputs: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Tensor]:
         return {
-            self.name: self._texels(u.detach()),
+            self.name: self._compute_texture(u.detach()),
             f"{self.name}-original": self._original,
         }
 
@@ -390,7 +393,7 @@ class Painter(NamedTuple):
     texels: Callable[[Tensor], Tensor]
 
 
-def _texel_areas(part: MeshPart, mask: Tensor) -> Float32Array:
+def _compute_texel_areas(part: MeshPart, mask: Tensor) -> Float32Array:
     """Return the area (h, w) that each texel of a mask covers on the surface.
 
     Without any area, each texel of the mask counts 1.
@@ -419,7 +422,7 @@ def make_palette_painter(original: Tensor, centers: Tensor, budget: Budget) -> P
     """
     squared_distance = (original[..., None, :] - centers).square().sum(dim=-1)  # (n, k)
     # A color's influence falls off over half the mean distance to the nearest other
-    # color.
+    # color. Without another one, all weights are 1, whatever it is.
     falloff = 1.0
     if len(centers) > 1:
         # more than any distance, so that no color is its own nearest
@@ -433,44 +436,49 @@ def make_palette_painter(original: Tensor, centers: Tensor, budget: Budget) -> P
 
 
 def _paint_palette(
-    original: Tensor, weights: Tensor, centres: Tensor, u: Tensor
+    original: Tensor, weights: Tensor, centers: Tensor, u: Tensor
 ) -> Tensor:
     """Return the texels (n, 3) for a changed palette, the coordinates u (3 k,).
 
     Each texel changes by the changes of the palette's colors, times its weights (n, k).
-    `centres` (k, 3) is the original palette.
+    `centers` (k, 3) is the original palette.
     """
-    change = weights.to(u.device) @ (u.reshape(-1, 3) - centres.to(u.device))
+    change = weights.to(u.device) @ (u.reshape(-1, 3) - centers.to(u.device))
     return (original.to(u.device) + change).clamp(0.0, 1.0)
 
 
 def make_wave_painter(
     original: Tensor, mask: Tensor, count: int, radius: float
 ) -> Painter:
-    """Return a painter of cosine waves along both sides of the texture.
+    """Return a painter of products of cosine waves down and to the right.
 
-    Their sum is held inside a radius by a tanh.
+    A tanh limits their sum. A coordinate is the amplitude of one product in one
+    channel: 0 at 0.5, and at the bounds one that falls with the product's frequency.
 
     Args:
         original: (n, 3) sRGB.
         mask: (h, w) bool, the texels that are painted.
-        count: number of waves along each side; wave m has m half periods, and the
-            amplitude that a coordinate at the end of its range gives falls as 1 / (1 +
-            the wave's frequency).
+        count: number of waves along each side; wave m has m half periods.
         radius: largest change of a texel value.
     """
+    height, width = mask.shape
+    down = _make_cosine_waves(height, count)
+    right = _make_cosine_waves(width, count)
     wave_index = torch.arange(count)
-    # (h, count) and (w, count): each wave along a side
-    down, right = (
-        torch.cos(math.pi * (torch.arange(side) + 0.5)[:, None] * wave_index / side)
-        for side in mask.shape
-    )
     frequency = torch.hypot(wave_index[:, None].float(), wave_index[None, :].float())
     max_amplitude = (WAVE_REACH / (1.0 + frequency))[..., None]  # (count, count, 1)
     start = torch.full((count * count * 3,), 0.5)
     waves = (down, right, max_amplitude)
     texels = partial(_paint_waves, original, mask, radius, waves)
     return Painter(start, Group("amplitudes", len(start), ("adjoint",)), texels)
+
+
+def _make_cosine_waves(side: int, count: int) -> Tensor:
+    """Return waves (side, count) over the texels of a side; wave m has m half
+    periods.
+    """
+    wave_index = torch.arange(count)
+    return torch.cos(math.pi * (torch.arange(side) + 0.5)[:, None] * wave_index / side)
 
 
 def _paint_waves(

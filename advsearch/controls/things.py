@@ -110,12 +110,13 @@ class ThingsControl(Control):
 
     @classmethod
     def declare_parameters(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
-        """Return the parameters for all things, and those set for one (`person.x`)."""
+        """Return the parameters for all things (`x`), and those set for one (`car.x`)."""
         parameter_by_name = {parameter.name: parameter for parameter in cls.parameters}
         single = []
         for setting in settings:
-            _, dot, short_name = setting.rpartition(".")
-            if dot and short_name in parameter_by_name:
+            short_name = setting.rpartition(".")[2]
+            names_thing = "." in setting
+            if names_thing and short_name in parameter_by_name:
                 single.append(replace(parameter_by_name[short_name], name=setting))
         return (*cls.parameters, *single)
 
@@ -139,14 +140,26 @@ class ThingsControl(Control):
                     f"`controls` {self.name}: thing beside the object", thing, things
                 )
         super().fit()
+        # The rest stay where they are, or another control moves them.
+        moved = self._find_moved_things()
+        self._moved_things = tuple(name for name in things if name in moved)
+        self._check_things_stand_free()
+
+    def _find_moved_things(self) -> set[str]:
+        """Return the things with a searched parameter, or one that the user set."""
         moved = set()
         for slot in self.slots:
             thing, _, short_name = slot.parameter.name.rpartition(".")
             is_set = slot.parameter.name in self.specs or short_name in self.specs
             if slot.n_coordinates or is_set:
                 moved.add(thing)
-        # The rest stay where they are, or another control moves them.
-        self._moved_things = tuple(name for name in things if name in moved)
+        return moved
+
+    def _check_things_stand_free(self) -> None:
+        """Check the things that this control moves where the scene has them.
+
+        Raises InputError: one stands in something else.
+        """
         # with all parameters 0, things stand where the scene has them
         unmoved = {slot.parameter.name: torch.zeros(()) for slot in self.slots}
         for name, stand in self._compute_stands(unmoved, {}).items():
@@ -208,16 +221,16 @@ class ThingsControl(Control):
             turn = geometry.make_euler_rotation(
                 values[f"{name}.heading"], *base.new_zeros(2)
             )
-            # the index of the choice: 0 is present, 1 is absent
-            is_absent = values[f"{name}.presence"]
-            if is_absent:
+            # () the index of the choice: 0 is present, 1 is absent
+            absence = values[f"{name}.presence"]
+            if bool(absence):
                 turn = ABSENT_SCALE * turn
             # without derivative
             position = base.new_tensor([*stand.position, stand.height])
-            depth = (
-                base.new_tensor([0.0, 0.0, ABSENT_DEPTH / self.scene.size_in_metres])
-                * is_absent
+            absent_depth = base.new_tensor(
+                [0.0, 0.0, ABSENT_DEPTH / self.scene.size_in_metres]
             )
+            depth = absent_depth * absence
             translation = position - depth - turn @ foot
             inputs[f"{name}.to_world"] = geometry.make_affine(turn, translation) @ base
         return inputs
@@ -256,8 +269,8 @@ class ThingsControl(Control):
                 name, values, footprint, object_center, obstacles, solids
             )
             stands[name] = stand
-            is_absent = values[f"{name}.presence"]
-            if not is_absent:
+            is_present = float(values[f"{name}.presence"]) == 0.0  # 1 is absent
+            if is_present:
                 obstacles.append(
                     parts.Footprint(outline, footprint.lower, footprint.upper)
                 )
@@ -312,13 +325,13 @@ class ThingsControl(Control):
     ) -> tuple[Stand, assets.Float64Array]:
         """Find the free position of one thing, and its outline (K, 2) there.
 
-        The thing moves along the line from the object's center through its requested
-        position; an absent thing stays there.
+        A thing that would stand in something is pushed along the line from the object's
+        center through its requested position. An absent one is not.
 
         Args:
             name: name of the thing.
             values: values of the control.
-            initial_footprint: initial footprint of the thing before it is moved.
+            initial_footprint: footprint of the thing in the scene, before it is moved.
             object_center: (2,) the object's center.
             obstacles: it is pushed away from the object until it is free of these.
             solids: solids of the surroundings; it is first pushed towards the object
@@ -327,7 +340,9 @@ class ThingsControl(Control):
         scene = self.scene
         x, y, heading, is_absent = self._read_numbers(name, values)
         foot = _find_foot(scene.meshes[name])
+        # x and y are metres from where the thing stands in the scene
         requested = foot[:2] + np.array([x, y]) / scene.size_in_metres
+        # about its foot
         outline = _rotate_outline(initial_footprint.outline - foot[:2], heading)
         direction = _normalize(requested - object_center)
         push_distance = 0.0

@@ -194,7 +194,7 @@ def _read_mesh(
     }
     elements, _ = read_elements((directory / "mesh.ply").read_bytes(), Notes(name))
     columns = elements["vertex"].scalars
-    faces = elements["face"].listed["vertex_indices"].values
+    faces = elements["face"].lists["vertex_indices"].values
     positions, normals, uvs = (
         np.stack([columns[axis] for axis in axes], axis=1).astype(np.float32)
         for axes in (("x", "y", "z"), ("nx", "ny", "nz"), ("s", "t"))

@@ -184,12 +184,10 @@ class CorruptionControl(Control):
     ) -> dict[str, Value]:
         """Return the severity that is applied: a whole one for stepped corruptions."""
         severity = values["severity"]
-        applied = (
-            round_severity(severity)
-            if CORRUPTION_NAMES[int(values["which"])] in STEPPED_CORRUPTIONS
-            else float(severity)
-        )
-        return {"applied": Value(value=float(applied), unit="1")}
+        applied = float(severity)
+        if CORRUPTION_NAMES[int(values["which"])] in STEPPED_CORRUPTIONS:
+            applied = float(round_severity(severity))
+        return {"applied": Value(value=applied, unit="1")}
 
 
 def apply_corruption(
@@ -208,17 +206,7 @@ def apply_corruption(
         `docs/controls/corruption.md` says.
     """
     if name in STEPPED_CORRUPTIONS:
-        apply_at = STEPPED_CORRUPTIONS[name]
-        applied_severity = round_severity(severity)
-        result = apply_at(image, applied_severity) if applied_severity else image
-        # A staircase has no slope: the gradient is that of the straight lines between
-        # its steps. What is added has the value 0, and only a derivative.
-        if severity.requires_grad:
-            below = min(int(severity.detach()), filters.MAX_SEVERITY - 1)
-            low = apply_at(image, below).detach() if below else image.detach()
-            high = apply_at(image, below + 1).detach()
-            result = result + (severity - severity.detach()) * (high - low)
-        return result.clamp(0.0, 1.0)
+        return _apply_stepped(image, STEPPED_CORRUPTIONS[name], severity)
     if name in CONTINUOUS_FROM_ZERO:
         return CONTINUOUS_FROM_ZERO[name](image, severity, seed).clamp(0.0, 1.0)
     # The tables of these begin at severity 1; below, the picture is blended with that.
@@ -228,6 +216,30 @@ def apply_corruption(
         image, torch.ones_like(severity), seed
     ).clamp(0.0, 1.0)
     return (image + severity * (mildest - image)).clamp(0.0, 1.0)
+
+
+def _apply_stepped(
+    image: Tensor, apply_at: Callable[[Tensor, int], Tensor], severity: Tensor
+) -> Tensor:
+    """Corrupt an image at the integer severity nearest to a severity ().
+
+    A staircase has no slope: the gradient is that of the straight lines between its
+    steps.
+
+    Args:
+        image: (H, W, 3) display-referred sRGB in [0, 1].
+        apply_at: the corruption, for an integer severity from 1.
+        severity: () in [0, 5]; at 0 the image is unchanged.
+    """
+    applied_severity = round_severity(severity)
+    result = apply_at(image, applied_severity) if applied_severity else image
+    if severity.requires_grad:
+        below = min(int(severity.detach()), filters.MAX_SEVERITY - 1)
+        low = apply_at(image, below).detach() if below else image.detach()
+        high = apply_at(image, below + 1).detach()
+        # the added term is 0, but has the derivative
+        result = result + (severity - severity.detach()) * (high - low)
+    return result.clamp(0.0, 1.0)
 
 
 def round_severity(severity: Tensor) -> int:

@@ -49,32 +49,33 @@ def make_generator(seed: int, name: str) -> torch.Generator:
 
 
 def interpolate_table(
-    table: Sequence[Sequence[float]], level: Tensor
+    table: Sequence[Sequence[float]], severity: Tensor
 ) -> tuple[Tensor, ...]:
     """Interpolate the five rows of a table linearly at a severity () in [1, 5].
 
     Returns one tensor () a column; differentiable.
     """
-    rows = torch.tensor(table, dtype=torch.float32, device=level.device)
-    return interpolate_severity(level, lambda severity: rows[severity - 1]).unbind()
+    rows = torch.tensor(table, dtype=torch.float32, device=severity.device)
+    return interpolate_severity(severity, lambda integer: rows[integer - 1]).unbind()
 
 
 def interpolate_severity(
-    level: Tensor, make_at_severity: Callable[[int], Tensor]
+    severity: Tensor, make_at_severity: Callable[[int], Tensor]
 ) -> Tensor:
-    """Interpolate between what `make_at_severity` returns for the integer severities
-    below and above a severity.
+    """Interpolate linearly between the results for the two nearest integer severities.
 
     Args:
-        level: () in [1, 5]; the result is differentiable in it, and on its device.
+        severity: () in [1, 5]; the result is differentiable in it, and on its device.
         make_at_severity: returns a tensor for an integer severity.
     """
-    below = min(int(level.detach()), MAX_SEVERITY - 1)
-    fraction = level - below
+    # at the largest severity the one before it, so that there is one above
+    below = min(int(severity.detach()), MAX_SEVERITY - 1)
+    fraction = severity - below
+    # the result above has no effect, and takes time to make
     if float(fraction.detach()) == 0.0 and not fraction.requires_grad:
-        return make_at_severity(below).to(level.device)
-    lower = make_at_severity(below).to(level.device)
-    upper = make_at_severity(below + 1).to(level.device)
+        return make_at_severity(below).to(severity.device)
+    lower = make_at_severity(below).to(severity.device)
+    upper = make_at_severity(below + 1).to(severity.device)
     return lower + fraction * (upper - lower)
 
 
@@ -109,16 +110,19 @@ def blur_along_line(
 ) -> Tensor:
     """Blur an image along a line: a one-sided Gaussian, cut off at twice the radius.
 
+    Lengths are in pixels of the reference image, that with a smaller side of
+    `REFERENCE_SIDE` pixels.
+
     Args:
         image: (H, W, C).
-        radius: () in pixels of the reference image.
-        sigma: () standard deviation, in pixels of the reference image.
-        angle: angle of the line, radians.
-        step: pixels of this image for a pixel of the reference image.
+        radius: () reference pixels.
+        sigma: () standard deviation, reference pixels.
+        angle: angle of the line, radians; 0 is to the right, 90 degrees down.
+        step: pixels of this image for a reference pixel.
     """
     # number of weights, one for each pixel along the line
     count = math.ceil((2.0 * float(radius.detach()) + 1.0) * step)
-    # in pixels of the reference image
+    # (count,) of each weight from the first, in reference pixels
     distance = torch.arange(count, device=image.device) / step
     # soft over one pixel, so that the result is differentiable in the radius
     cut_off = (2.0 * radius + 1.0 - distance).clamp(0.0, 1.0)
@@ -154,29 +158,31 @@ def _draw_noise(image: Tensor, seed: int, name: str, *, normal: bool = True) -> 
     ).to(image.device)
 
 
-def gaussian_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
+def gaussian_noise(image: Tensor, severity: Tensor, seed: int) -> Tensor:
     """Add normal noise, as of a sensor in the dark."""
-    (sigma,) = interpolate_table(GAUSSIAN, level)
+    (sigma,) = interpolate_table(GAUSSIAN, severity)
     return image + sigma * _draw_noise(image, seed, "gaussian noise")
 
 
-def speckle_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
+def speckle_noise(image: Tensor, severity: Tensor, seed: int) -> Tensor:
     """Add normal noise in proportion to the value."""
-    (sigma,) = interpolate_table(SPECKLE, level)
+    (sigma,) = interpolate_table(SPECKLE, severity)
     return image + image * sigma * _draw_noise(image, seed, "speckle noise")
 
 
-def shot_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
+def shot_noise(image: Tensor, severity: Tensor, seed: int) -> Tensor:
     """Replace the image by photon counts: Poisson numbers with the image as their mean.
 
     Counts have no derivative. So the noise is written as z standard deviations; z stays
     fixed, and the derivative is that of the mean and of the standard deviation.
     """
-    (photons,) = interpolate_table(SHOT, level)
+    # photons in a white pixel; `quantile` (H, W, 3) is uniform
+    (photons,) = interpolate_table(SHOT, severity)
     quantile = _draw_noise(image, seed, "shot noise", normal=False)
     with torch.no_grad():
         noisy = sample_poisson(image * photons, quantile) / photons
         z = (noisy - image) / torch.sqrt(image / photons + _DARK)
+    # the same value as `noisy`, with a derivative
     return image + z * torch.sqrt(image / photons + _DARK)
 
 
@@ -205,14 +211,14 @@ def sample_poisson(mean: Tensor, quantile: Tensor) -> Tensor:
     return count.to(mean.dtype)
 
 
-def impulse_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
+def impulse_noise(image: Tensor, severity: Tensor, seed: int) -> Tensor:
     """Replace a fraction of the values by 0 or 1 ("salt and pepper").
 
     A single value changes at once, which has no derivative by the fraction. The
     derivative is that of the expected value, which moves from the image's to 0 or 1
     with the fraction.
     """
-    (lost_fraction,) = interpolate_table(IMPULSE, level)
+    (lost_fraction,) = interpolate_table(IMPULSE, severity)
     uniform = _draw_noise(image, seed, "impulse noise", normal=False)
     extreme = (_draw_noise(image, seed, "impulse value", normal=False) < 0.5).float()
     noisy = torch.where(uniform < lost_fraction.detach(), extreme, image)
@@ -244,21 +250,21 @@ reference pixels.
 """
 
 
-def gaussian_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
+def gaussian_blur(image: Tensor, severity: Tensor, seed: int) -> Tensor:
     """Blur with a Gaussian."""
-    (sigma,) = interpolate_table(GAUSSIAN_BLUR, level)
+    (sigma,) = interpolate_table(GAUSSIAN_BLUR, severity)
     return blur_gaussian(image, sigma * compute_pixel_scale(image))
 
 
-def defocus_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
+def defocus_blur(image: Tensor, severity: Tensor, seed: int) -> Tensor:
     """Blur with a disc, the picture of a point that a lens has out of focus.
 
     Args:
         image: (H, W, 3).
-        level: () severity in [1, 5]; larger ones have larger discs.
+        severity: () in [1, 5]; larger ones have larger discs.
         seed: has no effect.
     """
-    (radius,) = interpolate_table(DEFOCUS, level)
+    (radius,) = interpolate_table(DEFOCUS, severity)
     radius = radius * compute_pixel_scale(image)
     # half the width of the kernel, with the soft edge
     reach = math.ceil(float(radius.detach()) + 0.5)
@@ -266,23 +272,35 @@ def defocus_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
     distance = torch.sqrt(offsets[:, None] ** 2 + offsets[None, :] ** 2)
     # 1 inside and 0 outside, soft over one pixel: differentiable in the radius
     disc = (radius + 0.5 - distance).clamp(0.0, 1.0)
+    return _convolve(image, disc / disc.sum(), reach)
+
+
+def _convolve(image: Tensor, kernel: Tensor, reach: int) -> Tensor:
+    """Return an image (H, W, C) convolved with a square kernel; edges are continued.
+
+    It is done by Fourier transforms, which are faster for large kernels.
+
+    Args:
+        image: (H, W, C).
+        kernel: (2 reach + 1, 2 reach + 1).
+        reach: pixels from the kernel's center to its edge.
+    """
     height, width = image.shape[:2]
     padded = F.pad(images.to_planes(image), (reach,) * 4, mode="replicate")
-    # By Fourier transforms, which are faster for large discs; of the full convolution
-    # only the part over the image is returned.
+    # The full convolution is larger than the padded image by the reach on each side,
+    # and this larger than the image by another one.
     size = (padded.shape[2] + 2 * reach, padded.shape[3] + 2 * reach)
-    product = torch.fft.rfft2(padded, s=size) * torch.fft.rfft2(
-        disc / disc.sum(), s=size
-    )
+    product = torch.fft.rfft2(padded, s=size) * torch.fft.rfft2(kernel, s=size)
     convolved = torch.fft.irfft2(product, s=size)
+    first = 2 * reach
     return images.to_image(
-        convolved[:, :, 2 * reach : 2 * reach + height, 2 * reach : 2 * reach + width]
+        convolved[:, :, first : first + height, first : first + width]
     )
 
 
-def motion_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
+def motion_blur(image: Tensor, severity: Tensor, seed: int) -> Tensor:
     """Blur along a line within 45 degrees of the horizontal, like a moving camera."""
-    radius, sigma = interpolate_table(MOTION, level)
+    radius, sigma = interpolate_table(MOTION, severity)
     turn = float(torch.rand((), generator=make_generator(seed, "motion blur")))
     return blur_along_line(
         image,
@@ -293,11 +311,11 @@ def motion_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
     )
 
 
-def zoom_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
+def zoom_blur(image: Tensor, severity: Tensor, seed: int) -> Tensor:
     """Average the image with magnified ones, like a camera that moves ahead."""
-    (largest,) = interpolate_table(ZOOM, level)
+    (largest,) = interpolate_table(ZOOM, severity)
     zooms = 1.0 + (largest - 1.0) * torch.linspace(
-        0.0, 1.0, ZOOM_STEPS, device=level.device
+        0.0, 1.0, ZOOM_STEPS, device=severity.device
     )
     # an image magnified by a zoom is looked up 1 / zoom as far from its center
     matrices = torch.diag_embed((1.0 / zooms)[:, None].expand(-1, 2))
@@ -311,19 +329,18 @@ def zoom_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
     return (image + zoomed.sum(dim=0).permute(1, 2, 0)) / (ZOOM_STEPS + 1)
 
 
-def glass_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
+def glass_blur(image: Tensor, severity: Tensor, seed: int) -> Tensor:
     """Blur, show at each pixel what a neighbor shows, and blur again."""
-    sigma = interpolate_table(GLASS, level)[0] * compute_pixel_scale(image)
+    pixel_scale = compute_pixel_scale(image)
+    reference_sigma, _, _ = interpolate_table(GLASS, severity)
+    sigma = reference_sigma * pixel_scale
+    height, width = image.shape[:2]
     shift = interpolate_severity(
-        level,
-        lambda severity: _make_glass_shift(
-            image.shape[0], image.shape[1], seed, severity
-        ),
+        severity,
+        lambda integer: _make_glass_shift(height, width, seed, integer),
     )
-    return blur_gaussian(
-        images.warp(blur_gaussian(image, sigma), shift * compute_pixel_scale(image)),
-        sigma,
-    )
+    shifted = images.warp(blur_gaussian(image, sigma), shift * pixel_scale)
+    return blur_gaussian(shifted, sigma)
 
 
 def _compute_shifts(origin: Tensor, columns: int) -> Tensor:
@@ -388,7 +405,7 @@ def elastic(image: Tensor, severity: Tensor, seed: int) -> Tensor:
     else:
         shift = interpolate_severity(
             severity,
-            lambda level: _make_elastic_shift(height, width, seed, level),
+            lambda integer: _make_elastic_shift(height, width, seed, integer),
         )
     return images.warp(image, compute_pixel_scale(image) * shift)
 
@@ -468,13 +485,13 @@ SNOW_IMAGE_WEIGHT = ((0.8,), (0.7,), (0.7,), (0.65,), (0.55,))
 LUMA_WEIGHTS = (0.299, 0.587, 0.114)  # weights of red, green and blue in a grey
 
 
-def fog(image: Tensor, level: Tensor, seed: int) -> Tensor:
+def fog(image: Tensor, severity: Tensor, seed: int) -> Tensor:
     """Add drifts of white, and scale the brightest value back to what it was."""
     height, width = image.shape[:2]
-    (density,) = interpolate_table(FOG, level)
+    (density,) = interpolate_table(FOG, severity)
     drift = interpolate_severity(
-        level,
-        lambda severity: _make_drift(height, width, seed, FOG_DECAY[severity - 1]),
+        severity,
+        lambda integer: _make_drift(height, width, seed, FOG_DECAY[integer - 1]),
     )
     brightest = image.max()
     return (
@@ -489,13 +506,8 @@ def _make_drift(height: int, width: int, seed: int, decay: float) -> Tensor:
     `decay` is as for `make_fractal_noise`: the larger it is, the smoother is the fog.
     """
     rows, columns = compute_reference_size(height, width)
-    return images.resized(
-        make_fractal_noise(max(rows, columns), decay, make_generator(seed, "fog"))[
-            :rows, :columns, None
-        ],
-        height,
-        width,
-    )
+    noise = make_fractal_noise(max(rows, columns), decay, make_generator(seed, "fog"))
+    return images.resized(noise[:rows, :columns, None], height, width)
 
 
 def make_fractal_noise(side: int, decay: float, source: torch.Generator) -> Tensor:
@@ -527,9 +539,9 @@ def make_fractal_noise(side: int, decay: float, source: torch.Generator) -> Tens
     return grid / grid.max()
 
 
-def frost(image: Tensor, level: Tensor, seed: int) -> Tensor:
+def frost(image: Tensor, severity: Tensor, seed: int) -> Tensor:
     """Lay ice crystals over the picture."""
-    image_weight, ice_weight = interpolate_table(FROST, level)
+    image_weight, ice_weight = interpolate_table(FROST, severity)
     ice = _make_ice(image.shape[0], image.shape[1], seed).to(image.device)
     return image_weight * image + ice_weight * ice
 
@@ -599,12 +611,12 @@ def _draw_line(
     pen.line((begin.real, begin.imag, end.real, end.imag), fill=int(255.0 * shine))
 
 
-def snow(image: Tensor, level: Tensor, seed: int) -> Tensor:
+def snow(image: Tensor, severity: Tensor, seed: int) -> Tensor:
     """Pale the picture and let streaks of snow fall before it."""
-    (image_weight,) = interpolate_table(SNOW_IMAGE_WEIGHT, level)
+    (image_weight,) = interpolate_table(SNOW_IMAGE_WEIGHT, severity)
     layer = interpolate_severity(
-        level,
-        lambda severity: _make_snowfall(image.shape[0], image.shape[1], seed, severity),
+        severity,
+        lambda integer: _make_snowfall(image.shape[0], image.shape[1], seed, integer),
     ).to(image.device)
     grey = (image * image.new_tensor(LUMA_WEIGHTS)).sum(dim=-1, keepdim=True)
     # paler, but never darker

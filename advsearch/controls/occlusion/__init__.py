@@ -293,11 +293,13 @@ class OcclusionControl(Control):
         """
         requested = {name: float(value.detach()) for name, value in values.items()}
         view = _ObjectView.of(self.scene, earlier_inputs)
+        # the parameter is a fraction of the way to the object's middle
         requested_distance = requested["distance"] * view.far
         if view.directions is None or requested["coverage"] <= 0.0:
             return _make_hidden_placement(requested["size"], requested_distance)
         mesh = _load_asset(self._select_option(values)).mesh
         turn = geometry.make_rotation(requested["turn"], 0.0, 0.0)
+        # of the occluder about the origin, one object size large
         points = mesh.vertices.astype(np.float64) @ turn.T
         size, distance = _fit_occluder(
             points, requested["size"], requested_distance, view.near
@@ -316,7 +318,9 @@ class OcclusionControl(Control):
         angle = _find_covering_angle(view, passage, requested["coverage"])
         # what it hides there, which may be less than requested
         hidden = float(passage.compute_coverage(np.array([angle]))[0])
-        return Placement(passage.axes, angle, size, distance, hidden, False)
+        return Placement(
+            passage.axes, angle, size, distance, hidden, is_out_of_sight=False
+        )
 
 
 # ---- what the camera sees
@@ -346,7 +350,14 @@ def _find_covering_angle(
 
 def _make_hidden_placement(size: float, distance: float) -> Placement:
     """Return the placement of an occluder that is out of sight."""
-    return Placement(np.eye(3), 0.0, size, distance, 0.0, True)
+    return Placement(
+        np.eye(3),
+        angle=0.0,
+        size=size,
+        distance=distance,
+        hidden=0.0,
+        is_out_of_sight=True,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -356,9 +367,8 @@ class _ObjectView:
     # (N, 3) in which it is visible, each for the same area; None if it is not in the
     # image
     directions: assets.Float64Array | None
-    directions_of_image: (
-        assets.Float64Array
-    )  # (M, 3) directions spread over the full image
+    # (M, 3) directions spread over the full image
+    directions_of_image: assets.Float64Array
     rim: assets.Float64Array  # (K, 3) those at its edge
     near: float  # distance of its nearest vertex from the camera
     far: float  # distance of the middle of its bounding box
@@ -370,8 +380,7 @@ class _ObjectView:
         """Compute how the camera sees a scene's object; without derivatives.
 
         `earlier_inputs` are the inputs of the controls before, which may move camera and
-        object. For a lens with a model the edge of the image is not known: all
-        directions of the image stand in for it.
+        object.
         """
         points = _object_in_camera(scene, earlier_inputs)
         faces = scene.object.mesh.faces
@@ -379,21 +388,22 @@ class _ObjectView:
         if model is not None:
             if "camera.lens" in earlier_inputs:
                 model = model.with_numbers(earlier_inputs["camera.lens"].detach().cpu())
-            spread = _spread_directions(
+            directions_of_image = _spread_directions(
                 model, (0.0, 1.0), (0.0, 1.0), silhouettes.DIRECTION_GRID
             )
-            rim = spread
+            # The edge of a distorted image is not known: all its directions stand in.
+            rim = directions_of_image
             directions = _directions_through_lens(model, points, faces)
         else:
             frame = _image_frame(scene, earlier_inputs)
             silhouette = silhouettes.rasterise_silhouette(points, faces, frame)
-            spread = silhouettes.spread_directions(frame)
+            directions_of_image = silhouettes.spread_directions(frame)
             rim = frame.corners()
             directions = None if silhouette is None else silhouette.list_directions()
         middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
         near = float(np.linalg.norm(points, axis=1).min())
         far = float(np.linalg.norm(middle))
-        return _ObjectView(directions, spread, rim, near, far)
+        return _ObjectView(directions, directions_of_image, rim, near, far)
 
 
 def _object_in_camera(

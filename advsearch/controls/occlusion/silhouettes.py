@@ -72,16 +72,16 @@ class Silhouette:
             (x / depth - window.left) / (window.right - window.left) * width
         )
         row = np.floor((y / depth - window.low) / (window.high - window.low) * height)
-        inside = (
+        is_inside = (
             (forwards > geometry.MIN_DEPTH)
             & (column >= 0)
             & (column < width)
             & (row >= 0)
             & (row < height)
         )
-        column = np.where(inside, column, 0).astype(np.int64)
-        row = np.where(inside, row, 0).astype(np.int64)
-        return np.asarray(inside & self.mask[row, column])
+        column = np.where(is_inside, column, 0).astype(np.int64)
+        row = np.where(is_inside, row, 0).astype(np.int64)
+        return np.asarray(is_inside & self.mask[row, column])
 
 
 def rasterise_silhouette(

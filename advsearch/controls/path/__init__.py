@@ -292,6 +292,23 @@ class PathControl(Control):
         self._files = [
             movement for movement in all_movements if isinstance(movement, Waypoints)
         ]
+        self._check_choices_of_files(
+            names, are_all_files=len(self._files) == len(all_movements)
+        )
+        if self._files:
+            self.chosen["seconds"] = max(
+                float(movement.times[-1]) for movement in self._files
+            )
+        self.seconds = float(self.chosen["seconds"])  # how long the path takes
+
+    def _check_choices_of_files(
+        self, names: Sequence[str], *, are_all_files: bool
+    ) -> None:
+        """Raise InputError if a choice is set that the paths state themselves.
+
+        `names` are those of the paths; `are_all_files` is whether no movement is one of
+        `PATHS`.
+        """
         has_single_path = any(MOVER_SEPARATOR not in name for name in names)
         if "moves" in self._settings and not has_single_path:
             raise InputError(
@@ -301,17 +318,11 @@ class PathControl(Control):
         # Where no path is set here, a setting of the run may state one later, and
         # `prepare` checks then.
         if "path" in self._settings:
-            self._check_needless()
+            self._check_trajectory_choices()
         if any(movement.has_times for movement in self._files):
             self._check_not_set("seconds")
-        are_all_files = len(self._files) == len(all_movements)
         if are_all_files:
             self._check_not_set("reach")
-        if self._files:
-            self.chosen["seconds"] = max(
-                float(movement.times[-1]) for movement in self._files
-            )
-        self.seconds = float(self.chosen["seconds"])  # how long the path takes
 
     def _check_not_set(self, setting: str) -> None:
         """Check that a choice which files state is not set. Raises InputError: it
@@ -353,7 +364,7 @@ class PathControl(Control):
                 movements |= self._read_file(Path(path_name), mover, is_single)
         return movements
 
-    def _check_needless(self) -> None:
+    def _check_trajectory_choices(self) -> None:
         """Check that choices about trajectories are set only if there is a trajectory.
 
         Raises InputError: they are set without one.
@@ -406,20 +417,12 @@ class PathControl(Control):
         """
         # choices that were left out by name, with the defaults taken for them
         assumed = dict[str, str]()
-        times = self._times_of(trajectory, assumed)
+        times = self._find_times(trajectory, assumed)
         check_times(path, times)
         positions, rotations = self._orient(path, trajectory, assumed)
         notes = list(trajectory.notes)
         if assumed:
-            assumptions = ", ".join(
-                f"{name} {value}" for name, value in assumed.items()
-            )
-            notes.append(
-                f"{path}: not everything is stated by {trajectory.format.value}. "
-                f"Assumed: {assumptions}. If that is wrong, "
-                f"say {', '.join(assumed)} of the control path; with axes none the "
-                "camera looks at the object."
-            )
+            notes.append(_describe_assumptions(path, trajectory.format, assumed))
         quaternions = None
         if rotations is not None:
             tilt = measure_tilt(rotations)
@@ -435,15 +438,15 @@ class PathControl(Control):
         return Waypoints(
             torch.from_numpy(times.astype(np.float32)),
             torch.from_numpy(positions.astype(np.float32)),
-            None,
-            None,
+            targets=None,
+            headings=None,
             rotations=quaternions,
             has_times=trajectory.format is not PoseFormat.KITTI,
             is_trajectory=True,
             notes=tuple(notes),
         )
 
-    def _times_of(
+    def _find_times(
         self, trajectory: Trajectory, assumed: dict[str, str]
     ) -> assets.Float64Array:
         """Return the times (n,) of a trajectory, in seconds.
@@ -530,25 +533,41 @@ class PathControl(Control):
         Raises InputError: another control or camera has the camera, or a path is
         impossible.
         """
-        if CAMERA in self._movers and not scene.uses_orbit_camera:
+        if CAMERA in self._movers:
+            self._check_camera_is_free(scene)
+        self._check_trajectory_choices()
+        in_scene = self.with_scene(scene)
+        names = _split_paths(self.chosen["path"])
+        for name, movements in zip(names, self._paths, strict=True):
+            if CAMERA in movements:
+                in_scene._check_camera_off_target(name, movements)
+        notes = self._list_notes()
+        if not notes:
+            return scene
+        remarks = tuple(dict.fromkeys((*scene.remarks, *notes)))
+        return replace(scene, remarks=remarks)
+
+    def _check_camera_is_free(self, scene: SceneDescription) -> None:
+        """Raise InputError if a camera or a photograph of the scene fixes the pose."""
+        if not scene.uses_orbit_camera:
             raise InputError(
                 f"`controls` {self.name}: moves the camera, and the scene is seen by "
                 f"its camera {scene.camera!r}; give "
                 f"moves=object, or have it seen by 'orbit'"
             )
         photograph = scene.backdrop_photograph
-        if CAMERA in self._movers and photograph is not None:
+        if photograph is not None:
             raise InputError(
                 f"`controls` {self.name} and `backdrop={photograph.spec}` contradict "
                 "each other: the photograph was taken from one place; give "
                 "moves=object, or leave one of the two out"
             )
-        self._check_needless()
-        in_scene = self.with_scene(scene)
-        names = _split_paths(self.chosen["path"])
-        for name, movements in zip(names, self._paths, strict=True):
-            if CAMERA in movements:
-                in_scene._check_camera_off_target(name, movements)
+
+    def _list_notes(self) -> list[str]:
+        """Return notes on the files, and one if the files of several paths end early.
+
+        A frame is drawn from the duration of the longest.
+        """
         notes = [note for waypoints in self._files for note in waypoints.notes]
         durations = [float(waypoints.times[-1]) for waypoints in self._files]
         shortest = min(durations, default=self.seconds)
@@ -559,10 +578,7 @@ class PathControl(Control):
                 f"{_format_rounded(self.seconds)}; who "
                 "has arrived waits, and these frames count"
             )
-        if not notes:
-            return scene
-        remarks = tuple(dict.fromkeys((*scene.remarks, *notes)))
-        return replace(scene, remarks=remarks)
+        return notes
 
     def _check_camera_off_target(self, name: str, movements: MovementByMover) -> None:
         """Check that the camera is never at what it looks at, also between waypoints.
@@ -705,10 +721,10 @@ class PathControl(Control):
         Returns:
             Two positions (..., 3), object sizes.
         """
-        pose = scene_start.camera
+        # the columns of the pose
+        left, _, forward, start = scene_start.camera[:3].unbind(dim=1)
         center = scene_start.middle
         movement = movements.get(CAMERA)
-        start = pose[:3, 3]
         if movement is None:
             return start, center
         if isinstance(movement, Waypoints):
@@ -716,16 +732,15 @@ class PathControl(Control):
         distance = (start - center).norm()
         reach = float(self.chosen["reach"])
         progress = (time / self.seconds).clamp(0.0, 1.0)
-        # columns of the pose: left, up and forwards
         if movement == APPROACH:
-            ahead = _level_direction(pose[:3, 2])
+            ahead = _level_direction(forward)
             # it begins `reach` times as far away as it ends
             to_go = (1.0 - progress)[..., None]
             return start - ahead * distance * (reach - 1.0) * to_go, center + shift
         if movement == PASS:
             # 1 at the begin, 0 where the camera stands, -1 at the end
-            from_middle = (1.0 - 2.0 * progress)[..., None]
-            return start + pose[:3, 0] * distance * reach * from_middle, center + shift
+            to_the_left = (1.0 - 2.0 * progress)[..., None]
+            return start + left * distance * reach * to_the_left, center + shift
         # orbit
         return center + _turn_about_vertical(start - center, progress), center + shift
 
@@ -766,32 +781,31 @@ class PathControl(Control):
             (..., 3) object sizes, and (...,) degrees.
         """
         camera = scene_start.camera
+        # the columns of the pose
+        left, _, forward, position = camera[:3].unbind(dim=1)
         movement = movements.get(OBJECT)
         no_shift = camera.new_zeros(3)
         no_turn = camera.new_zeros(())
         if movement is None:
             return no_shift, no_turn
         if isinstance(movement, Waypoints):
-            shift = (
-                movement.interpolate(time, movement.positions)
-                / self.scene.size_in_metres
-            )
+            shift = movement.interpolate(time, movement.positions)
+            shift = shift / self.scene.size_in_metres
             if movement.headings is None:
                 return shift, no_turn
             return shift, movement.interpolate(time, movement.headings)
         progress = (time / self.seconds).clamp(0.0, 1.0)
-        reach = float(self.chosen["reach"])
         if movement == ORBIT:
             return no_shift, 360.0 * progress
-        distance = (camera[:3, 3] - scene_start.middle).norm()
+        reach = float(self.chosen["reach"])
+        distance = (position - scene_start.middle).norm()
         if movement == APPROACH:
             # it begins `reach` times as far from the camera as it ends
             to_go = distance * (reach - 1.0) * (1.0 - progress)
-            return _level_direction(camera[:3, 2]) * to_go[..., None], no_turn
-        # Pass: positive at the begin, 0 where the object stands. The camera's x axis
-        # points to its left.
-        from_middle = distance * reach * (1.0 - 2.0 * progress)
-        return _level_direction(-camera[:3, 0]) * from_middle[..., None], no_turn
+            return _level_direction(forward) * to_go[..., None], no_turn
+        # Pass: to the right of where the object stands at first, then to the left.
+        to_right = distance * reach * (1.0 - 2.0 * progress)
+        return _level_direction(-left) * to_right[..., None], no_turn
 
 
 @geometry.cache_per_scene
@@ -933,12 +947,12 @@ def make_object_pose(start: Start, shift: Tensor, heading: Tensor) -> Tensor:
         shift: (3,) object sizes.
         heading: () degrees about the vertical through its middle.
     """
-    about = geometry.make_euler_rotation(heading, *heading.new_zeros(2))
+    turn = geometry.make_euler_rotation(heading, *heading.new_zeros(2))
     center = start.middle
-    posed: Tensor = (
-        geometry.make_affine(about, center - about @ center + shift) @ start.object
-    )
-    return posed
+    # it turns about the center, and not about the origin
+    movement = geometry.make_affine(turn, center - turn @ center + shift)
+    pose: Tensor = movement @ start.object
+    return pose
 
 
 def unwrap_headings(
@@ -969,6 +983,19 @@ def unwrap_headings(
         "one, add a waypoint between them"
     )
     return np.asarray(np.unwrap(degrees, period=360.0)), note
+
+
+def _describe_assumptions(
+    path: Path, pose_format: PoseFormat, assumed: Mapping[str, str]
+) -> str:
+    """Return a note on what a trajectory does not state: `assumed` values by choice."""
+    assumptions = ", ".join(f"{name} {value}" for name, value in assumed.items())
+    return (
+        f"{path}: not everything is stated by {pose_format.value}. "
+        f"Assumed: {assumptions}. If that is wrong, "
+        f"say {', '.join(assumed)} of the control path; with axes none the "
+        "camera looks at the object."
+    )
 
 
 def _format_rounded(number: float) -> str:
@@ -1044,27 +1071,42 @@ def read_waypoints(
         )
     notes = _unwrap_headings(path, column)
 
-    positions = _stack_columns(column, POSITION_COLUMNS)
     seconds = torch.from_numpy(times.astype(np.float32))
-    assert positions is not None
+    positions = _stack_columns(column, POSITION_COLUMNS)
+    assert positions is not None  # `_check_header` requires them
     waypoints = {
         mover: Waypoints(
             seconds,
             positions,
-            _stack_columns(column, TARGET_COLUMNS),
-            _stack_columns(column, (HEADING_COLUMN,)),
+            targets=_stack_columns(column, TARGET_COLUMNS),
+            headings=_stack_columns(column, (HEADING_COLUMN,)),
             notes=notes.get(HEADING_COLUMN, ()),
         )
     }
+    object_notes = notes.get(OBJECT_HEADING_COLUMN, ())
+    object_waypoints = _make_object_waypoints(column, seconds, object_notes)
+    if object_waypoints is not None:
+        waypoints[OBJECT] = object_waypoints
+    return waypoints
+
+
+def _make_object_waypoints(
+    column: Mapping[str, assets.Float64Array], seconds: Tensor, notes: tuple[str, ...]
+) -> Waypoints | None:
+    """Return what the object does in a file about the camera; None for nothing.
+
+    Args:
+        column: the columns (n,) of the file by name.
+        seconds: (n,) times of the waypoints.
+        notes: the notes on the object's headings.
+    """
     shift = _stack_columns(column, OBJECT_SHIFT_COLUMNS)
     turn = _stack_columns(column, (OBJECT_HEADING_COLUMN,))
-    if shift is None and turn is not None:
-        shift = torch.zeros_like(positions)
-    if shift is not None:
-        waypoints[OBJECT] = Waypoints(
-            seconds, shift, None, turn, notes=notes.get(OBJECT_HEADING_COLUMN, ())
-        )
-    return waypoints
+    if shift is None and turn is None:
+        return None
+    if shift is None:
+        shift = torch.zeros(len(seconds), 3)  # it only turns
+    return Waypoints(seconds, shift, targets=None, headings=turn, notes=notes)
 
 
 def _read_csv(path: Path, text: str) -> tuple[list[str], list[list[str]]]:

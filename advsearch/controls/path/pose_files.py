@@ -139,21 +139,33 @@ def read_trajectory(path: Path, text: str) -> Trajectory | None:
     if first_row is None:
         return None
     has_commas = "," in lines[first_row]
-    # what may be headers
-    leading = [_split(line.lstrip("#").strip()) for line in lines[:first_row]]
-    headers = [names for names in leading if _find_columns(names)]
-    has_waypoint_header = any(WAYPOINT_COLUMNS <= set(names) for names in leading)
-    is_waypoint_table = has_waypoint_header and not headers
+    candidates = [_split(line.lstrip("#").strip()) for line in lines[:first_row]]
+    headers = [names for names in candidates if _find_columns(names)]
+    if not headers:
+        is_waypoint_table = any(WAYPOINT_COLUMNS <= set(names) for names in candidates)
+        has_unknown_header = has_commas and bool(candidates)
+        if is_waypoint_table or has_unknown_header:
+            return None
     rows = [_split(line) for line in lines[first_row:] if not line.startswith("#")]
-    has_unknown_header = not headers and has_commas and bool(leading)
-    if is_waypoint_table or has_unknown_header:
-        return None
     if len(rows) > MAX_ROWS:
         raise errors.FileFormatError(
             f"{path}: expected 2 to {MAX_ROWS} waypoints, got {len(rows)}"
         )
     if headers:
         return _read_named_columns(path, headers[-1], rows, has_commas)
+    return _read_unnamed_columns(path, rows, has_commas)
+
+
+def _read_unnamed_columns(
+    path: Path, rows: Sequence[Sequence[str]], has_commas: bool
+) -> Trajectory:
+    """Read a table without a header: 8 columns are TUM's, and 12 are KITTI's.
+
+    `has_commas` is whether commas are between the columns, which is EuRoC's way.
+
+    Raises:
+        FileFormatError: it has commas, or other columns.
+    """
     if has_commas:
         raise errors.FileFormatError(
             f"{path}: expected a first line that names the columns, got numbers; add "
@@ -168,14 +180,14 @@ def read_trajectory(path: Path, text: str) -> Trajectory | None:
         )
     if count == 12:
         return _read_kitti(path, rows)
-    known = ""
+    hint = ""
     # a matrix of 12 or 16 numbers after the number of a picture
     if count in (13, 17):
-        known = " (KITTI-360's first column is a number of a picture; leave it out)"
+        hint = " (KITTI-360's first column is a number of a picture; leave it out)"
     raise errors.FileFormatError(
         f"{path}: expected 8 numbers a line as TUM's timestamp tx ty tz qx qy qz qw, "
         "or 12 as KITTI's poses, got "
-        f"{count}{known}"
+        f"{count}{hint}"
     )
 
 
@@ -185,6 +197,20 @@ def _split(line: str) -> list[str]:
 
 def _is_row(line: str) -> bool:
     return not line.startswith("#") and all(map(reading.is_number, _split(line)))
+
+
+def _find_column(name: str) -> str | None:
+    """Return our name for a column of a trajectory, such as qx; None if it is none."""
+    plain = UNIT.sub("", name).strip().lower()
+    if TIME_NAME.fullmatch(plain):
+        return "time"
+    position = POSITION_NAME.fullmatch(plain)
+    if position:
+        return position[1]
+    quaternion = QUATERNION_NAME.fullmatch(plain)
+    if quaternion:
+        return f"q{quaternion[1] or quaternion[2]}"
+    return None
 
 
 def _find_columns(names: Sequence[str]) -> dict[str, int]:
@@ -199,14 +225,8 @@ def _find_columns(names: Sequence[str]) -> dict[str, int]:
         return {}
     columns = dict[str, int]()
     for index, name in enumerate(names):
-        plain = UNIT.sub("", name).strip().lower()
-        if TIME_NAME.fullmatch(plain):
-            column = "time"
-        elif match := POSITION_NAME.fullmatch(plain):
-            column = match[1]
-        elif match := QUATERNION_NAME.fullmatch(plain):
-            column = f"q{match[1] or match[2]}"
-        else:
+        column = _find_column(name)
+        if column is None:
             continue
         if column in columns:
             return {}
@@ -303,6 +323,8 @@ def _read_kitti(path: Path, rows: Sequence[Sequence[str]]) -> Trajectory:
     """Read KITTI's poses. Raises FileFormatError: a matrix is no rotation."""
     poses = _read_table(path, rows, 12).reshape(-1, 3, 4)
     matrices = poses[:, :, :3]
+    # A rotation times its transpose is the identity. So is a reflection, which has a
+    # negative determinant.
     products = matrices @ matrices.transpose(0, 2, 1)
     error = np.abs(products - np.eye(3)).max(axis=(1, 2))
     error = np.where(np.linalg.det(matrices) > 0.0, error, np.inf)
@@ -313,4 +335,10 @@ def _read_kitti(path: Path, rows: Sequence[Sequence[str]]) -> Trajectory:
             "rows of 4), got another map"
         )
     rotations = Rotation.from_matrix(matrices)
-    return Trajectory(PoseFormat.KITTI, None, poses[:, :, 3], rotations, ())
+    return Trajectory(
+        PoseFormat.KITTI,
+        times=None,
+        positions=poses[:, :, 3],
+        rotations=rotations,
+        notes=(),
+    )

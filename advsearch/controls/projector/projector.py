@@ -55,6 +55,7 @@ MAX_AMBIENT_FACTOR = 20.0
 """Of a projector that nobody has described: it is dimmed to so many times the light of
 the place.
 """
+MAX_DEFAULT_FOV = 150.0  # degrees
 START_GREY = 0.5
 DUTY_CYCLE = 0.5  # of its period, in which a flashing light is on
 
@@ -213,18 +214,8 @@ class ProjectorControl(PictureControl):
 
     def check_choices(self) -> None:
         """Check that pattern, picture and ball go together. Raises InputError."""
-        pattern = self._settings.get("pattern")
+        self._check_pattern()
         picture = self.chosen["picture"]
-        # a pattern may be left out, be False or 0, or be its full range
-        is_full_range = isinstance(pattern, (list, tuple)) and [*pattern] == [0.0, 1.0]
-        # an empty list is false as well, but no way to leave the pattern out
-        is_empty_list = isinstance(pattern, (list, tuple)) and not pattern
-        if is_empty_list or (pattern and not is_full_range):
-            raise InputError(
-                f"{self.name}.pattern: expected no value but [0, 1], got {pattern!r}; "
-                f"a file is {self.name}.picture, "
-                f"and how far texels may go {self.name}.epsilon"
-            )
         if picture is None:
             return
         if not isinstance(picture, (str, Path)):
@@ -244,13 +235,30 @@ class ProjectorControl(PictureControl):
                 "leave one of them out"
             )
 
+    def _check_pattern(self) -> None:
+        """Check that the pattern, if it is set, has its full range.
+
+        Raises InputError: it has another one.
+        """
+        pattern = self._settings.get("pattern")
+        if isinstance(pattern, (list, tuple)):
+            is_valid = [*pattern] == [0.0, 1.0]
+        else:
+            is_valid = not pattern  # left out, False or 0
+        if not is_valid:
+            raise InputError(
+                f"{self.name}.pattern: expected no value but [0, 1], got {pattern!r}; "
+                f"a file is {self.name}.picture, "
+                f"and how far texels may go {self.name}.epsilon"
+            )
+
     # ---- in a scene
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Add the projector, and a remark if the place's brightness has no unit.
 
         By default its field of view covers the object from where the projector stands
-        at the start, 150 degrees at most.
+        at the start, `MAX_DEFAULT_FOV` at most.
         """
         picture = self.read_picture()
         if picture is None:
@@ -264,7 +272,8 @@ class ProjectorControl(PictureControl):
             object_radius = float(np.linalg.norm(offsets, axis=1).max())
             half_width = object_radius * max(1.0, columns / rows) * scene.size_in_metres
             distance = self.with_scene(scene)._start_distance()
-            fov = min(math.degrees(2.0 * math.atan(half_width / distance)), 150.0)
+            covering_fov = math.degrees(2.0 * math.atan(half_width / distance))
+            fov = min(covering_fov, MAX_DEFAULT_FOV)
         part = parts.ProjectorPart(self.name, float(fov), (rows, columns))
         has_unit = (
             scene.environment is not None and scene.environment.candelas is not None
@@ -281,9 +290,8 @@ class ProjectorControl(PictureControl):
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
         """Return a parameter with its default in this scene.
 
-        The projector stands beside the scene's camera, as far away and as high. The
-        ambient light is the environment's, if that has a unit. The light is
-        `DEFAULT_LUMENS`, or less if that is too bright for the ambient light.
+        By default the projector stands beside the scene's camera, as far away and as
+        high.
         """
         parameter = super().resolve_parameter(parameter)
         scene = self.scene
@@ -295,21 +303,10 @@ class ProjectorControl(PictureControl):
                 grey = START_GREY if self.chosen["start"] == "grey" else 0.0
                 return replace(parameter, default=grey)
             case "ambient":
-                lux = DEFAULT_AMBIENT_LUX
-                environment = scene.environment
-                if environment is not None and environment.candelas is not None:
-                    lux = environment.candelas * scene.metered_irradiance
-                    lux = min(max(lux, 1e-3), 2e5)  # the parameter's range
-                return replace(parameter, default=lux)
+                return replace(parameter, default=self._compute_ambient_lux())
             case "lumens":
-                # the light falls on an area that grows with the squared distance
-                max_lumens = (
-                    MAX_AMBIENT_FACTOR
-                    * float(self.get_clean_value("ambient"))
-                    * self.part.area
-                    * self._start_distance() ** 2
-                )
-                return replace(parameter, default=min(DEFAULT_LUMENS, max_lumens))
+                lumens = min(DEFAULT_LUMENS, self._compute_max_lumens())
+                return replace(parameter, default=lumens)
             case "azimuth":
                 azimuth = math.degrees(math.atan2(camera_offset[1], camera_offset[0]))
                 return replace(parameter, default=azimuth + DEFAULT_CAMERA_ANGLE)
@@ -317,13 +314,36 @@ class ProjectorControl(PictureControl):
                 elevation = math.degrees(math.asin(camera_offset[2] / camera_distance))
                 return replace(parameter, default=min(max(elevation, -89.0), 89.0))
             case "distance":
-                unit = (
-                    "object sizes" if scene.object.size_in_metres is None else "metres"
-                )
+                has_metres = scene.object.size_in_metres is not None
                 return replace(
-                    parameter, default=camera_distance * scene.size_in_metres, unit=unit
+                    parameter,
+                    default=camera_distance * scene.size_in_metres,
+                    unit="metres" if has_metres else "object sizes",
                 )
         return parameter
+
+    def _compute_ambient_lux(self) -> float:
+        """Return the illuminance by the environment, which may have no unit.
+
+        Then it is `DEFAULT_AMBIENT_LUX`.
+        """
+        environment = self.scene.environment
+        if environment is None or environment.candelas is None:
+            return DEFAULT_AMBIENT_LUX
+        lux = environment.candelas * self.scene.metered_irradiance
+        return min(max(lux, 1e-3), 2e5)  # the parameter's range
+
+    def _compute_max_lumens(self) -> float:
+        """Return the light that is `MAX_AMBIENT_FACTOR` times as bright as the ambient.
+
+        It falls on an area that grows with the squared distance.
+        """
+        return (
+            MAX_AMBIENT_FACTOR
+            * float(self.get_clean_value("ambient"))
+            * self.part.area
+            * self._start_distance() ** 2
+        )
 
     @property
     def sides(self) -> tuple[int, int]:
@@ -391,6 +411,7 @@ class ProjectorControl(PictureControl):
         """
         values = super().values(u)
         pattern = values["pattern"]
+        # the rounding is added as a constant, which has no derivative
         rounded = pattern + (images.round_to_8_bit(pattern.detach()) - pattern.detach())
         return values | {"pattern": rounded}
 
@@ -401,20 +422,15 @@ class ProjectorControl(PictureControl):
 
         The light is radiance of the scene at a distance of one unit.
         """
-        pose_arguments = (
-            float(values[name].detach())
-            for name in ("azimuth", "elevation", "distance")
+        pose = make_projector_pose(
+            self.scene,
+            float(values["azimuth"].detach()),
+            float(values["elevation"].detach()),
+            float(values["distance"].detach()),
         )
-        pose = make_projector_pose(self.scene, *pose_arguments).to(
-            values["distance"], copy=True
-        )
+        pose = pose.to(values["distance"], copy=True)
         light = self.project_light(values)
-        rate = float(values["flicker"].detach())
-        phase = float(values["phase"].detach()) / 360.0
-        # from 0 at the begin of a flash to 1 at that of the next one
-        cycle_position = (rate * self._time_shift + phase) % 1.0
-        is_off = cycle_position >= DUTY_CYCLE
-        if rate and is_off:
+        if self._flashes_off(values):
             light = 0.0 * light  # still depends on the pattern, for its derivative
         distance_in_units = values["distance"].detach() / self.scene.size_in_metres
         # white in units of the ambient light, at a distance of one unit: light falls
@@ -422,6 +438,14 @@ class ProjectorControl(PictureControl):
         brightness = self._relative_to_ambient(values) * distance_in_units**2
         white = brightness * self.scene.metered_irradiance / math.pi
         return {f"{self.name}.pose": pose, f"{self.name}.pattern": light * white}
+
+    def _flashes_off(self, values: Values) -> bool:
+        """Return whether the light is off at this moment of its flicker."""
+        rate = float(values["flicker"].detach())
+        phase = float(values["phase"].detach()) / 360.0
+        # from 0 at the begin of a flash to 1 at that of the next one
+        cycle_position = (rate * self._time_shift + phase) % 1.0
+        return rate != 0.0 and cycle_position >= DUTY_CYCLE
 
     def project_light(self, values: Values) -> Tensor:
         """Return the image (h, w, 3) as it is thrown, linear, as fractions of white.

@@ -175,22 +175,18 @@ class SpotControl(ProjectorControl):
             / self.scene.size_in_metres
         )
         rows, columns = self.part.sides
-        # Positions of the texels' centers in that plane: every second one of twice as
-        # many points, since the others are the texels' edges.
-        right, up = (
-            torch.linspace(-1.0, 1.0, 2 * count + 1)[1::2].to(half_width) * half_width
-            for count in (columns, rows)
-        )
+        # positions of the texels' centers in that plane
+        right = _compute_texel_centers(columns).to(half_width) * half_width
+        up = _compute_texel_centers(rows).to(half_width) * half_width
         std = values["width"] / WIDTH_PER_DEVIATION
         # rows go downwards
-        squared = (right[None] - values["x"]) ** 2 + (-up[:, None] - values["y"]) ** 2
-        spot = (
-            # The integral of the Gaussian is divided out, and the area of the image
-            # multiplied: the mean of the image is about 1.
-            torch.exp(-0.5 * squared / std**2)
-            * (2.0 * half_width) ** 2
-            / (2.0 * math.pi * std**2)
-        )
+        squared_distance = (right[None] - values["x"]) ** 2 + (
+            -up[:, None] - values["y"]
+        ) ** 2
+        image_area = (2.0 * half_width) ** 2
+        integral = 2.0 * math.pi * std**2  # of the Gaussian
+        # with these two factors the mean of the image is about 1
+        spot = torch.exp(-0.5 * squared_distance / std**2) * image_area / integral
         return spot[..., None] * color.combine_channels(values)
 
     def measured(
@@ -208,3 +204,9 @@ class SpotControl(ProjectorControl):
                 unit="times the ambient light",
             ),
         }
+
+
+def _compute_texel_centers(count: int) -> Tensor:
+    """Return the centers (count,) of the texels of a row that goes from -1 to 1."""
+    # every second one of twice as many points: the others are the texels' edges
+    return torch.linspace(-1.0, 1.0, 2 * count + 1)[1::2]

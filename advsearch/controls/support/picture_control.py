@@ -76,9 +76,10 @@ class PictureControl(Control):
         return Range(0.0, 1.0) if self.is_searched_image else Fixed(0.0)
 
     def get_budget(self, parameter: Parameter) -> Budget:
-        """Return the ball that the image stays in; no limit for other parameters.
+        """Return how far the image may go from its start; others have no limit.
 
-        Its radius is converted from colors to fractions of the range.
+        That is the radius `epsilon` in the norm, converted from colors to fractions of
+        the range.
         """
         norm = self.chosen["norm"]
         if parameter.name != self.image_parameter or norm == "box":
@@ -120,8 +121,6 @@ class PictureControl(Control):
         described = super().describe(u, earlier_inputs)
         if not self.is_searched_image:
             return described
-        image, start_image = (
-            self.values(point)[self.image_parameter]
-            for point in (u.detach(), self.start.to(u.device))
-        )
+        image = self.values(u.detach())[self.image_parameter]
+        start_image = self.values(self.start.to(u.device))[self.image_parameter]
         return {**describe_color_change(self.name, image - start_image), **described}

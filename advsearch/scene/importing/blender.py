@@ -8,7 +8,9 @@ applies what glTF cannot represent (node materials, simulations, bevels of curve
 
 from __future__ import annotations
 
+import subprocess
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 from advsearch.extend import errors, reading, stored_files
@@ -50,31 +52,8 @@ def convert_blend(path: Path, data: bytes) -> bytes:
         "export glTF (.glb) from Blender and name that",
     )
     with tempfile.TemporaryDirectory(prefix="advsearch-blender-") as folder:
-        script = Path(folder) / "export.py"
         target = Path(folder) / "scene.glb"
-        script.write_text(EXPORT_SCRIPT, "utf-8")
-        arguments = [
-            str(path.resolve()),
-            str(target),
-            str(stored_files.scale_limit(stored_files.LARGEST_FILE)),
-        ]
-        # The bpy package runs in Python (-I), which needs no separator.
-        separator = [] if "-I" in program else ["--"]
-        command = [*program, str(script), *separator, *arguments]
-        try:
-            process = reading.run_converter(
-                path,
-                "Blender",
-                command,
-                folder=folder,
-                seconds=LONGEST,
-                env=reading.make_environment(folder),
-            )
-        except OSError as error:
-            raise errors.FileFormatError(
-                f"{path}: Blender can't be started ({error.strerror}); check "
-                f"{program[0]}"
-            ) from error
+        process = _run_blender(program, path, target)
         if process.returncode or not target.is_file():
             last_line = reading.get_last_line(process.stdout + process.stderr)
             raise errors.FileFormatError(
@@ -82,3 +61,41 @@ def convert_blend(path: Path, data: bytes) -> bytes:
                 "yourself"
             )
         return reading.read_bytes(target, "object", (".glb",))
+
+
+def _run_blender(
+    program: Sequence[str], path: Path, target: Path
+) -> subprocess.CompletedProcess[str]:
+    """Let Blender convert a file, in the folder of the result.
+
+    Args:
+        program: Blender, with the arguments that it always has.
+        path: the file.
+        target: path of the result, which is not there if Blender cannot read the file.
+
+    Raises:
+        FileFormatError: Blender cannot be started, or takes too long.
+    """
+    folder = str(target.parent)
+    script = target.with_name("export.py")
+    script.write_text(EXPORT_SCRIPT, "utf-8")
+    arguments = [
+        str(path.resolve()),
+        str(target),
+        str(stored_files.scale_limit(stored_files.LARGEST_FILE)),
+    ]
+    # The bpy package runs in Python (-I), which needs no separator.
+    separator = [] if "-I" in program else ["--"]
+    try:
+        return reading.run_converter(
+            path,
+            "Blender",
+            [*program, str(script), *separator, *arguments],
+            folder=folder,
+            seconds=LONGEST,
+            env=reading.make_environment(folder),
+        )
+    except OSError as error:
+        raise errors.FileFormatError(
+            f"{path}: Blender can't be started ({error.strerror}); check {program[0]}"
+        ) from error

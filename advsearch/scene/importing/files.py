@@ -109,19 +109,25 @@ def find_advice(path: Path) -> str | None:
         if suffix in blender_suffixes:
             return f"{kind}: {_make_blender_advice(path, operator)}"
     if suffix == ".bin":
-        gltf_file = ""
-        if path.parent.is_dir():
-            names = sorted(other.name for other in path.parent.glob("*.gltf"))
-            gltf_file = f", {names[0]}" if names else ""
-        return f"a buffer, as a .gltf file has beside it: name that file{gltf_file}"
-    output_files = {
+        return _make_buffer_advice(path)
+    # what stands in the braces of `FORMAT_ADVICE`: the file, and what is made of it
+    names = {"file": shlex.quote(path.name)} | {
         name: shlex.quote(f"{path.stem}.{name}") for name in ("obj", "stl", "glb")
     }
     for kind, (instructions, suffixes) in FORMAT_ADVICE.items():
         if suffix in suffixes:
-            text = instructions.format(file=shlex.quote(path.name), **output_files)
-            return f"{kind}: {text}"
+            return f"{kind}: {instructions.format(**names)}"
     return None
+
+
+def _make_buffer_advice(path: Path) -> str:
+    """Return advice on a buffer of glTF: to name the .gltf file beside it."""
+    example = ""
+    if path.parent.is_dir():
+        names = sorted(other.name for other in path.parent.glob("*.gltf"))
+        if names:
+            example = f", {names[0]}"
+    return f"a buffer, as a .gltf file has beside it: name that file{example}"
 
 
 def _make_blender_advice(path: Path, operator: str) -> str:
@@ -230,24 +236,22 @@ def _check_suffix(path: Path, what: str, suffixes: Sequence[str]) -> None:
 
 def _make_missing_file_hint(path: Path, suffixes: Sequence[str]) -> str:
     """Return a sentence that helps to find a missing file, with a blank before it."""
-    hint = ""
     if not path.parent.is_dir():
-        hint = f" The folder {path.parent} does not exist either."
-    # A folder that does not exist, or may not be read, has no similar names to offer.
-    with suppress(OSError):
+        return f" The folder {path.parent} does not exist either."
+    name_by_lower_case = {}
+    with suppress(OSError):  # the folder may not be read
         name_by_lower_case = {
             file.name.lower(): file.name
             for file in path.parent.iterdir()
             if file.suffix.lower() in suffixes
         }
-        matches = difflib.get_close_matches(
-            path.name.lower(), sorted(name_by_lower_case), n=3, cutoff=0.5
-        )
-        hint = ""
-        if matches:
-            names = " or ".join(repr(name_by_lower_case[match]) for match in matches)
-            hint = f" Did you mean {names}?"
-    return hint
+    matches = difflib.get_close_matches(
+        path.name.lower(), sorted(name_by_lower_case), n=3, cutoff=0.5
+    )
+    if not matches:
+        return ""
+    names = " or ".join(repr(name_by_lower_case[match]) for match in matches)
+    return f" Did you mean {names}?"
 
 
 def damaged(path: Path | str, expected: str, got: str) -> FileFormatError:

@@ -137,14 +137,7 @@ def join_parts(
     """
     vertices = np.concatenate([part.vertices for part in parts])
     _check_finite(vertices, source)
-    vertex_starts = np.cumsum([0] + [len(part.vertices) for part in parts])
-    # Faces count the vertices of all parts, not of their own.
-    faces = np.concatenate(
-        [
-            part.faces + start
-            for part, start in zip(parts, vertex_starts[:-1], strict=True)
-        ]
-    )
+    faces = _concatenate_faces(parts)
     lower_corner = vertices[find_used(faces, len(vertices))].min(axis=0)
     extent = compute_extent(parts)
     _check_extent(extent, source)
@@ -171,6 +164,17 @@ def join_parts(
         colors=np.concatenate(colors),
         is_flat=np.array([part.flat for part in parts]).repeat(n_faces),
         stored_vertices=faces if has_movable else None,
+    )
+
+
+def _concatenate_faces(parts: Sequence[ImportedPart]) -> IntArray:
+    """Return the faces (F, 3) of all parts, as indices of all their vertices."""
+    vertex_starts = np.cumsum([0] + [len(part.vertices) for part in parts])
+    return np.concatenate(
+        [
+            part.faces + start
+            for part, start in zip(parts, vertex_starts[:-1], strict=True)
+        ]
     )
 
 
@@ -445,7 +449,8 @@ def _find_closed_shells(
     Then twice the number of its shared edges is its number of sides, three for each
     face. `shell` is (F,), `face_counts` (S,).
     """
-    edge_shell = shell[find_shared_edges(soup.faces)[0] // 3]
+    left_corner, _, _ = find_shared_edges(soup.faces)
+    edge_shell = shell[left_corner // 3]  # corner c is a corner of face c // 3
     paired_edges = np.bincount(edge_shell, minlength=len(face_counts)) * 2
     return np.equal(paired_edges, 3 * face_counts)
 
@@ -469,10 +474,9 @@ def _find_inside_out_shells(soup: TriangleSoup, shell: IntArray) -> BoolArray:
     n_shells = len(face_counts)
     is_closed = _find_closed_shells(soup, shell, face_counts)
     volume = _compute_signed_volumes(soup, shell, vectors, face_counts)
-    face_agreement = np.nan_to_num((soup.normals * vectors[:, None]).sum(axis=2)).sum(
-        axis=1
-    )
     # Agreement with the file's normals; 0 if it has none.
+    corner_agreement = (soup.normals * vectors[:, None]).sum(axis=2)
+    face_agreement = np.nan_to_num(corner_agreement).sum(axis=1)
     agreement = np.bincount(shell, weights=face_agreement, minlength=n_shells)
     lower, upper = _compute_shell_bounds(soup, shell, n_shells)
     # If most of the volume is negative, the whole object counts as turned first, and
@@ -557,6 +561,16 @@ def _fix_normals(soup: TriangleSoup, notes: Notes) -> TriangleSoup:
     return replace(soup, normals=normals)
 
 
+def _compute_cosines(
+    face_normals: Float64Array, left_corner: IntArray, right_corner: IntArray
+) -> Float64Array:
+    """Return the cosine between the faces at each edge, (E,), given a corner of each."""
+    # Corner c is a corner of face c // 3.
+    left_normals = face_normals[left_corner // 3]
+    right_normals = face_normals[right_corner // 3]
+    return np.asarray((left_normals * right_normals).sum(axis=1))
+
+
 def compute_smooth_normals(soup: TriangleSoup) -> Float64Array:
     """Compute unit normals of corners (F, 3, 3), smooth except across creases.
 
@@ -567,9 +581,7 @@ def compute_smooth_normals(soup: TriangleSoup) -> Float64Array:
     """
     face_normals = normalize_vectors(soup.compute_face_vectors())
     left_corner, right_corner, same_direction = find_shared_edges(soup.faces)
-    cosine = (face_normals[left_corner // 3] * face_normals[right_corner // 3]).sum(
-        axis=1
-    )
+    cosine = _compute_cosines(face_normals, left_corner, right_corner)
     is_smooth = cosine >= np.cos(np.radians(CREASE_DEGREES))
     left_corner = left_corner[is_smooth & ~same_direction]
     right_corner = right_corner[is_smooth & ~same_direction]
@@ -955,8 +967,11 @@ def _is_ear(
     y = points[is_ear, :, 1]
     is_inside = is_present[is_ear]
     for start, end in zip(corners, [*corners[1:], corners[0]], strict=True):
-        x0, y0 = start[is_ear, :, None].swapaxes(0, 1)
-        x1, y1 = end[is_ear, :, None].swapaxes(0, 1)
+        # (E, 1) the ends of the side
+        x0 = start[is_ear, :1]
+        y0 = start[is_ear, 1:]
+        x1 = end[is_ear, :1]
+        y1 = end[is_ear, 1:]
         is_inside &= (x1 - x0) * (y - y0) >= (y1 - y0) * (x - x0)
         # A point at a corner of the triangle is not in it.
         is_inside &= (x != x0) | (y != y0)

@@ -7,7 +7,7 @@ import json
 import struct
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 from urllib.parse import unquote_to_bytes
 
 import numpy as np
@@ -41,6 +41,11 @@ MOST_VALUES = 1_000_000
 """Limit of the lists, objects and values in a header; each may take two bytes of the
 file, and takes hundreds of bytes of memory.
 """
+
+
+# bytes in a .glb file
+_FILE_HEADER_SIZE = 12
+_CHUNK_HEADER_SIZE = 8
 
 
 def read_header(path: Path, data: bytes) -> Header:
@@ -96,8 +101,8 @@ def _parse_content(path: Path, chunk: bytes) -> dict[str, Any]:
     upper bound of its values. Raises FileFormatError.
     """
     text = decode_text(chunk)
-    # Each value but the first of a list or an object follows a comma.
-    max_values = sum(map(text.count, ",[{"))
+    # Each value follows a comma, or the bracket that begins its list or object.
+    max_values = sum(text.count(character) for character in ",[{")
     check_most(
         path,
         max_values,
@@ -136,6 +141,16 @@ def _make_entry_error(path: Path, error: ValidationError) -> FileFormatError:
     return damaged(path, f"glTF whose {location} is {requirement}", got)
 
 
+def _are_extensions(value: JsonValue) -> TypeGuard[dict[str, JsonValue]]:
+    """Return whether a value is an object whose supported extensions are objects.
+
+    Extensions that are not supported may be anything: nothing reads them.
+    """
+    return isinstance(value, dict) and all(
+        isinstance(value.get(name) or {}, dict) for name in SUPPORTED_EXTENSIONS
+    )
+
+
 def _find_extensions(path: Path, content: JsonValue) -> set[str]:
     """Return the names of all extensions that entries of a header have.
 
@@ -153,12 +168,7 @@ def _find_extensions(path: Path, content: JsonValue) -> set[str]:
             entry_extensions = entry.get("extensions")
             if entry_extensions is None:
                 entry_extensions = {}
-            # Extensions that are not supported may be anything: nothing reads them.
-            are_objects = isinstance(entry_extensions, dict) and all(
-                isinstance(entry_extensions.get(name) or {}, dict)
-                for name in SUPPORTED_EXTENSIONS
-            )
-            if not isinstance(entry_extensions, dict) or not are_objects:
+            if not _are_extensions(entry_extensions):
                 raise damaged(
                     path,
                     "glTF whose extensions are objects",
@@ -172,13 +182,13 @@ def _find_extensions(path: Path, content: JsonValue) -> set[str]:
 def _split_chunks(path: Path, data: bytes) -> tuple[bytes, bytes | None]:
     """Return the JSON of a file, and the binary chunk of a .glb file or None.
 
-    A .glb has 12 bytes of header, then chunks with 8 bytes of header each (glTF 2.0,
-    section 4.4). Raises FileFormatError if it is shorter than it states.
+    A .glb has a header, then chunks with a header each (glTF 2.0, section 4.4). Raises
+    FileFormatError if it is shorter than it states.
     """
     if path.suffix.lower() == ".gltf":
         return data, None
     has_magic = data.startswith(b"glTF")
-    json_start = 20  # after the headers of the file (12) and of its first chunk (8)
+    json_start = _FILE_HEADER_SIZE + _CHUNK_HEADER_SIZE
     if not has_magic or len(data) < json_start:
         got = "the first few bytes of one" if has_magic else describe_content(data)
         raise damaged(path, "a binary glTF file", got)
@@ -198,14 +208,24 @@ def _split_chunks(path: Path, data: bytes) -> tuple[bytes, bytes | None]:
             "a chunk of JSON first",
             f"{json_size} bytes of {format_name(kind.decode('latin-1'))}",
         )
-    binary_start = json_end + 8  # after the header of the second chunk
-    binary = None
-    if binary_start <= length:
-        size, kind = struct.unpack_from("<I4s", data, binary_start - 8)
-        if kind == b"BIN\0":
-            binary = data[binary_start : min(binary_start + size, length)]
+    binary = _read_binary_chunk(data, json_end, length)
     # Some writers pad the JSON with zeros.
     return data[json_start:json_end].rstrip(b"\0"), binary
+
+
+def _read_binary_chunk(data: bytes, chunk_start: int, file_end: int) -> bytes | None:
+    """Return the content of the binary chunk of a .glb file; None if it has none.
+
+    `chunk_start` is the position of the chunk's header, which follows the JSON, and
+    `file_end` the end that the file states. The content may be cut short.
+    """
+    content_start = chunk_start + _CHUNK_HEADER_SIZE
+    if content_start > file_end:
+        return None
+    size, kind = struct.unpack_from("<I4s", data, chunk_start)
+    if kind != b"BIN\0":
+        return None
+    return data[content_start : min(content_start + size, file_end)]
 
 
 MAX_DATA_SIZE = 1 << 28

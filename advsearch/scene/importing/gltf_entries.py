@@ -94,8 +94,9 @@ class Entry(BaseModel):
         keys_of_extension: dict[str, set[str]] = {}
         for info in cls.model_fields.values():
             if isinstance(info.validation_alias, AliasPath):
-                path = [str(key) for key in info.validation_alias.path]
-                keys_of_extension.setdefault(path[1], set()).update(path[2:3])
+                # "extensions", the extension, and its key unless it is an entry itself
+                _, extension, *keys = map(str, info.validation_alias.path)
+                keys_of_extension.setdefault(extension, set()).update(keys[:1])
         return keys_of_extension
 
     def iterate_references(self) -> Iterator[tuple[str, int]]:
@@ -307,12 +308,13 @@ class TextureUse(Entry):
 
     def has_same_coordinates(self, other: TextureUse) -> bool:
         """Return whether another texture has the same coordinates and transform."""
-        transforms = [
-            (transform.offset, transform.rotation, transform.scale)
-            for transform in (self.transform, other.transform)
-        ]
+        transform = self.transform
+        other_transform = other.transform
         return (
-            self.uv_attribute == other.uv_attribute and transforms[0] == transforms[1]
+            self.uv_attribute == other.uv_attribute
+            and transform.offset == other_transform.offset
+            and transform.rotation == other_transform.rotation
+            and transform.scale == other_transform.scale
         )
 
 
@@ -382,8 +384,9 @@ class MaterialEntry(Entry):
 
     @property
     def layout_texture(self) -> TextureUse | None:
-        """The texture whose coordinates the mesh gets: that of the base color, if
-        any.
+        """The texture whose coordinates the mesh gets.
+
+        It is that of the base color, or else the normal map, or that of the emission.
         """
         return (
             self.surface.baseColorTexture or self.normalTexture or self.emissiveTexture
@@ -392,11 +395,9 @@ class MaterialEntry(Entry):
     @property
     def uv_attribute(self) -> str:
         """Name of the attribute with the texture coordinates that are read."""
-        return (
-            "TEXCOORD_0"
-            if self.layout_texture is None
-            else self.layout_texture.uv_attribute
-        )
+        if self.layout_texture is None:
+            return "TEXCOORD_0"
+        return self.layout_texture.uv_attribute
 
     def can_read(self, use: TextureUse | None) -> bool:
         """Return whether a texture has the coordinates of `layout_texture`, or is None.
@@ -421,6 +422,7 @@ MIRRORED = 33648
 CLAMPED = 33071
 BORDER = 33069  # nothing beyond the edges: OpenGL's and USD's, not glTF's
 NEAREST = 9728  # the filter that leaves texels sharp
+FLOAT32 = 5126  # the component type of 32-bit floats
 
 
 class Sampler(Entry):

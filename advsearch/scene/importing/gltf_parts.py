@@ -38,6 +38,7 @@ from advsearch.scene.importing.gltf import (
 from advsearch.scene.importing.gltf_entries import (
     GENERATOR,
     TRANSPARENT_MODES,
+    Entry,
     Header,
     MaterialEntry,
     Primitive,
@@ -194,20 +195,9 @@ def _note_unread(header: Header, notes: Notes) -> None:
     """
     for entry in header.iterate_entries():
         kind = ENTRY_KINDS.get(type(entry).__name__)
-        if kind is None:
-            continue
-        keys = TrackedKeys(
-            {**(entry.model_extra or {}), "extensions": entry.extensions}
-        )
-        extensions = keys.get_nested("extensions")
-        for name, read_keys in entry.list_extension_keys().items():
-            extension = extensions.get_nested(name)
-            all_keys = [key for key, _ in extension.items()]
-            extension.mark_read(*(read_keys or all_keys))
-        # Extensions that are not understood are noted once for the file.
-        extensions.mark_read(*(name for name, _ in extensions.items()))
-        for key in keys.find_unread():
-            notes.record(kind, key)
+        if kind is not None:
+            for key in _find_unread_keys(entry):
+                notes.record(kind, key)
     for kind in set(ENTRY_KINDS.values()):
         is_of_material = "material" in kind or "texture" in kind
         # Elsewhere, extras are notes of applications.
@@ -216,6 +206,21 @@ def _note_unread(header: Header, notes: Notes) -> None:
     for mesh in header.meshes:
         for primitive in mesh.primitives:
             _note_unread_attributes(header, primitive, notes)
+
+
+def _find_unread_keys(entry: Entry) -> list[str]:
+    """Return the keys of an entry that have no field, also within its extensions."""
+    keys = TrackedKeys({**(entry.model_extra or {}), "extensions": entry.extensions})
+    extensions = keys.get_nested("extensions")
+    for name, read_keys in entry.list_extension_keys().items():
+        extension = extensions.get_nested(name)
+        # Without keys of its own, the extension is an entry, whose keys are noted as
+        # those of other entries are.
+        all_keys = {key for key, _ in extension.items()}
+        extension.mark_read(*(read_keys or all_keys))
+    # Extensions that are not understood are noted once for the file.
+    extensions.mark_read(*(name for name, _ in extensions.items()))
+    return keys.find_unread()
 
 
 def _note_unread_attributes(header: Header, primitive: Primitive, notes: Notes) -> None:
@@ -381,10 +386,7 @@ class GltfSurfaces:
             "is used instead",
         )
         if texture is not None and (color_factor != 1.0).any():
-            linear = srgb_to_linear(texture[:, :, :3]) * color_factor
-            texture = np.concatenate(
-                [linear_to_srgb(linear), texture[:, :, 3:]], axis=2
-            )
+            texture = _multiply_colors(texture, color_factor)
         base_color: Float32Array | None = color
         if entry.baseColorTexture is not None and (color > 0.999).all():
             base_color = None  # plain white does not change a texture
@@ -448,20 +450,47 @@ class GltfSurfaces:
         return entry.roughnessFactor * green, entry.metallicFactor * blue
 
     def _load_image(
-        self, use: TextureUse | None, kind: ImageKind, words: str
+        self, use: TextureUse | None, kind: ImageKind, note_template: str
     ) -> Float32Array | None:
-        """Return the texels (H, W, C) of a texture; None, and a note, if it has none.
+        """Return the texels (H, W, C) of a texture, as they are to be shown.
 
-        `words` is the note, with `{name}` for the image and `{why}` for the reason. Of
-        a texture that is not to be filtered each texel is repeated, so that filtering
-        is not visible; a large one is filtered, with a note.
+        Of a texture that is not to be filtered each texel is repeated, so that
+        filtering is not visible; a large one is filtered, with a note.
+
+        Args:
+            use: the texture; None returns None.
+            kind: what it holds.
+            note_template: the note if it has no texels, with `{name}` for the image and
+                `{why}` for the reason; then None is returned.
         """
         if use is None:
             return None
+        texels = self._load_texels(use, kind, note_template)
+        is_unfiltered = self._get_sampler(use).magFilter == gltf_entries.NEAREST
+        is_single_texel = texels is not None and texels.shape[:2] == (1, 1)
+        if texels is None or not is_unfiltered or is_single_texel:
+            return texels
+        # Each texel is repeated up to this size, where filtering is not visible.
+        max_sharp_size = min(self._images.max_side, TEXTURE_LIMIT) // 2
+        repeats = max_sharp_size // max(texels.shape[:2])
+        if repeats < 2:
+            self.notes.warn(BLURRED_NOTE.format(most=max_sharp_size // 2))
+            return texels
+        return texels.repeat(repeats, axis=0).repeat(repeats, axis=1)
+
+    def _load_texels(
+        self, use: TextureUse, kind: ImageKind, note_template: str
+    ) -> Float32Array | None:
+        """Return the texels (H, W, C) of a texture as the file has them.
+
+        Arguments are those of `_load_image`.
+        """
         image_index = self.file.header.textures[use.index].image
         if image_index is None:
             self._images.note_missing(
-                "(embedded)", "has a picture of a kind that is not understood", words
+                "(embedded)",
+                "has a picture of a kind that is not understood",
+                note_template,
             )
             return None
         entry = self.file.header.images[image_index]
@@ -477,20 +506,8 @@ class GltfSurfaces:
             return bytes(self.file.get_view(entry.bufferView))
 
         # Several textures may show the same file, which is decoded once.
-        texels = self._images.load(
-            (entry.uri, entry.bufferView), load_content, kind, name, words
-        )
-        is_unfiltered = self._get_sampler(use).magFilter == gltf_entries.NEAREST
-        is_single_texel = texels is not None and texels.shape[:2] == (1, 1)
-        if texels is None or not is_unfiltered or is_single_texel:
-            return texels
-        # Each texel is repeated up to this size, where filtering is not visible.
-        max_sharp_size = min(self._images.max_side, TEXTURE_LIMIT) // 2
-        repeats = max_sharp_size // max(texels.shape[:2])
-        if repeats < 2:
-            self.notes.warn(BLURRED_NOTE.format(most=max_sharp_size // 2))
-            return texels
-        return texels.repeat(repeats, axis=0).repeat(repeats, axis=1)
+        key = (entry.uri, entry.bufferView)
+        return self._images.load(key, load_content, kind, name, note_template)
 
     def _get_sampler(self, use: TextureUse) -> Sampler:
         """Return the sampler of a texture, which has defaults if the file states none."""
@@ -517,17 +534,6 @@ class GltfSurfaces:
         all_uvs = np.concatenate([*uvs, np.zeros((0, 2))])
         scale = np.ones(2)
         shift = np.zeros(2)
-        # The texture whose coordinates the mesh has is first.
-        texture_uses = (
-            material.surface.baseColorTexture,
-            material.normalTexture,
-            material.emissiveTexture,
-        )
-        samplers = [
-            self._get_sampler(use)
-            for use in texture_uses
-            if use is not None and material.can_read(use)
-        ]
         images = list(surface.images)
         if not images or not len(all_uvs) or not np.isfinite(all_uvs).all():
             return surface, scale, shift
@@ -535,24 +541,39 @@ class GltfSurfaces:
         normals_index = None
         if surface.normal_map is not None:
             normals_index = 0 if surface.texture is None else 1
+        samplers = self._list_samplers(material)
         wraps_by_axis = (
             [sampler.wrapS for sampler in samplers],
             [sampler.wrapT for sampler in samplers],
         )
         for axis, wraps in enumerate(wraps_by_axis):
-            bounds = (
-                float(all_uvs[:, axis].min()),
-                float(all_uvs[:, axis].max()),
-            )
+            axis_uvs = all_uvs[:, axis]
             # u, the first coordinate, runs along the second axis of an image.
             images, scale[axis], shift[axis] = self._fit_axis(
                 images,
                 axis=1 - axis,
                 wraps=wraps,
-                bounds=bounds,
+                bounds=(float(axis_uvs.min()), float(axis_uvs.max())),
                 normals_index=normals_index,
             )
         return surface.with_images(images), scale, shift
+
+    def _list_samplers(self, material: MaterialEntry) -> list[Sampler]:
+        """Return the samplers of a material's textures that the mesh has coordinates
+        for.
+
+        The first is that of the texture whose coordinates the mesh has.
+        """
+        uses = (
+            material.surface.baseColorTexture,
+            material.normalTexture,
+            material.emissiveTexture,
+        )
+        return [
+            self._get_sampler(use)
+            for use in uses
+            if use is not None and material.can_read(use)
+        ]
 
     def _fit_axis(
         self,
@@ -630,37 +651,56 @@ class GltfSurfaces:
             The images; and the scale and shift by which a coordinate of an old image
             becomes that of the padded one, t -> scale t + shift.
         """
-        min_uv, max_uv = bounds
         sizes = [image.shape[axis] for image in images]
         # All images need pads of the same width in texture coordinates, and whole
-        # texels. So an image is divided into as many units as the greatest common
-        # divisor of the sizes: a unit is a whole number of texels in each, and pads are
-        # whole units. One more on each side keeps filtering from reaching beyond them.
-        unit_size = int(np.gcd.reduce(sizes))
-        units_before = max(0, int(np.ceil(-min_uv * unit_size))) + 1
-        units_after = max(0, int(np.ceil((max_uv - 1.0) * unit_size))) + 1
-        total_units = unit_size + units_before + units_after
-        if total_units * (max(sizes) // unit_size) > 2 * self._images.max_side:
+        # texels. So each is divided into as many units as the greatest common divisor
+        # of the sizes: a unit is a whole number of texels in each, and pads are whole
+        # units.
+        n_units = int(np.gcd.reduce(sizes))
+        units_before, units_after = _count_pad_units(n_units, bounds)
+        padded_units = n_units + units_before + units_after
+        if padded_units * (max(sizes) // n_units) > 2 * self._images.max_side:
             self.notes.warn(EDGES_NOTE)
             return images, 1.0, 0.0
         padded = []
         for index, image in enumerate(images):
             border = None
             if has_border:
-                border = (
-                    FLAT_TEXEL if index == normals_index else np.zeros(1, np.float32)
-                )
-            texels_per_unit = sizes[index] // unit_size
+                is_normal_map = index == normals_index
+                border = FLAT_TEXEL if is_normal_map else np.zeros(1, np.float32)
+            unit_texels = sizes[index] // n_units
             padded.append(
                 _pad(
                     image,
                     axis,
-                    before=units_before * texels_per_unit,
-                    after=units_after * texels_per_unit,
+                    before=units_before * unit_texels,
+                    after=units_after * unit_texels,
                     border=border,
                 )
             )
-        return padded, unit_size / total_units, units_before / total_units
+        return padded, n_units / padded_units, units_before / padded_units
+
+
+def _multiply_colors(texture: Float32Array, factor: Float32Array) -> Float32Array:
+    """Multiply the colors of a texture (H, W, 3 or 4), sRGB, by a linear factor (3,)."""
+    linear = srgb_to_linear(texture[:, :, :3]) * factor
+    return np.concatenate([linear_to_srgb(linear), texture[:, :, 3:]], axis=2)
+
+
+def _count_pad_units(n_units: int, bounds: tuple[float, float]) -> tuple[int, int]:
+    """Return how many units the pads before and behind an image need.
+
+    They reach as far as texture coordinates, and one unit farther, so that filtering
+    does not reach beyond them.
+
+    Args:
+        n_units: number of units of the image itself, which is from 0 to 1.
+        bounds: smallest and largest texture coordinate.
+    """
+    min_uv, max_uv = bounds
+    units_before = max(0, int(np.ceil(-min_uv * n_units))) + 1
+    units_after = max(0, int(np.ceil((max_uv - 1.0) * n_units))) + 1
+    return units_before, units_after
 
 
 def _average_where_visible(
@@ -753,22 +793,31 @@ DEFAULT_MATERIAL_NOTE = (
 )
 
 
-def _list_instances(header: Header) -> list[tuple[int, int, Float64Array]]:
-    """Return node, mesh and pose (4, 4) of everything that is drawn, in order of the
-    nodes.
-    """
+PrimitiveKey = tuple[int, int]  # index of a mesh, and of a primitive in it
+
+
+class _Instance(NamedTuple):
+    """A mesh that a node draws."""
+
+    node: int
+    mesh: int
+    pose: Float64Array  # (4, 4) from the node's coordinates to the scene's
+
+
+def _list_instances(header: Header) -> list[_Instance]:
+    """Return everything that is drawn, in order of the nodes."""
     poses = sorted(gltf_skeleton.iterate_poses(header), key=lambda item: item[0])
     instances = []
     for node, pose in poses:
         mesh = header.nodes[node].mesh
         if mesh is not None:
-            instances.append((node, mesh, pose))
+            instances.append(_Instance(node, mesh, pose))
     return instances
 
 
 def _select_with_faces(
-    pieces: Mapping[tuple[int, int], PrimitiveData | None],
-) -> dict[tuple[int, int], PrimitiveData]:
+    pieces: Mapping[PrimitiveKey, PrimitiveData | None],
+) -> dict[PrimitiveKey, PrimitiveData]:
     """Return the primitives that have faces, by the indices of mesh and primitive."""
     return {
         key: piece
@@ -787,7 +836,7 @@ def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     file = GltfFile(path, data)
     header = file.header
     instances = _list_instances(header)
-    mesh_nodes = [node for node, _, _ in instances]
+    mesh_nodes = [instance.node for instance in instances]
     target_counts = gltf_skeleton.count_targets(file, mesh_nodes)
     pieces = _read_pieces(file, mesh_nodes)
     with_faces = _select_with_faces(pieces)
@@ -806,15 +855,17 @@ def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     return parts
 
 
-SkinPose = tuple[IntArray, Float64Array, Float64Array]
-"""A skin at rest: its joints (J,), which are nodes; its inverse bind matrices (J, 4,
-4), from the mesh to each joint; and the matrices (J, 4, 4) from the mesh to the scene.
-"""
+class SkinPose(NamedTuple):
+    """A skin at rest."""
+
+    joints: IntArray  # (J,) its joints, which are nodes
+    inverse_binds: Float64Array  # (J, 4, 4) from the mesh to each joint
+    matrices: Float64Array  # (J, 4, 4) from the mesh to the scene
 
 
 def _read_pieces(
     file: GltfFile, mesh_nodes: Sequence[int]
-) -> dict[tuple[int, int], PrimitiveData | None]:
+) -> dict[PrimitiveKey, PrimitiveData | None]:
     """Read the primitives that some nodes draw, by mesh and index in the mesh.
 
     None is a primitive that is not made of faces.
@@ -826,7 +877,7 @@ def _read_pieces(
         for node in mesh_nodes
         if header.nodes[node].skin is not None
     }
-    pieces = dict[tuple[int, int], PrimitiveData | None]()
+    pieces = dict[PrimitiveKey, PrimitiveData | None]()
     for mesh in meshes:
         assert mesh is not None  # for mypy: these nodes have meshes
         entry = header.meshes[mesh]
@@ -854,8 +905,8 @@ def _make_no_faces_error(
 
 def _note_pieces(
     header: Header,
-    keys: Sequence[tuple[int, int]],
-    with_faces: Mapping[tuple[int, int], PrimitiveData],
+    keys: Sequence[PrimitiveKey],
+    with_faces: Mapping[PrimitiveKey, PrimitiveData],
     notes: Notes,
 ) -> None:
     """Note primitives without faces or material, and with transparent vertices.
@@ -887,17 +938,17 @@ def _note_pieces(
 
 
 def _make_parts(
-    surfaces: GltfSurfaces, with_faces: Mapping[tuple[int, int], PrimitiveData]
-) -> dict[tuple[int, int], ImportedPart]:
+    surfaces: GltfSurfaces, with_faces: Mapping[PrimitiveKey, PrimitiveData]
+) -> dict[PrimitiveKey, ImportedPart]:
     """Return the parts of pieces with their surfaces and final UVs.
 
     Keys are mesh and index of the primitive in it. Pieces with the same material share
     one surface, whose images fit the texture coordinates of all of them.
     """
-    groups = dict[int | None, dict[tuple[int, int], PrimitiveData]]()
+    groups = dict[int | None, dict[PrimitiveKey, PrimitiveData]]()
     for key, piece in with_faces.items():
         groups.setdefault(piece.material, {})[key] = piece
-    parts = dict[tuple[int, int], ImportedPart]()
+    parts = dict[PrimitiveKey, ImportedPart]()
     for material, group in groups.items():
         surface, scale, shift = surfaces.make_surface(material, list(group.values()))
         for key, piece in group.items():
@@ -924,9 +975,9 @@ def _read_skins(file: GltfFile, mesh_nodes: Sequence[int]) -> dict[int, SkinPose
         if index is None:
             continue
         joints = header.skins[index].joints
-        inverse = gltf_skeleton.read_inverse_binds(file, header.skins[index])
-        matrices = np.stack([all_poses[joint] for joint in joints]) @ inverse
-        skins[index] = (np.array(joints), inverse, matrices)
+        inverse_binds = gltf_skeleton.read_inverse_binds(file, header.skins[index])
+        matrices = np.stack([all_poses[joint] for joint in joints]) @ inverse_binds
+        skins[index] = SkinPose(np.array(joints), inverse_binds, matrices)
     return skins
 
 
@@ -942,9 +993,9 @@ def _note_skeleton(skeleton: Skeleton, notes: Notes) -> None:
 
 def _pose_parts(
     file: GltfFile,
-    instances: Sequence[tuple[int, int, Float64Array]],
-    parts_by_key: Mapping[tuple[int, int], ImportedPart],
-    with_faces: Mapping[tuple[int, int], PrimitiveData],
+    instances: Sequence[_Instance],
+    parts_by_key: Mapping[PrimitiveKey, ImportedPart],
+    with_faces: Mapping[PrimitiveKey, PrimitiveData],
     skins: Mapping[int, SkinPose],
     skeleton: Skeleton | None,
 ) -> list[ImportedPart]:
@@ -955,7 +1006,7 @@ def _pose_parts(
 
     Args:
         file: the glTF file.
-        instances: node, mesh and pose of everything that is drawn.
+        instances: everything that is drawn.
         parts_by_key: the primitives as parts, by the indices of mesh and primitive.
         with_faces: what the file stores of these primitives, by the same indices.
         skins: the skins of the nodes, by index.
@@ -976,8 +1027,9 @@ def _pose_parts(
             if skin is None or vertex_joints is None:
                 part = transform_part(part, pose)
             else:
-                _, _, matrices = skin
-                part = gltf_skeleton.pose_part(file.path, part, vertex_joints, matrices)
+                part = gltf_skeleton.pose_part(
+                    file.path, part, vertex_joints, skin.matrices
+                )
             parts.append(replace(part, node=node))
     return parts
 
@@ -1001,7 +1053,8 @@ def _make_movable(
     inverse_binds = np.eye(4)[None]
     if skin is not None and piece.vertex_joints is not None:
         vertex_joints = piece.vertex_joints
-        joint_nodes, inverse_binds, _ = skin
+        joint_nodes = skin.joints
+        inverse_binds = skin.inverse_binds
     rest_weights = gltf_skeleton.read_rest_weights(file, node, len(piece.targets))
     movable = Movable(
         skeleton=skeleton,
@@ -1053,6 +1106,22 @@ def _read_vertex_colors(
     return rgba[:, :3][faces], has_alpha
 
 
+def _read_packed_coordinates(
+    file: GltfFile,
+    attributes: Mapping[str, int],
+    material: MaterialEntry,
+    used: IntArray,
+) -> Float64Array | None:
+    """Return the UVs (V, 2) of the texture of roughness and metallic, if there is one.
+
+    None also if the primitive lacks them. `used` are the vertices that faces use.
+    """
+    texture = material.surface.metallicRoughnessTexture
+    if texture is None:
+        return None
+    return _read_texture_coordinates(file, attributes, texture, used)
+
+
 def read_primitive(
     file: GltfFile, primitive: Primitive, extras: object, is_skinned: bool
 ) -> PrimitiveData | None:
@@ -1070,25 +1139,21 @@ def read_primitive(
     attributes = primitive.attributes
     if primitive.mode < TRIANGLES or "POSITION" not in attributes:
         return None
-    used_vertices, faces = _find_used_vertices(file, primitive)
-    positions = file.read_numbers(attributes["POSITION"], used_vertices)
+    used, faces = _find_used_vertices(file, primitive)
+    positions = file.read_numbers(attributes["POSITION"], used)
     material = MaterialEntry()
     if primitive.material is not None:
         material = file.header.materials[primitive.material]
-    uvs = _read_texture_coordinates(
-        file, attributes, material.layout_texture, used_vertices
-    )
-    packed_uvs = None
-    roughness_texture = material.surface.metallicRoughnessTexture
-    if roughness_texture is not None:
-        packed_uvs = _read_texture_coordinates(
-            file, attributes, roughness_texture, used_vertices
-        )
-    colors, has_alpha = _read_vertex_colors(file, attributes, used_vertices, faces)
-    has_transparent_colors = material.alphaMode in TRANSPARENT_MODES and has_alpha
+    uvs = _read_texture_coordinates(file, attributes, material.layout_texture, used)
+    packed_uvs = _read_packed_coordinates(file, attributes, material, used)
+    colors, has_alpha = _read_vertex_colors(file, attributes, used, faces)
     normals = None
     if "NORMAL" in attributes:
-        normals = file.read_numbers(attributes["NORMAL"], used_vertices)
+        normals = file.read_numbers(attributes["NORMAL"], used)
+    vertex_joints = None
+    if is_skinned:
+        vertex_joints = gltf_skeleton.read_vertex_joints(file, primitive, used)
+    targets, normal_offsets = gltf_skeleton.read_targets(file, primitive, used, extras)
     part = ImportedPart(
         vertices=positions,
         faces=faces,
@@ -1096,18 +1161,12 @@ def read_primitive(
         uvs=uvs,
         colors=colors,
         surface=ImportedSurface(),
-        flat=True,
-    )
-    vertex_joints = None
-    if is_skinned:
-        vertex_joints = gltf_skeleton.read_vertex_joints(file, primitive, used_vertices)
-    targets, normal_offsets = gltf_skeleton.read_targets(
-        file, primitive, used_vertices, extras
+        flat=True,  # as glTF shades faces without normals
     )
     return PrimitiveData(
         part=part,
         material=primitive.material,
-        has_transparent_colors=has_transparent_colors,
+        has_transparent_colors=material.alphaMode in TRANSPARENT_MODES and has_alpha,
         vertex_joints=vertex_joints,
         targets=targets,
         normal_offsets=normal_offsets,

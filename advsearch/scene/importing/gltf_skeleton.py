@@ -15,6 +15,7 @@ from advsearch.scene.assets import Float64Array, IntArray
 from advsearch.scene.importing.files import UniqueNames, damaged, sanitize_name
 from advsearch.scene.importing.gltf import GltfFile
 from advsearch.scene.importing.gltf_entries import (
+    FLOAT32,
     Accessor,
     Animation,
     Channel,
@@ -78,9 +79,8 @@ def compute_matrix(node: Node) -> Float64Array:
     if node.matrix is not None:
         return np.asarray(np.array(node.matrix, dtype=np.float64).reshape(4, 4).T)
     matrix = np.eye(4)
-    # the norm of 1.0 is 1: that of the identity, which no rotation means
-    length = max(float(np.linalg.norm(node.rotation or 1.0)), 1e-12)
-    quaternion = np.array(node.rotation or [0.0, 0.0, 0.0, 1.0]) / length
+    quaternion = np.array(node.rotation or [0.0, 0.0, 0.0, 1.0])
+    quaternion = quaternion / max(float(np.linalg.norm(quaternion)), 1e-12)
     rotation = np.reshape(compute_rotation_entries(*quaternion), (3, 3))
     matrix[:3, :3] = rotation * np.array(node.scale or [1.0, 1.0, 1.0])
     matrix[:3, 3] = node.translation or [0.0, 0.0, 0.0]
@@ -94,7 +94,7 @@ class VertexJoints(NamedTuple):
     """The joints to which vertices are bound, and their weights."""
 
     joints: IntArray  # (V, 4 n) indices into the joints of the skin
-    weights: Float64Array  # (V, 4 n); those of a vertex sum to 1
+    weights: Float64Array  # (V, 4 n); those of a vertex sum to 1, but as stored
 
 
 def read_vertex_joints(
@@ -107,40 +107,50 @@ def read_vertex_joints(
     Raises:
         FileFormatError: joints are those of other vertices, or have no weights.
     """
-    attributes = primitive.attributes
-    accessors = file.header.accessors
     # A file has sets of four joints and weights a vertex: JOINTS_0, JOINTS_1, ...
-    joints = list[IntArray]()
-    weights = list[Float64Array]()
-    while f"JOINTS_{len(joints)}" in attributes:
-        if len(joints) == MAX_JOINT_SETS:
+    sets = list[VertexJoints]()
+    while f"JOINTS_{len(sets)}" in primitive.attributes:
+        if len(sets) == MAX_JOINT_SETS:
             raise damaged(
                 file.path, f"at most {4 * MAX_JOINT_SETS} joints of each vertex", "more"
             )
-        joints_index = attributes[f"JOINTS_{len(joints)}"]
-        weights_index = attributes.get(f"WEIGHTS_{len(joints)}")
-        n_vertices = accessors[attributes["POSITION"]].count
-        if (
-            weights_index is None
-            or not _is_vec4(accessors[joints_index], n_vertices)
-            or not _is_vec4(accessors[weights_index], n_vertices)
-        ):
-            raise damaged(
-                file.path, "four joints and four weights of each vertex", "others"
-            )
-        joints.append(file.read_values(joints_index)[used].astype(np.int64))
-        weights.append(file.read_numbers(weights_index, used))
-    if not joints:
+        sets.append(_read_joint_set(file, primitive, used, len(sets)))
+    if not sets:
         return None
-    stored_weights = np.concatenate(weights, axis=1)
-    total = stored_weights.sum(axis=1, keepdims=True)
-    # A vertex without weights moves with its first joint.
+    joints = np.concatenate([joint_set.joints for joint_set in sets], axis=1)
+    weights = np.concatenate([joint_set.weights for joint_set in sets], axis=1)
+    total = weights.sum(axis=1, keepdims=True)
+    # A vertex without weights moves with its first joint: (1, 0, 0, ...).
+    only_first = np.eye(1, weights.shape[1])
     normalized = np.where(
-        total > 0.0,
-        stored_weights / np.where(total > 0.0, total, 1.0),
-        np.eye(1, stored_weights.shape[1]),
+        total > 0.0, weights / np.where(total > 0.0, total, 1.0), only_first
     )
-    return VertexJoints(np.concatenate(joints, axis=1), normalized)
+    return VertexJoints(joints, normalized)
+
+
+def _read_joint_set(
+    file: GltfFile, primitive: Primitive, used: IntArray, index: int
+) -> VertexJoints:
+    """Return four joints of each used vertex, with their weights as stored.
+
+    They are those of the attributes ``JOINTS_<index>`` and ``WEIGHTS_<index>``. Raises
+    FileFormatError as `read_vertex_joints`.
+    """
+    attributes = primitive.attributes
+    accessors = file.header.accessors
+    joints_index = attributes[f"JOINTS_{index}"]
+    weights_index = attributes.get(f"WEIGHTS_{index}")
+    n_vertices = accessors[attributes["POSITION"]].count
+    if (
+        weights_index is None
+        or not _is_vec4(accessors[joints_index], n_vertices)
+        or not _is_vec4(accessors[weights_index], n_vertices)
+    ):
+        raise damaged(
+            file.path, "four joints and four weights of each vertex", "others"
+        )
+    joints = file.read_values(joints_index)[used].astype(np.int64)
+    return VertexJoints(joints, file.read_numbers(weights_index, used))
 
 
 def _is_vec4(accessor: Accessor, count: int) -> bool:
@@ -324,6 +334,15 @@ def read_rest_weights(file: GltfFile, node: int, count: int) -> Float64Array:
     return np.array(weights, np.float64)
 
 
+def _count_vertices(header: Header, primitives: Sequence[Primitive]) -> int:
+    """Return the number of vertices of primitives; those without positions have none."""
+    return sum(
+        header.accessors[primitive.attributes["POSITION"]].count
+        for primitive in primitives
+        if "POSITION" in primitive.attributes
+    )
+
+
 def count_targets(file: GltfFile, mesh_nodes: Sequence[int]) -> dict[int, int]:
     """Return the number of morph targets of each node with a mesh.
 
@@ -349,12 +368,7 @@ def count_targets(file: GltfFile, mesh_nodes: Sequence[int]) -> dict[int, int]:
         n_targets[node] = max(counts, default=0)
         if entry.skin is not None:
             n_moves += len(primitives) * len(header.skins[entry.skin].joints)
-        n_vertices = sum(
-            header.accessors[primitive.attributes["POSITION"]].count
-            for primitive in primitives
-            if "POSITION" in primitive.attributes
-        )
-        n_moves += n_targets[node] * n_vertices
+        n_moves += n_targets[node] * _count_vertices(header, primitives)
     check_most(
         file.path,
         n_moves,
@@ -442,23 +456,7 @@ def _read_clips(
         skins: indices of the skins of these nodes.
     """
     header = file.header
-    joints = (joint for skin in skins for joint in header.skins[skin].joints)
-    moving_nodes = with_ancestors(header.parents, {*target_counts, *joints})
-
-    def moves_geometry(channel: Channel) -> bool:
-        """Return whether a channel sets something that moves geometry, see above."""
-        node = channel.target.node
-        property_name = channel.target.path
-        if node is None or property_name not in VALUE_WIDTHS:
-            return False  # an extension defines what it sets
-        if property_name == "weights":
-            return target_counts.get(node, 0) > 0
-        return node in moving_nodes
-
-    used_channels = [
-        list(filter(moves_geometry, animation.channels))
-        for animation in header.animations
-    ]
+    used_channels = _find_moving_channels(header, target_counts, skins)
     check_most(
         file.path,
         _count_key_numbers(header, used_channels),
@@ -478,6 +476,29 @@ def _read_clips(
             name = unique_names.make_unique(animation.name or f"clip-{index}")
             clips.append(Clip(name, tuple(tracks)))
     return tuple(clips)
+
+
+def _find_moving_channels(
+    header: Header, target_counts: Mapping[int, int], skins: Collection[int]
+) -> list[list[Channel]]:
+    """Return the channels of each animation that move geometry; see `_read_clips`."""
+    joints = (joint for skin in skins for joint in header.skins[skin].joints)
+    moving_nodes = with_ancestors(header.parents, {*target_counts, *joints})
+
+    def moves_geometry(channel: Channel) -> bool:
+        """Return whether a channel sets something that moves geometry."""
+        node = channel.target.node
+        property_name = channel.target.path
+        if node is None or property_name not in VALUE_WIDTHS:
+            return False  # an extension defines what it sets
+        if property_name == "weights":
+            return target_counts.get(node, 0) > 0
+        return node in moving_nodes
+
+    return [
+        list(filter(moves_geometry, animation.channels))
+        for animation in header.animations
+    ]
 
 
 def _read_track(
@@ -501,39 +522,60 @@ def _read_track(
     Raises:
         FileFormatError: its keys are not as the format defines them.
     """
-    path = file.path
     sampler = animation.samplers[channel.curve]
-    node = channel.target.node or 0  # always there: `_read_clips` has seen to that
-    target_path = channel.target.path
+    node = channel.target.node
+    assert node is not None  # for mypy: `_read_clips` leaves others out
+    property_name = channel.target.path
     times = _read_times(file, sampler.input)
-    if file.header.nodes[node].matrix is not None and target_path != "weights":
+    if file.header.nodes[node].matrix is not None and property_name != "weights":
         raise damaged(
-            path, f"a node {node} without matrix, because a clip moves it", "one"
+            file.path, f"a node {node} without matrix, because a clip moves it", "one"
         )
-    # A cubic spline has two tangents and a value for each key.
+    # a spline: the tangent before a key, its value, and the tangent after it
     values_per_key = 3 if sampler.interpolation == "CUBICSPLINE" else 1
-    n_targets = target_counts[node] if target_path == "weights" else 1
-    width = VALUE_WIDTHS[target_path]
-    output = file.header.accessors[sampler.output]
-    count = len(times) * values_per_key * n_targets
+    n_targets = target_counts[node] if property_name == "weights" else 1
+    shape = (len(times), values_per_key, n_targets)
+    keys = _read_keys(file, sampler.output, property_name, shape)
+    if property_name == "rotation":
+        quaternions = keys[:, values_per_key // 2]  # without tangents
+        lengths = np.linalg.norm(quaternions, axis=1)
+        if not (lengths > MIN_QUATERNION_LENGTH).all():  # they have no direction
+            raise damaged(
+                file.path,
+                "rotations of a clip that are unit quaternions",
+                "one of length 0",
+            )
+    return Track(node, property_name, sampler.interpolation, times, keys)
+
+
+def _read_keys(
+    file: GltfFile, index: int, property_name: str, shape: tuple[int, int, int]
+) -> Float64Array:
+    """Return the values of the keys of a clip, (keys, values per key, numbers).
+
+    Args:
+        file: the glTF file.
+        index: accessor of the values.
+        property_name: the property that they set, a key of `VALUE_WIDTHS`.
+        shape: how many keys there are, values a key, and targets that a value is for.
+
+    Raises:
+        FileFormatError: there are more or fewer values, or others.
+    """
+    n_keys, values_per_key, n_targets = shape
+    width = VALUE_WIDTHS[property_name]
+    output = file.header.accessors[index]
+    count = n_keys * values_per_key * n_targets
     if output.count != count or output.width != width:
         expected = (
             f"{count:,} values of {_count_numbers(width)} for "
-            f"{len(times):,} keys of a {target_path}"
+            f"{n_keys:,} keys of a {property_name}"
         )
-        raise damaged(path, expected, f"{output.count:,} of {output.width}")
-    values = file.read_numbers(sampler.output, np.arange(count))
-    keys = _require_finite(path, "the keys of a clip", values).reshape(
-        len(times), values_per_key, n_targets * width
+        raise damaged(file.path, expected, f"{output.count:,} of {output.width}")
+    values = file.read_numbers(index, np.arange(count))
+    return _require_finite(file.path, "the keys of a clip", values).reshape(
+        n_keys, values_per_key, n_targets * width
     )
-    if target_path == "rotation":
-        # the values themselves, which stand between the tangents of a spline
-        lengths = np.linalg.norm(keys[:, values_per_key // 2], axis=1)
-        if not (lengths > MIN_QUATERNION_LENGTH).all():  # they have no direction
-            raise damaged(
-                path, "rotations of a clip that are unit quaternions", "one of length 0"
-            )
-    return Track(node, target_path, sampler.interpolation, times, keys)
 
 
 def _count_numbers(count: int) -> str:
@@ -549,7 +591,7 @@ def _read_times(file: GltfFile, index: int) -> Float64Array:
     """
     path = file.path
     accessor = file.header.accessors[index]
-    is_float32 = accessor.componentType == 5126
+    is_float32 = accessor.componentType == FLOAT32
     if accessor.type != "SCALAR" or not is_float32 or not accessor.count:
         raise damaged(
             path,

@@ -15,7 +15,7 @@ import os
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -222,6 +222,29 @@ def _read_window(
     return (int(low[1]), int(low[0])), (height, width)
 
 
+class _Layer(NamedTuple):
+    """One layer of an OpenEXR file.
+
+    Attributes:
+        name: its name, perhaps empty.
+        header: header of the part that it is in.
+        channels: its channels by what they hold, see `CHANNEL_NAMES`.
+    """
+
+    name: str
+    header: dict[str, Any]
+    channels: dict[str, Any]
+
+    @property
+    def rank(self) -> tuple[int, bool]:
+        """Rank by the name in `MAIN_LAYER_NAMES`, then colors before luminance."""
+        last_word = self.name.split(".")[-1].lower()
+        name_rank = len(MAIN_LAYER_NAMES)
+        if last_word in MAIN_LAYER_NAMES:
+            name_rank = MAIN_LAYER_NAMES.index(last_word)
+        return name_rank, "R" not in self.channels
+
+
 def _select_layer(
     file: Path, parts: list[tuple[dict[str, Any], dict[str, Any]]]
 ) -> tuple[dict[str, Any], dict[str, Any], list[str]]:
@@ -246,57 +269,46 @@ def _select_layer(
             f"{file}: {expected}, got {got}; save the picture as plain RGB"
         )
 
-    def rank(
-        layer: tuple[str, Mapping[str, Any], Mapping[str, Any]],
-    ) -> tuple[int, bool]:
-        """Return the rank of a layer: by its name, then colors before luminance."""
-        name, _, channels = layer
-        last_word = name.split(".")[-1].lower()
-        name_rank = len(MAIN_LAYER_NAMES)
-        if last_word in MAIN_LAYER_NAMES:
-            name_rank = MAIN_LAYER_NAMES.index(last_word)
-        return name_rank, "R" not in channels
+    selected = min(layers, key=lambda layer: layer.rank)  # the first of equal ones
+    # colors, or luminance with its chroma if there is one
+    channel_names = ("R", "G", "B") if "R" in selected.channels else ("Y", "RY", "BY")
+    channels = {
+        name: selected.channels[name]
+        for name in channel_names
+        if name in selected.channels
+    }
+    return selected.header, channels, _describe_other_layers(selected, layers)
 
-    name, header, channels = min(layers, key=rank)  # the first of equal ones
+
+def _describe_other_layers(selected: _Layer, layers: list[_Layer]) -> list[str]:
+    """Return a clause about the layers that are left out; none if there are none."""
     other_names = ", ".join(
         # not more, so that the note stays readable
-        format_name(other)
-        for other, _, _ in layers[:20]
-        if other != name
+        format_name(layer.name)
+        for layer in layers[:20]
+        if layer.name != selected.name
     )
-    notes = []
-    if other_names and name:
-        notes.append(
-            f"of its layers {format_name(name)} is taken; left out: {other_names}"
-        )
-    elif other_names:
-        notes.append(f"layers are left out: {other_names}")
-    # colors, or luminance with its chroma if there is one
-    channel_names = ("R", "G", "B") if "R" in channels else ("Y", "RY", "BY")
-    return (
-        header,
-        {key: channels[key] for key in channel_names if key in channels},
-        notes,
-    )
+    if not other_names:
+        return []
+    if not selected.name:
+        return [f"layers are left out: {other_names}"]
+    name = format_name(selected.name)
+    return [f"of its layers {name} is taken; left out: {other_names}"]
 
 
 def _find_color_layers(
     parts: list[tuple[dict[str, Any], dict[str, Any]]],
-) -> list[tuple[str, dict[str, Any], dict[str, Any]]]:
-    """Return the name, header and channels of every layer with color or luminance.
+) -> list[_Layer]:
+    """Return every layer with color or luminance.
 
     A channel's name is that of its layer, a dot, and what it holds: "diffuse.R". Those
     without a dot are of the layer "", which has the name of its part if the file has
     several. A layer counts if it has R, G and B, or luminance Y: alone, or with both
     chroma channels RY and BY. Y beside X or Z is a color of XYZ and does not count.
 
-    Args:
-        parts: header and channels of each part.
-
-    Returns:
-        Channels are by what they hold, see `CHANNEL_NAMES`.
+    `parts` are the header and the channels of each part.
     """
-    layers: list[tuple[str, dict[str, Any], dict[str, Any]]] = []
+    layers = list[_Layer]()
     for header, channels in parts:
         channels_by_layer: dict[str, dict[str, Any]] = {}
         for name, channel in channels.items():
@@ -313,7 +325,7 @@ def _find_color_layers(
                 and not {"R", "G", "B", "X", "Z"} & names
             )
             if is_luminance or {"R", "G", "B"} <= names:
-                layers.append((layer or part_name, header, layer_channels))
+                layers.append(_Layer(layer or part_name, header, layer_channels))
     return layers
 
 
@@ -329,10 +341,10 @@ def _convert_luminance(
     if "RY" not in planes:
         return dict.fromkeys("RGB", planes["Y"])
     luminance = planes["Y"].astype(np.float32)
-    red, blue = (
-        (_resample(planes[name].astype(np.float32), size) + 1.0) * luminance
-        for name in ("RY", "BY")
-    )
+    red_ratio = _resample(planes["RY"].astype(np.float32), size)
+    blue_ratio = _resample(planes["BY"].astype(np.float32), size)
+    red = (red_ratio + 1.0) * luminance
+    blue = (blue_ratio + 1.0) * luminance
     green = (luminance - LUMINANCE[0] * red - LUMINANCE[2] * blue) / LUMINANCE[1]
     colors = {"R": red, "G": green, "B": blue}
     return {
@@ -362,16 +374,17 @@ def _resample(plane: Plane, size: tuple[int, ...]) -> Plane:
     return plane
 
 
+def _shift_range(pixels: range, origin: int) -> slice:
+    """Return pixels of a grid as those of an array whose first one is `origin`."""
+    return slice(pixels.start - origin, pixels.stop - origin)
+
+
 def _intersect_ranges(
     data_start: int, data_length: int, start: int, length: int
-) -> slice:
-    """Return what two ranges of integers have in common.
-
-    Each is a start and a length. The slice stops before its start if they have nothing
-    in common.
-    """
+) -> range:
+    """Return what two ranges of integers, each a start and a length, have in common."""
     stop = min(data_start + data_length, start + length)
-    return slice(max(data_start, start), stop)
+    return range(max(data_start, start), stop)
 
 
 def _crop_to_display_window(
@@ -383,33 +396,25 @@ def _crop_to_display_window(
     file's data need not be all of its image. Pads are black; data that is cropped away
     is noted in `notes`. Planes have the size of the data window.
     """
-    (data_top, data_left), data_size = _read_window(header, "dataWindow")
-    (top, left), (height, width) = _read_window(header, "displayWindow")
-    if (data_top, data_left) == (top, left) and data_size == (height, width):
+    data_corner, data_size = _read_window(header, "dataWindow")
+    corner, size = _read_window(header, "displayWindow")
+    if data_corner == corner and data_size == size:
         return planes
-    rows = _intersect_ranges(data_top, data_size[0], top, height)
-    columns = _intersect_ranges(data_left, data_size[1], left, width)
-    is_cropped = (
-        rows.start > data_top
-        or columns.start > data_left
-        or rows.stop < data_top + data_size[0]
-        or columns.stop < data_left + data_size[1]
-    )
+    rows = _intersect_ranges(data_corner[0], data_size[0], corner[0], size[0])
+    columns = _intersect_ranges(data_corner[1], data_size[1], corner[1], size[1])
+    is_cropped = (len(rows), len(columns)) != data_size
     if is_cropped:
         notes.append("its data beyond the display window is left out")
 
+    # the pixels that both windows have, counted from the corner of either one
+    source = (_shift_range(rows, data_corner[0]), _shift_range(columns, data_corner[1]))
+    target = (_shift_range(rows, corner[0]), _shift_range(columns, corner[1]))
+
     def crop(plane: Plane) -> Plane:
         """Copy what both windows have into a black plane of the display window."""
-        result = np.zeros((height, width), plane.dtype)
-        if rows.stop > rows.start and columns.stop > columns.start:
-            # the same pixels, counted from the corner of either window
-            result[
-                rows.start - top : rows.stop - top,
-                columns.start - left : columns.stop - left,
-            ] = plane[
-                rows.start - data_top : rows.stop - data_top,
-                columns.start - data_left : columns.stop - data_left,
-            ]
+        result = np.zeros(size, plane.dtype)
+        if rows and columns:
+            result[target] = plane[source]
         return result
 
     red, green, blue = planes
@@ -417,7 +422,12 @@ def _crop_to_display_window(
 
 
 Bytes = npt.NDArray[np.uint8]
-_RESOLUTION = re.compile(rb"([-+])([YX]) +(\d{1,6}) +([-+])([YX]) +(\d{1,6})\r?\n")
+_RESOLUTION = re.compile(
+    rb"(?P<line_direction>[-+](?P<line_axis>[YX])) +(?P<n_lines>\d{1,6}) +"
+    rb"(?P<pixel_direction>[-+](?P<pixel_axis>[YX])) +(?P<line_length>\d{1,6})\r?\n"
+)
+"""The direction and number of scanlines, and of the pixels in each: -Y 512 +X 1024."""
+_UPRIGHT_DIRECTIONS = (b"-Y", b"+X")  # y falls from the top, x grows from the left
 _NUMBER = rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 
 
@@ -431,30 +441,27 @@ def _read_upright_pixels(path: Path, body: bytes) -> Bytes:
     Raises:
         FileFormatError: the size is none, or too large, or scanlines are missing.
     """
-    # A sign, an axis and a count of scanlines, and these three of pixels in a scanline.
     size_match = _RESOLUTION.match(body)
     if (
         not size_match
-        or not int(size_match[3])
-        or not int(size_match[6])
-        or size_match[2] == size_match[5]  # twice the same axis
+        or not int(size_match["n_lines"])
+        or not int(size_match["line_length"])
+        or size_match["line_axis"] == size_match["pixel_axis"]
     ):
         line = body[:30].split(b"\n")[0].decode("latin-1")
         raise FileFormatError(
             f"{path}: expected a size like '-Y 512 +X 1024', got "
             f"{line!r}; save the picture again"
         )
-    n_lines = int(size_match[3])
-    line_length = int(size_match[6])
+    n_lines = int(size_match["n_lines"])
+    line_length = int(size_match["line_length"])
     check_pixels(path, line_length, n_lines)
     pixels = _decode_scanlines(path, body[size_match.end() :], n_lines, line_length)
-    # Flip it so that it begins at the top (y falls: -Y) and at the left (x grows: +X).
-    line_step, pixel_step = (
-        1 if sign + axis in (b"-Y", b"+X") else -1
-        for sign, axis in (size_match.group(1, 2), size_match.group(4, 5))
-    )
-    pixels = pixels[::line_step, ::pixel_step]
-    if size_match[2] != b"Y":  # its scanlines are columns
+    if size_match["line_direction"] not in _UPRIGHT_DIRECTIONS:
+        pixels = pixels[::-1]
+    if size_match["pixel_direction"] not in _UPRIGHT_DIRECTIONS:
+        pixels = pixels[:, ::-1]
+    if size_match["line_axis"] == b"X":  # its scanlines are columns
         pixels = pixels.transpose(1, 0, 2)
     return pixels
 
@@ -472,10 +479,11 @@ def read_radiance(path: Path, data: bytes) -> tuple[Bytes, Float32Array, list[st
         FileFormatError: the file is no Radiance picture, has XYZ colors, is too large,
             or is cut short.
     """
-    header_end = re.search(rb"\r?\n\r?\n", data)
-    if not data.startswith(b"#?") or not header_end:
-        got = describe_content(data) if not data.startswith(b"#?") else "half a header"
-        raise damaged(path, "a Radiance .hdr picture", got)
+    if not data.startswith(b"#?"):
+        raise damaged(path, "a Radiance .hdr picture", describe_content(data))
+    header_end = re.search(rb"\r?\n\r?\n", data)  # an empty line
+    if not header_end:
+        raise damaged(path, "a Radiance .hdr picture", "half a header")
     header = data[: header_end.start()]
     body = data[header_end.end() :]
     format_match = re.search(rb"^FORMAT=\s*(\S+)", header, re.MULTILINE)

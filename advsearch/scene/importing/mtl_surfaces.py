@@ -142,10 +142,12 @@ class MtlReader:
         return self._materials.get(name) or self._materials.get(without_comment(name))
 
     def get_surface(self, name: str, square: int = 0) -> MtlSurface | None:
-        """Return a material by its name, which may have a comment after it, or None.
+        """Return the material of a name as a surface; None if there is no such one.
 
-        If its images are one for each UDIM square, those of `square` are used; of
-        square 0, those that the file names.
+        Args:
+            name: the name as the mesh file writes it, perhaps with a comment after it.
+            square: the UDIM square whose images are used, if there is one for each; 0
+                for the images that the file names.
         """
         material = self._find_material(name)
         if material is None:
@@ -156,17 +158,17 @@ class MtlReader:
         return self._surfaces[key]
 
     def find_squares(self, name: str, candidates: Sequence[int]) -> list[int]:
-        """Return those of some UDIM squares for which a material has images.
+        """Return the UDIM squares for which a material has images: all candidates, or
+        none.
 
-        The first of its images that has a square in its name decides. All `candidates`
-        have images if the name has the placeholder ``<UDIM>``, or if there is an image
-        for one of them that is not the square in the name. If there is none, the image
-        is taken for an ordinary one that repeats, which is noted, and no square is
-        returned; nor is one if no name has a square.
+        The first of its images that has a square in its name decides. There are images
+        for all squares if the name has the placeholder ``<UDIM>``, or if there is an
+        image for a candidate that is not the square in the name. Otherwise the image is
+        taken for an ordinary one that repeats, which is noted.
 
         Args:
             name: the material.
-            candidates: squares, the first of which is 1001; 0 is none.
+            candidates: UDIM squares of faces; 0, for faces outside of all, is ignored.
         """
         material = self._find_material(name)
         if material is None:
@@ -174,20 +176,18 @@ class MtlReader:
         numbered_name = self._find_numbered_name(material)
         if numbered_name is None:
             return []
-        named_square = find_square(numbered_name)  # 0 is the placeholder
-        other_squares = [
-            square for square in candidates if square and square != named_square
-        ]
+        squares = [square for square in candidates if square]
+        named_square = find_square(numbered_name)
+        other_squares = [square for square in squares if square != named_square]
         if not other_squares:
             return []
-        exists = (
-            isinstance(
-                self.references.find(replace_square(numbered_name, square)), bytes
-            )
-            for square in other_squares
+        other_names = (
+            replace_square(numbered_name, square) for square in other_squares
         )
-        if named_square == 0 or any(exists):
-            return [square for square in candidates if square]
+        if named_square == PLACEHOLDER_SQUARE or any(
+            _exists(self.references, other_name) for other_name in other_names
+        ):
+            return squares
         self.notes.warn(
             f"{format_name(numbered_name)} is named like one of several pictures (UDIM), "
             "and there is none for the "
@@ -217,7 +217,7 @@ class MtlReader:
             name: the name by which the mesh file uses it.
         """
         # Statements are noted once, not for each square.
-        is_first = not any(
+        are_noted = any(
             material_id == id(material) for material_id, _ in self._surfaces
         )
         uses = self._parse_uses(material, square)
@@ -238,7 +238,7 @@ class MtlReader:
             normal_map=self._make_normal_map(material, uses),
             emission=self._make_emission(material, uses.get("map_ke")),
         )
-        if is_first:
+        if not are_noted:
             self._note_unread(material)
         is_clamped = bool(first_use.name) and any(
             use.options.get("clamp", "").lower() == "on" for use in uses.values()
@@ -248,16 +248,16 @@ class MtlReader:
     def _parse_uses(self, material: MtlMaterial, square: int) -> dict[str, MapUse]:
         """Return the maps of a material by keyword, with the images of a UDIM square.
 
-        They count as read, but for normal maps, of which only some are.
+        They count as read; but of normal maps, `_make_normal_map` reads only the first
+        that it can use.
         """
         uses = dict[str, MapUse]()
         for key in (*UV_MAPS, "map_pr", "map_pm"):
             use = self._parse_use(material, key)
             if use is not None:
                 uses[key] = use
-        material.keys.mark_read(
-            "illum", *(key for key in uses if key not in NORMAL_MAPS)
-        )
+        material.keys.mark_read(*(key for key in uses if key not in NORMAL_MAPS))
+        material.keys.mark_read("illum")  # noted by its value
         if square:
             uses = {
                 key: replace(use, name=replace_square(use.name, square))
@@ -297,18 +297,7 @@ class MtlReader:
         A texture is not multiplied by Kd, which is an exporter's default more often
         than a tint.
         """
-        argument = material.read_argument("kd")
-        color = None
-        values = parse_numbers(argument)
-        if values is not None and len(values) in (1, 3, 4):  # of four, three count
-            rgb = np.clip(np.broadcast_to(values[:3], (3,)), 0.0, 1.0)
-            color = rgb.astype(np.float32)
-        elif "kd" in material.statements:
-            statement = (
-                f"the Kd {format_name(argument)} of the material "
-                f"{format_name(material.name)}"
-            )
-            self.notes.warn(f"{statement} is no colour; neutral grey is used instead")
+        color = self._read_color(material)
         substitute = f"{describe_substitute(color)} is used instead"
         note_template = (
             f"{material.file} names the texture {{name}}, which {{why}}; {substitute}"
@@ -325,6 +314,24 @@ class MtlReader:
             color = None  # plain white does not change a texture
         return color, texture
 
+    def _read_color(self, material: MtlMaterial) -> Float32Array | None:
+        """Return the color (3,) of ``Kd``; None, and a note, if it is no color.
+
+        Of four numbers, three count.
+        """
+        argument = material.read_argument("kd")
+        values = parse_numbers(argument)
+        if values is not None and len(values) in (1, 3, 4):
+            rgb = np.clip(np.broadcast_to(values[:3], (3,)), 0.0, 1.0)
+            return np.asarray(rgb, np.float32)
+        if "kd" in material.statements:
+            statement = (
+                f"the Kd {format_name(argument)} of the material "
+                f"{format_name(material.name)}"
+            )
+            self.notes.warn(f"{statement} is no colour; neutral grey is used instead")
+        return None
+
     def _note_unread(self, material: MtlMaterial) -> None:
         """Note the statements that are not read, unless they change nothing.
 
@@ -334,10 +341,7 @@ class MtlReader:
         Kd, and illumination models with more than highlights.
         """
         zero_keys = {
-            key
-            for key in material.statements
-            # What has no numbers is not zero.
-            if not any(parse_numbers(material.peek_argument(key)) or [1.0])
+            key for key in material.statements if _is_zero(material.peek_argument(key))
         }
         base_map = parse_map(without_comment(material.statements.get("map_kd", "")))
 
@@ -350,14 +354,10 @@ class MtlReader:
                 return True
             if key == "tf":  # a grey filter: all its numbers are equal
                 return len(set(rest.split())) == 1
-            if key == "map_ka":
-                use = parse_map(rest)
-                return (
-                    use is not None
-                    and base_map is not None
-                    and use.name == base_map.name
-                )
-            return False
+            if key != "map_ka" or base_map is None:
+                return False
+            ambient_map = parse_map(rest)
+            return ambient_map is not None and ambient_map.name == base_map.name
 
         for key in material.overridden:
             self.notes.record("earlier material statement", key)
@@ -409,9 +409,9 @@ class MtlReader:
             """Return whether an option has a value that changes nothing."""
             if option == "colorspace":
                 return value.lower() == ("srgb" if has_colors else "linear")
-            is_default = value.lower() == DEFAULT_OPTIONS.get(option)
-            is_zero = not any(parse_numbers(value) or [1.0])  # 1: it has no numbers
-            return (is_default or is_zero) and option != "imfchan"
+            if option == "imfchan":
+                return False
+            return value.lower() == DEFAULT_OPTIONS.get(option) or _is_zero(value)
 
         for option in options.find_unread(is_quiet):
             self.notes.record(
@@ -423,8 +423,9 @@ class MtlReader:
     ) -> ImportedSurface:
         """Return a surface with its opacity.
 
-        It is ``d``, or 1 - ``Tr``, which some programs write for d, times the image of
-        ``map_d``, resized to that of the color. The color alone has the factor alone.
+        That is ``d``, or 1 - ``Tr``, times the image of ``map_d``, which is resized to
+        that of the color. The single color, which counts where there is no texture, has
+        only the first factor.
         """
         factor = self._read_opacity(material)
         image = self._load_image(
@@ -461,27 +462,30 @@ class MtlReader:
         """
         if "-halo" in material.read_argument("d").lower().split():
             self.notes.record("option", "-halo of d")
-        opacity = parse_fraction(material.read_argument("d"), -1.0)  # -1: there is none
-        transparency = parse_fraction(material.read_argument("tr"), -1.0)
+        opacity = parse_fraction(material.read_argument("d"))
+        transparency = parse_fraction(material.read_argument("tr"))
+        if transparency is None:
+            return 1.0 if opacity is None else opacity
         material_phrase = (
             f"the material {format_name(material.name)} has Tr {transparency:g}"
         )
-        if opacity >= 0.0 and transparency >= 0.0:
-            # to two digits, since programs round
-            agrees_as_opacity = abs(transparency - opacity) <= 0.01
-            agrees_as_transparency = abs(1.0 - transparency - opacity) <= 0.01
-            if not agrees_as_opacity and not agrees_as_transparency:
+        if opacity is None:
+            if transparency > 0.0:
                 self.notes.warn(
-                    f"{material_phrase} beside d {opacity:g}, which it contradicts; d is "
-                    "taken for its opacity"
+                    f"{material_phrase} and no d: it is taken for transparency, which "
+                    f"makes its opacity {1.0 - transparency:g}; some programs"
+                    f" mean opacity by it, so write d in its place"
                 )
-        elif opacity < 0.0 < transparency:  # there is a Tr alone, and it is not 0
+            return 1.0 - transparency
+        # to two digits, since programs round
+        agrees_as_opacity = abs(transparency - opacity) <= 0.01
+        agrees_as_transparency = abs(1.0 - transparency - opacity) <= 0.01
+        if not agrees_as_opacity and not agrees_as_transparency:
             self.notes.warn(
-                f"{material_phrase} and no d: it is taken for transparency, which makes its "
-                f"opacity {1.0 - transparency:g}; some programs"
-                f" mean opacity by it, so write d in its place"
+                f"{material_phrase} beside d {opacity:g}, which it contradicts; d is "
+                "taken for its opacity"
             )
-        return opacity if opacity >= 0.0 else 1.0 - max(transparency, 0.0)
+        return opacity
 
     def _read_fraction(
         self,
@@ -506,7 +510,7 @@ class MtlReader:
             f"{material.spelling.get(f'map_{key}')} {{name}} {{why}}; it is left out"
         )
         image = self._load_image(use, "numbers", note_template)
-        number = parse_fraction(material.read_argument(key), -1.0)  # -1: none
+        number = parse_fraction(material.read_argument(key))
         if use is not None and image is not None:
             self.notes.warn(
                 "textures of roughness and metallic are replaced by their means"
@@ -516,7 +520,7 @@ class MtlReader:
             return float(
                 average_over_faces(channel, uvs * use.scale + use.offset, areas)[0]
             )
-        return number if number >= 0.0 else None
+        return number
 
     def _make_normal_map(
         self, material: MtlMaterial, uses: dict[str, MapUse]
@@ -598,12 +602,13 @@ def _select_channel(picture: Float32Array, use: MapUse) -> Float32Array:
     They are the channel that ``-imfchan`` names; or else the alpha, if it is not opaque
     everywhere; or else the mean of the colors, also for an alpha that is not there.
     """
-    channel = CHANNELS.get(use.options.get("imfchan", "").lower())
-    has_alpha = picture.shape[2] == 4
     alpha_index = 3
+    has_alpha = picture.shape[2] == 4
+    channel = CHANNELS.get(use.options.get("imfchan", "").lower())
     if channel is None and has_alpha and picture[:, :, alpha_index].min() < 1.0:
         channel = alpha_index
-    if channel is None or (channel == alpha_index and not has_alpha):
+    lacks_channel = channel == alpha_index and not has_alpha
+    if channel is None or lacks_channel:
         mean: Float32Array = picture[:, :, :3].mean(axis=2)
         return mean
     return picture[:, :, channel]
@@ -613,7 +618,8 @@ def find_libraries(arguments: Sequence[str], references: References) -> list[str
     """Return the names of the material files that ``mtllib`` lines name.
 
     A line may name several files, and a name may have blanks. So a line that is itself
-    the name of a file is one name; else a name ends in ``.mtl``; else at a blank.
+    the name of a file is one name. Otherwise it is split after each ``.mtl``, and the
+    rest at blanks, if these are names; if not, the line is one name after all.
 
     Args:
         arguments: what follows ``mtllib`` in each line.
@@ -629,7 +635,8 @@ def find_libraries(arguments: Sequence[str], references: References) -> list[str
         else:
             candidates = _split_libraries(argument_without_comment)
             have_suffix = all(map(_has_mtl_suffix, candidates))
-            if have_suffix or any(_exists(references, name) for name in candidates):
+            exist = (_exists(references, name) for name in candidates)
+            if have_suffix or any(exist):
                 names += candidates
             else:
                 names.append(argument_without_comment)
@@ -667,6 +674,7 @@ def _split_libraries(line: str) -> list[str]:
 
 FIRST_SQUARE = 1001
 SQUARES_PER_ROW = 10
+PLACEHOLDER_SQUARE = 0  # of a name that stands for the images of all squares
 _SQUARE_NUMBER = re.compile(r"(?<!\d)1\d{3}(?=\.\w+$)")
 _PLACEHOLDER = re.compile(r"<UDIM>", re.IGNORECASE)
 
@@ -674,10 +682,10 @@ _PLACEHOLDER = re.compile(r"<UDIM>", re.IGNORECASE)
 def find_square(name: str) -> int | None:
     """Return the UDIM square in the name of an image, or None if it has none.
 
-    It is 0 if the name has the placeholder ``<UDIM>``.
+    It is `PLACEHOLDER_SQUARE` if the name has the placeholder ``<UDIM>``.
     """
     if _PLACEHOLDER.search(name):
-        return 0
+        return PLACEHOLDER_SQUARE
     match = _SQUARE_NUMBER.search(name)
     if match is None or int(match[0]) < FIRST_SQUARE:
         return None
@@ -774,7 +782,7 @@ class MtlMaterial:
         return self.peek_argument(key)
 
     def peek_argument(self, key: str) -> str:
-        """Return what `numbers` returns, without counting the statement as read."""
+        """Return what `read_argument` does, without counting the statement as read."""
         return self.statements.get(key, "").partition("#")[0].strip()
 
 
@@ -783,8 +791,7 @@ class MapUse:
     """A statement that names a picture."""
 
     name: str  # name of the picture, as the file has it
-    # its options by their names, in lower case, as (name, value)
-    options: dict[str, str]
+    options: dict[str, str]  # the values of its options by their names, in lower case
     # How often the image repeats over a unit of u and of v (``-s``).
     scale: Pair = (1.0, 1.0)
     offset: Pair = (0.0, 0.0)  # what is added to scaled texture coordinates (``-o``)
@@ -835,7 +842,8 @@ def parse_map(argument: str) -> MapUse | None:
     options: dict[str, str] = {}
     for match in _OPTION.finditer(argument):
         for key in _OPTIONS:
-            # The group "s" is the option's name, the group "s_" its value.
+            # `_OPTION` has two groups for each option: "s" is its name as it stands,
+            # and "s_" its value.
             if match[key] is not None:
                 options[key] = match[f"{key}_"]
     name = " ".join(_OPTION.sub("", argument).split())
@@ -846,7 +854,7 @@ def parse_map(argument: str) -> MapUse | None:
         unknown = _UNKNOWN.match(name)
     if not name:
         return None
-    bump, _ = _parse_pair(options, "bm", (1.0, 1.0))
+    bump, _ = _parse_pair(options, "bm", (1.0, 1.0))  # it has one number
     return MapUse(
         name,
         options,
@@ -876,10 +884,17 @@ def parse_numbers(argument: str) -> list[float] | None:
     return values if values and all(map(math.isfinite, values)) else None
 
 
-def parse_fraction(argument: str, default: float) -> float:
+def parse_fraction(argument: str) -> float | None:
     """Return the last word of a statement as a number clipped to [0, 1].
 
-    It is `default` if that is no number; options may stand before it.
+    None if that is no number. Options may stand before it.
     """
-    values = parse_numbers(" ".join(argument.split()[-1:]))
-    return default if values is None else min(max(values[0], 0.0), 1.0)
+    last_word = " ".join(argument.split()[-1:])
+    values = parse_numbers(last_word)
+    return None if values is None else min(max(values[0], 0.0), 1.0)
+
+
+def _is_zero(argument: str) -> bool:
+    """Return whether a statement has numbers, and all of them are 0."""
+    values = parse_numbers(argument)
+    return values is not None and not any(values)

@@ -382,13 +382,13 @@ def _make_mesh(
         raise InputError(f"{file}: {error}") from None
     if stored_vertices is None:
         return normalised_mesh
+    # The soup was divided by the first extent, the mesh is divided by the second.
+    soup_extent = compute_extent(parts)
+    mesh_extent = float(np.ptp(mesh.vertices.astype(np.float64), axis=0).max())
     # Imported late: torch takes seconds, and most objects have no joints.
     from advsearch.scene.rigged import SkeletonRig
 
     movable_parts = [part.movable for part in parts if part.movable is not None]
-    # The soup was divided by the first extent, the mesh is divided by the second.
-    soup_extent = compute_extent(parts)
-    mesh_extent = float(np.ptp(mesh.vertices.astype(np.float64), axis=0).max())
     rig = SkeletonRig(
         movable_parts, stored_vertices, turn / (soup_extent * mesh_extent)
     )

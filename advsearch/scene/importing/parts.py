@@ -346,19 +346,10 @@ def split_at_corners(
         surface: as in `ImportedPart`.
         flat: as in `ImportedPart`.
     """
-    # One number for each corner, the digits of which are its rows of all values: in
-    # base (number of values + 1), since a missing row is -1, which is the digit 0.
-    corner_key = np.zeros(3 * len(triangles), dtype=np.int64)
-    n_codes = 1  # bound of the numbers
-    for indexed in filter(None, (points, normals, uvs)):
-        base = len(indexed.values) + 1
-        if n_codes * base >= 2**63:  # numbered anew, so that it does not overflow
-            corner_key = np.unique(corner_key, return_inverse=True)[1].reshape(-1)
-            n_codes = len(corner_key)
-        corner_key = corner_key * base + indexed.rows[triangles].reshape(-1) + 1
-        n_codes *= base
+    corner_number = _number_corners(triangles, points, normals, uvs)
+    # for each vertex its first corner, and for each corner its vertex
     _, first_corner, faces = np.unique(
-        corner_key, return_index=True, return_inverse=True
+        corner_number, return_index=True, return_inverse=True
     )
 
     def gather_vertex_values(indexed: IndexedValues | None) -> Float64Array | None:
@@ -380,3 +371,26 @@ def split_at_corners(
         surface=surface,
         flat=flat,
     )
+
+
+def _number_corners(triangles: IntArray, *columns: IndexedValues | None) -> IntArray:
+    """Return a number for each corner of triangles (T,), equal where all rows are.
+
+    Its digits are the corner's rows of all columns, each in the base of that column's
+    number of values plus 1: a missing row is -1, which is the digit 0.
+
+    Returns:
+        (3 T,), corner by corner.
+    """
+    corner_number = np.zeros(3 * len(triangles), dtype=np.int64)
+    bound = 1  # all numbers are smaller
+    for indexed in filter(None, columns):
+        base = len(indexed.values) + 1
+        # numbered anew, so that the next digit does not overflow
+        if bound * base >= 2**63:
+            _, corner_number = np.unique(corner_number, return_inverse=True)
+            corner_number = corner_number.reshape(-1)
+            bound = len(corner_number)
+        corner_number = corner_number * base + indexed.rows[triangles].reshape(-1) + 1
+        bound *= base
+    return corner_number

@@ -91,43 +91,64 @@ def load_display_image(
         image.load()
         # the factor by which the image becomes smaller; from 1 on it stays as it is
         shrink = 1.0 if limit is None else limit / max(height, width)
-        # Tables of the 256 levels, which replace a computation for each pixel.
-        display_of_level: Float32Array = np.arange(256, dtype=np.float32) / np.float32(
-            255.0
-        )
         if shrink >= 1.0:
-            return np.asarray(display_of_level[to_8bit_levels(image, alpha=keep_alpha)])
+            return np.asarray(_VALUE_OF_LEVEL[to_8bit_levels(image, alpha=keep_alpha)])
         target_shape = max(1, round(height * shrink)), max(1, round(width * shrink))
-        linear_of_level = (
-            display_of_level if is_raw else srgb_to_linear(display_of_level)
-        )
-        # Transparent pixels do not count in the mean of colors.
-        is_weighted = not is_raw and (keep_alpha or image.has_transparency_data)
-
-        def load_band(top: int, end: int) -> Float32Array:
-            """Return rows of colors; with opacity also that, and their product."""
-            band_image = image.crop((0, top, width, end))
-            levels = to_8bit_levels(band_image, alpha=is_weighted)
-            colors = linear_of_level[levels[:, :, :3]]
-            if not is_weighted:
-                return colors
-            opacity = display_of_level[levels[:, :, 3:]]
-            return np.concatenate([colors, opacity, colors * opacity], axis=2)
-
-        averaged = average_in_bands(load_band, (height, width), target_shape)
         if is_raw:
-            return averaged
-        # As `load_band` returns them: colors, opacity and their product.
-        colors = averaged[:, :, :3]
-        opacity = averaged[:, :, 3:4]
-        if is_weighted:
-            weighted_colors = averaged[:, :, 4:] / np.maximum(opacity, 1e-9)
-            # Where all is transparent, the mean color stays.
-            colors = np.where(opacity > 0.0, weighted_colors, colors)
-        display_colors = linear_to_srgb(colors)
-        if not keep_alpha:
-            return display_colors
-        return np.concatenate([display_colors, opacity], axis=2)
+            return _average_numbers(image, target_shape)
+        return _average_colors(image, target_shape, keep_alpha=keep_alpha)
+
+
+# (256,) the values in [0, 1] of 8-bit levels: a table replaces a computation per pixel
+_VALUE_OF_LEVEL: Float32Array = np.arange(256, dtype=np.float32) / np.float32(255.0)
+
+
+def _average_numbers(image: Image.Image, target_shape: tuple[int, int]) -> Float32Array:
+    """Return an image of numbers averaged down as it is, (height, width, 3)."""
+    width, height = image.size
+
+    def load_band(top: int, end: int) -> Float32Array:
+        """Return rows of values."""
+        levels = to_8bit_levels(image.crop((0, top, width, end)), alpha=False)
+        return np.asarray(_VALUE_OF_LEVEL[levels[:, :, :3]])
+
+    return average_in_bands(load_band, (height, width), target_shape)
+
+
+def _average_colors(
+    image: Image.Image, target_shape: tuple[int, int], *, keep_alpha: bool
+) -> Float32Array:
+    """Return an image of colors averaged down in linear light, display-referred.
+
+    Its shape is (height, width, 3), or 4 with the opacity if `keep_alpha`. Transparent
+    pixels do not count in the mean of colors.
+    """
+    width, height = image.size
+    linear_of_level = srgb_to_linear(_VALUE_OF_LEVEL)
+    is_weighted = keep_alpha or image.has_transparency_data
+
+    def load_band(top: int, end: int) -> Float32Array:
+        """Return rows of colors; with opacity also that, and their product."""
+        band_image = image.crop((0, top, width, end))
+        levels = to_8bit_levels(band_image, alpha=is_weighted)
+        colors = linear_of_level[levels[:, :, :3]]
+        if not is_weighted:
+            return colors
+        opacity = _VALUE_OF_LEVEL[levels[:, :, 3:]]
+        return np.concatenate([colors, opacity, colors * opacity], axis=2)
+
+    averaged = average_in_bands(load_band, (height, width), target_shape)
+    # as `load_band` returns them
+    colors = averaged[:, :, :3]
+    opacity = averaged[:, :, 3:4]
+    if is_weighted:
+        weighted_colors = averaged[:, :, 4:] / np.maximum(opacity, 1e-9)
+        # Where all is transparent, the mean color stays.
+        colors = np.where(opacity > 0.0, weighted_colors, colors)
+    display_colors = linear_to_srgb(colors)
+    if not keep_alpha:
+        return display_colors
+    return np.concatenate([display_colors, opacity], axis=2)
 
 
 def average_in_bands(
@@ -232,6 +253,8 @@ LARGEST_SUM = 2 * MAX_PIXELS
 `scaled`.
 """
 UNREADABLE = "cannot be read as a picture"
+NO_PATH = ": "  # begins the message of an error about an image without a path
+MIN_TEXTURE_SIDE = 64  # however many materials a file has
 MAX_FULL_TEXTURES = 16
 """Materials whose textures may be as large as `TEXTURE_LIMIT`; more are baked into one
 map, so that smaller ones suffice.
@@ -264,7 +287,7 @@ class FileImages:
             return self.limit
         side = TEXTURE_LIMIT
         max_texels = MAX_FULL_TEXTURES * TEXTURE_LIMIT * TEXTURE_LIMIT
-        while side > 64 and self.materials * side * side > max_texels:
+        while side > MIN_TEXTURE_SIDE and self.materials * side * side > max_texels:
             side //= 2
         return side
 
@@ -317,37 +340,19 @@ class FileImages:
     ) -> Float32Array | str:
         """Return the values of an image, or the reason why there are none.
 
-        An image that is read counts towards the largest number of pixels of all images
-        of its sort (numbers, or colors); if it was made smaller, a note says so.
+        A note says so if it was made smaller.
         """
         try:
             image = Image.open(io.BytesIO(read_bytes()), formats=FORMATS)
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
             return self.references.refused.get(normalize_name(name), UNREADABLE)
-        (width, height) = image.size
-        is_raw = kind == "numbers"
-        n_pixels = self._pixels[is_raw] + width * height
         try:
-            check_pixels("", width, height)
-            check_most(
-                "",
-                n_pixels,
-                LARGEST_SUM,
-                "pictures of at most {} pixels",
-                f"{n_pixels:,} in all",
-            )
-            texture = load_display_image(
-                image,
-                self.max_side,
-                "",
-                keep_alpha=kind == "colours and alpha",
-                is_raw=is_raw,
-            )
+            texture = self._load_within_limits(image, kind)
         except FileFormatError as error:
-            return f"is not read ({str(error).removeprefix(': ')})"
+            return f"is not read ({str(error).removeprefix(NO_PATH)})"
         except (OSError, ValueError, SyntaxError, EOFError):
             return UNREADABLE
-        self._pixels[is_raw] = n_pixels
+        width, height = image.size
         rows, columns = texture.shape[:2]
         if (columns, rows) != (width, height):
             label = f"the texture {format_name(name)}" if name else "a texture"
@@ -355,4 +360,31 @@ class FileImages:
                 f"{label} of {width:,} x {height:,} texels is averaged "
                 f"down to {columns:,} x {rows:,}"
             )
+        return texture
+
+    def _load_within_limits(self, image: Image.Image, kind: ImageKind) -> Float32Array:
+        """Return the values of an opened image, and count its pixels.
+
+        Those of all images of its sort, numbers or colors, are limited in total. Raises
+        what `load_display_image` does.
+        """
+        width, height = image.size
+        is_raw = kind == "numbers"
+        n_pixels = self._pixels[is_raw] + width * height
+        check_pixels("", width, height)
+        check_most(
+            "",
+            n_pixels,
+            LARGEST_SUM,
+            "pictures of at most {} pixels",
+            f"{n_pixels:,} in all",
+        )
+        texture = load_display_image(
+            image,
+            self.max_side,
+            "",
+            keep_alpha=kind == "colours and alpha",
+            is_raw=is_raw,
+        )
+        self._pixels[is_raw] = n_pixels
         return texture

@@ -7,7 +7,7 @@ known here.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -85,7 +85,7 @@ class Element:
     # Values (N,) of properties with one in each row.
     scalars: dict[str, Numbers] = field(default_factory=dict)
     # Values of list properties.
-    listed: dict[str, ListValues] = field(default_factory=dict)
+    lists: dict[str, ListValues] = field(default_factory=dict)
 
 
 def read_elements(data: bytes, notes: Notes) -> tuple[dict[str, Element], list[str]]:
@@ -108,7 +108,6 @@ def read_elements(data: bytes, notes: Notes) -> tuple[dict[str, Element], list[s
     )
     notes.check_faces(elements["face"].count if "face" in elements else 0)
     body = data[header_end.end() :]
-    position = 0
     # `cells` are bytes to read from: of an ASCII file, those of its numbers as float64.
     if byte_order:
         cells = np.frombuffer(body, np.uint8)
@@ -116,8 +115,11 @@ def read_elements(data: bytes, notes: Notes) -> tuple[dict[str, Element], list[s
     else:
         cells = parse_number_array(body, np.float64).view(np.uint8)
         text = body
+    position = 0
+    # All rows are assumed to be as long as the first, so that values are gathered at
+    # once. Where lists turn out to differ in length, rows are walked one by one.
     for element in elements.values():
-        position = _read_rows(notes, element, cells, position, text)
+        position = _RowReader(notes, element, cells, text).read(position)
     return elements, comments
 
 
@@ -141,25 +143,23 @@ def _parse_header(
         match line.split():
             case ["format", kind, *_] if kind in _FORMATS:
                 byte_order = _FORMATS[kind]
-            case ["comment" | "obj_info", *_]:
-                comments.append(line.strip().partition(line.split()[0])[2].strip())
+            case ["comment" | "obj_info" as keyword, *_]:
+                comments.append(line.strip().removeprefix(keyword).strip())
             case ["element", name, count] if (
                 # no more digits than 64 bits have
                 count.isdecimal() and len(count) < 20 and name not in elements
             ):
                 element = Element(name, int(count))
                 elements[name] = element
-            case ["property", "list", counts, kind, name] if (
-                element and counts in _TYPES and kind in _TYPES
+            case ["property", "list", count_kind, kind, name] if (
+                element and count_kind in _TYPES and kind in _TYPES
             ):
-                element.types[name] = np.dtype((byte_order or "") + _TYPES[kind])
-                element.count_types[name] = np.dtype(
-                    (byte_order or "") + _TYPES[counts]
-                )
+                element.types[name] = _make_dtype(kind, byte_order)
+                element.count_types[name] = _make_dtype(count_kind, byte_order)
             case ["property", kind, name] if (
                 element and kind in _TYPES and name not in element.types
             ):
-                element.types[name] = np.dtype((byte_order or "") + _TYPES[kind])
+                element.types[name] = _make_dtype(kind, byte_order)
             case []:
                 pass
             case _:
@@ -174,128 +174,143 @@ def _parse_header(
     return elements, comments, byte_order
 
 
-def _read_rows(
-    notes: Notes,
-    element: Element,
-    cells: npt.NDArray[np.uint8],
-    position: int,
-    text: bytes,
-) -> int:
-    """Read the rows of an element, and return the position of the byte after them.
+def _make_dtype(kind: str, byte_order: str | None) -> np.dtype[np.generic]:
+    """Return the type of numbers of a kind; without a byte order, in that of the
+    machine.
+    """
+    return np.dtype((byte_order or "") + _TYPES[kind])
 
-    All rows are assumed to be as long as the first, so that their values are gathered
-    at once. If the lengths of lists, read on that assumption, differ, the rows are
-    walked one by one instead.
 
-    Args:
+@dataclass
+class _RowReader:
+    """Reads the rows of an element.
+
+    Attributes:
         notes: notes about the file.
-        element: its values are filled in.
+        element: the element, whose values are filled in.
         cells: the bytes of the file's body; of an ASCII file, those of its numbers as
             float64.
-        position: the byte at which the element begins.
-        text: the body of an ASCII file, for messages; empty for a binary file.
-
-    Raises:
-        FileFormatError: the file ends early, or has a list of an impossible length.
+        text: the body of an ASCII file; empty for a binary file.
+        values: by property, the number of its type that begins at each byte.
+        counts: by property that is a list, the count that begins at each byte. A list
+            is its count and then its values.
+        widths: by property, the bytes of a scalar, or of the count of a list.
     """
 
-    def view_from_any_byte(kind: np.dtype[np.generic]) -> Numbers:
+    notes: Notes
+    element: Element
+    cells: npt.NDArray[np.uint8]
+    text: bytes
+
+    def __post_init__(self) -> None:
+        element = self.element
+        self.values = {
+            name: self._view_from_any_byte(kind) for name, kind in element.types.items()
+        }
+        self.counts = {
+            name: self._view_from_any_byte(kind)
+            for name, kind in element.count_types.items()
+        }
+        self.widths = {
+            name: self.counts.get(name, numbers).itemsize
+            for name, numbers in self.values.items()
+        }
+
+    def read(self, position: int) -> int:
+        """Read all rows, and return the position of the byte after them.
+
+        Args:
+            position: the byte at which the element begins.
+
+        Raises:
+            FileFormatError: the file ends early, or has a list of an impossible length.
+        """
+        if not self.element.count or not self.widths:
+            return position
+        # At least the scalars and counts have to be there, before memory is taken for
+        # rows.
+        self._check_end(position + self.element.count * sum(self.widths.values()))
+        starts, end = self._find_even_rows(position)
+        lists_differ = end > len(self.cells) or any(
+            np.ptp(numbers[starts[name]]) != 0 for name, numbers in self.counts.items()
+        )
+        if lists_differ:
+            starts, end = self._walk_rows(position, self.element.count)
+        self._store_values(starts)
+        return end
+
+    def _view_from_any_byte(self, kind: np.dtype[np.generic]) -> Numbers:
         """Return the numbers of a type that begin at each byte.
 
         No byte is copied: number i of the view is made of the bytes from i on.
         """
-        kind = np.dtype(np.float64) if text else kind  # an ASCII file's numbers
-        n_starts = max(0, len(cells) - kind.itemsize + 1)
+        kind = np.dtype(np.float64) if self.text else kind  # an ASCII file's numbers
+        n_starts = max(0, len(self.cells) - kind.itemsize + 1)
         # a stride of one byte
-        numbers: Numbers = np.ndarray((n_starts,), kind, cells, 0, (1,))
+        numbers: Numbers = np.ndarray((n_starts,), kind, self.cells, 0, (1,))
         return numbers
 
-    values = {name: view_from_any_byte(kind) for name, kind in element.types.items()}
-    counts = {
-        name: view_from_any_byte(kind) for name, kind in element.count_types.items()
-    }
-    # Bytes of a scalar, or of the count of a list.
-    scalar_widths = {
-        name: counts.get(name, numbers).itemsize for name, numbers in values.items()
-    }
+    def _find_even_rows(self, position: int) -> tuple[dict[str, IntArray], int]:
+        """Return what `_walk_rows` does if all rows are as long as the first."""
+        first_starts, first_end = self._walk_rows(position, 1)
+        row_size = first_end - position
+        row_offsets = row_size * np.arange(self.element.count)
+        starts = {name: start + row_offsets for name, start in first_starts.items()}
+        return starts, position + row_size * self.element.count
 
-    def check_end(end: int) -> None:
-        """Raise FileFormatError if the file has fewer bytes than `end`."""
-        if end > len(cells):
-            raise _make_length_error(notes, element, text)
-
-    def walk_rows(n_rows: int) -> tuple[dict[str, IntArray], int]:
-        """Walk through rows one by one.
+    def _walk_rows(self, position: int, n_rows: int) -> tuple[dict[str, IntArray], int]:
+        """Walk through rows one by one, from the byte at a position.
 
         Returns:
             For each property the bytes at which it begins, (n_rows,); and the byte
             after the last row.
         """
-        starts = {name: list[int]() for name in scalar_widths}
+        starts = {name: list[int]() for name in self.widths}
         byte = position
-        # a longer list than the whole file could hold is damage
-        max_length = len(cells) // (8 if text else 1)  # float64 have 8 bytes
         for _ in range(n_rows):
-            for name, width in scalar_widths.items():
+            for name, width in self.widths.items():
                 starts[name].append(byte)
-                check_end(byte + width)
-                if name in counts:
-                    length = counts[name].item(byte)
-                    if not 0 <= length <= max_length:
-                        expected = (
-                            f"lists in the PLY element {format_name(element.name)}"
-                        )
-                        raise notes.damaged(expected, f"one of {length:g} values")
-                    byte += values[name].itemsize * int(length)
+                self._check_end(byte + width)
+                if name in self.counts:
+                    length = self._read_length(name, byte)
+                    byte += self.values[name].itemsize * length
                 byte += width
-        check_end(byte)
+        self._check_end(byte)
         arrays = {
             name: np.array(positions, dtype=np.int64)
             for name, positions in starts.items()
         }
         return arrays, byte
 
-    if not element.count or not scalar_widths:
-        return position
-    # At least the scalars and counts have to be there, before memory is taken for rows.
-    check_end(position + element.count * sum(scalar_widths.values()))
-    # All rows are assumed to be as long as the first.
-    first_starts, first_end = walk_rows(1)
-    row_size = first_end - position
-    end = position + row_size * element.count
-    row_offsets = row_size * np.arange(element.count)
-    starts = {name: start + row_offsets for name, start in first_starts.items()}
-    lists_differ = end > len(cells) or any(
-        np.ptp(numbers[starts[name]]) != 0 for name, numbers in counts.items()
-    )
-    if lists_differ:
-        starts, end = walk_rows(element.count)
-    _store_values(element, starts, values, counts)
-    return end
+    def _read_length(self, name: str, byte: int) -> int:
+        """Return the length of the list that begins at a byte."""
+        length = self.counts[name].item(byte)
+        # A longer list than the whole file could hold is damage. A float64 of an ASCII
+        # file has 8 bytes.
+        max_length = len(self.cells) // (8 if self.text else 1)
+        if not 0 <= length <= max_length:
+            expected = f"lists in the PLY element {format_name(self.element.name)}"
+            raise self.notes.damaged(expected, f"one of {length:g} values")
+        return int(length)
 
+    def _check_end(self, end: int) -> None:
+        """Raise FileFormatError if the file has fewer bytes than `end`."""
+        if end > len(self.cells):
+            raise _make_length_error(self.notes, self.element, self.text)
 
-def _store_values(
-    element: Element,
-    starts: Mapping[str, IntArray],
-    values: Mapping[str, Numbers],
-    counts: Mapping[str, Numbers],
-) -> None:
-    """Fill in the values of an element.
+    def _store_values(self, starts: Mapping[str, IntArray]) -> None:
+        """Fill in the values of the element.
 
-    Args:
-        element: its scalars and lists are set.
-        starts: by property, the bytes (rows,) at which it begins in each row.
-        values: by property, the number of its type that begins at each byte.
-        counts: by property that is a list, the count that begins at each byte. A list
-            is its count and then its values.
-    """
-    for name, property_starts in starts.items():
-        if name in counts:
-            lengths = counts[name][property_starts].astype(np.int64)
-            first_values = property_starts + counts[name].itemsize
-            element.listed[name] = _gather_lists(values[name], first_values, lengths)
-        else:
-            element.scalars[name] = values[name][property_starts]
+        `starts` are, by property, the bytes (rows,) at which it begins in each row.
+        """
+        for name, property_starts in starts.items():
+            values = self.values[name]
+            if name in self.counts:
+                lengths = self.counts[name][property_starts].astype(np.int64)
+                first_values = property_starts + self.counts[name].itemsize
+                self.element.lists[name] = _gather_lists(values, first_values, lengths)
+            else:
+                self.element.scalars[name] = values[property_starts]
 
 
 def _gather_lists(
@@ -405,15 +420,14 @@ def _make_parts(
     normals = reader.read_columns("vertex", (("nx", "ny", "nz"),))
     normal = None if normals is None else IndexedValues(normals, position.rows)
     uvs = reader.read_uvs(corners, corner_counts, triangles)
-    texture = reader.read_texture_indices(texture_names, corners, corner_counts)[
-        polygon
-    ]
+    polygon_textures = reader.read_texture_indices(
+        texture_names, corners, corner_counts
+    )
+    texture = polygon_textures[polygon]
     colors = reader.read_colors(position.rows, polygon)
-    # Index -1, of faces without texture, is the last surface.
-    surfaces = [
-        *reader.make_surfaces(texture_names, has_no_colors=colors is None),
-        ImportedSurface(),
-    ]
+    surfaces = reader.make_surfaces(texture_names, has_no_colors=colors is None)
+    # The last one is for faces without texture, whose index is -1.
+    surfaces.append(ImportedSurface())
     parts = list[ImportedPart]()
     has_uvs = np.zeros(len(triangles), np.bool_)
     if uvs is not None:
@@ -471,26 +485,34 @@ class _Properties:
         Returns:
             The values as float64, or None if the element has none of the groups.
         """
-        group = self._find_group(element, "scalars", *groups)
+        scalars = self._get_scalars(element)
+        group = self._find_group(element, scalars, groups)
         if not group:
             return None
-        scalars = self.elements[element].scalars
         return np.stack([scalars[name].astype(np.float64) for name in group], axis=1)
 
     def _find_list(self, element: str, names: Sequence[str]) -> ListValues | None:
         """Return the first of several list properties that an element has, or None."""
-        group = self._find_group(element, "listed", *((name,) for name in names))
-        return self.elements[element].listed[group[0]] if group else None
+        if element not in self.elements:
+            return None
+        lists = self.elements[element].lists
+        group = self._find_group(element, lists, [(name,) for name in names])
+        return lists[group[0]] if group else None
+
+    def _get_scalars(self, element: str) -> Mapping[str, Numbers]:
+        """Return the scalar properties of an element, none if there is no such one."""
+        return self.elements[element].scalars if element in self.elements else {}
 
     def _find_group(
-        self, element: str, table: str, *groups: tuple[str, ...]
+        self,
+        element: str,
+        properties: Container[str],
+        groups: Iterable[tuple[str, ...]],
     ) -> tuple[str, ...]:
-        """Return the first group of properties that an element has, () if it has none.
+        """Return the first group of names that are all properties, () if none is.
 
-        The properties count as read. `table` is "scalars" or "listed", a field of
-        `Element`.
+        These properties of the element count as read.
         """
-        properties = getattr(self.elements.get(element), table, {})
         for group in groups:
             if all(name in properties for name in group):
                 for name in group:
@@ -498,11 +520,11 @@ class _Properties:
                 return group
         return ()
 
-    def read_polygons(self, points: int) -> tuple[IntArray, IntArray]:
+    def read_polygons(self, n_points: int) -> tuple[IntArray, IntArray]:
         """Return the polygons of the file: its faces, then the triangles of strips.
 
         Args:
-            points: how many vertices there are.
+            n_points: how many vertices there are.
 
         Returns:
             The vertices (C,) of the corners of all polygons, concatenated, and the
@@ -512,15 +534,7 @@ class _Properties:
             FileFormatError: there are none, one has too many or too few corners, or
                 refers to what is not there.
         """
-        # If corners have none of the known names, any other list counts.
-        face_element = self.elements.get("face")
-        names: tuple[str, ...] = CORNER_NAMES
-        if face_element is not None:
-            other_lists = [
-                name for name in face_element.listed if name not in WEDGE_UV_NAMES
-            ]
-            names = (*CORNER_NAMES, *other_lists)
-        faces = self._find_list("face", names)
+        faces = self._find_corner_lists()
         strips = self._find_list("tristrips", CORNER_NAMES)
         corners = np.zeros(0, np.int64)
         counts = np.zeros(0, np.int64)
@@ -531,6 +545,25 @@ class _Properties:
             triangles = _split_strips(_to_integers(strips.values), strips.counts)
             corners = np.concatenate([corners, triangles.reshape(-1)])
             counts = np.concatenate([counts, np.full(len(triangles), 3)])
+        self._check_polygons(corners, counts, n_points)
+        return corners, counts
+
+    def _find_corner_lists(self) -> ListValues | None:
+        """Return the vertices of the corners of each face, or None.
+
+        If no list of faces has one of the known names, any other counts, but those of
+        texture coordinates.
+        """
+        names: tuple[str, ...] = CORNER_NAMES
+        if "face" in self.elements:
+            lists = self.elements["face"].lists
+            names += tuple(name for name in lists if name not in WEDGE_UV_NAMES)
+        return self._find_list("face", names)
+
+    def _check_polygons(
+        self, corners: IntArray, counts: IntArray, n_points: int
+    ) -> None:
+        """Check what `read_polygons` returns. Raises FileFormatError as it does."""
         if (counts < 3).all():
             got = "points or lines only; export triangles"
             if self.has_splats:
@@ -542,12 +575,11 @@ class _Properties:
             int(counts.max()), MAX_CORNERS, "faces with at most {} corners"
         )
         self.notes.check_faces(int((counts - 2).clip(0).sum()))
-        if corners.min() < 0 or corners.max() >= points:
+        if corners.min() < 0 or corners.max() >= n_points:
             raise self.notes.damaged(
                 "faces of its own vertices",
                 "a face that refers to a vertex that is not there",
             )
-        return corners, counts
 
     def read_uvs(
         self, corners: IntArray, counts: IntArray, triangles: IntArray
@@ -563,11 +595,20 @@ class _Properties:
             triangles: (T, 3) corners.
         """
         wedges = self._find_list("face", WEDGE_UV_NAMES)
-        if wedges is None or not wedges.counts.any():  # all lists are empty
-            vertex_uvs = self.read_columns("vertex", UV_NAMES)
-            if vertex_uvs is None:
-                return None
-            return IndexedValues(vertex_uvs, corners[triangles])
+        if wedges is not None and wedges.counts.any():  # not all lists are empty
+            return self._read_wedge_uvs(wedges, counts, triangles)
+        vertex_uvs = self.read_columns("vertex", UV_NAMES)
+        if vertex_uvs is None:
+            return None
+        return IndexedValues(vertex_uvs, corners[triangles])
+
+    def _read_wedge_uvs(
+        self, wedges: ListValues, counts: IntArray, triangles: IntArray
+    ) -> IndexedValues:
+        """Return the texture coordinates of triangles from the lists of faces.
+
+        `counts` and `triangles` are as for `read_uvs`.
+        """
         # Triangles of strips, which come after the faces, have no wedges.
         wedge_counts = np.zeros(len(counts), np.int64)
         wedge_counts[: len(wedges.counts)] = wedges.counts
@@ -579,11 +620,12 @@ class _Properties:
             )
         is_used = np.repeat(is_mapped[: len(wedges.counts)], wedges.counts)
         used_uvs = wedges.values[is_used].astype(np.float64).reshape(-1, 2)
-        # Equal pairs become one; as complex numbers they are compared as a whole.
+        # Equal pairs become one. As complex numbers, u + v i, both are compared at
+        # once.
         distinct_uvs, index_of_pair = np.unique(
             used_uvs.view(np.complex128), return_inverse=True
         )
-        uv_of_corner = np.full(len(corners), -1)
+        uv_of_corner = np.full(int(counts.sum()), -1)  # -1 for none
         uv_of_corner[np.repeat(is_mapped, counts)] = index_of_pair.reshape(-1)
         return IndexedValues(
             distinct_uvs.view(np.float64).reshape(-1, 2), uv_of_corner[triangles]
@@ -620,31 +662,35 @@ class _Properties:
     ) -> Float64Array | None:
         """Return the linear colors (..., 3) of rows of an element, or None.
 
-        An alpha that is opaque everywhere counts as read. An index past the last row
-        has neutral grey.
+        An index past the last row has neutral grey: triangles of strips have no row.
         """
         values = self.read_columns(element, COLOR_NAMES)
         if values is None:
             return None
-        element_table = self.elements[element]
-        color_type = element_table.types[
-            self._find_group(element, "scalars", *COLOR_NAMES)[0]
-        ]
-        for name in set(ALPHA_NAMES) & set(element_table.scalars):
-            alphas = element_table.scalars[name].astype(np.float64)
+        scalars = self.elements[element].scalars
+        red_name = self._find_group(element, scalars, COLOR_NAMES)[0]
+        color_type = self.elements[element].types[red_name]
+        self._mark_opaque_alphas(element, color_type)
+        display = np.clip(
+            np.nan_to_num(values / _find_scale(values, color_type)), 0.0, 1.0
+        )
+        linear = srgb_to_linear(display.astype(np.float32))
+        neutral = srgb_to_linear(np.full((1, 3), NEUTRAL_GREY, np.float32))
+        padded = np.concatenate([linear, neutral])
+        return padded[np.minimum(index, len(linear))].astype(np.float64)
+
+    def _mark_opaque_alphas(
+        self, element: str, color_type: np.dtype[np.generic]
+    ) -> None:
+        """Count the alphas of an element as read that are opaque in all rows."""
+        scalars = self.elements[element].scalars
+        for name in set(ALPHA_NAMES) & set(scalars):
+            alphas = scalars[name].astype(np.float64)
             is_opaque = not len(alphas) or alphas.min() >= _find_scale(
                 alphas[:, None], color_type
             )
             if is_opaque:
                 self.notes.mark_read(f"{element} property", name)
-        display = np.clip(
-            np.nan_to_num(values / _find_scale(values, color_type)), 0.0, 1.0
-        )
-        linear = srgb_to_linear(display.astype(np.float32))
-        # Triangles of strips have no row: they are neutral grey.
-        neutral = srgb_to_linear(np.full((1, 3), NEUTRAL_GREY, np.float32))
-        padded = np.concatenate([linear, neutral])
-        return padded[np.minimum(index, len(linear))].astype(np.float64)
 
     def read_texture_indices(
         self, names: Sequence[str], corners: IntArray, counts: IntArray
@@ -663,17 +709,13 @@ class _Properties:
         texture = np.full(len(counts), -1)
         if not names:
             return texture
-        element = None
-        for candidate in ("face", "vertex"):
-            if self._find_group(candidate, "scalars", ("texnumber",)):
-                element = candidate
-                break
+        element = self._find_element_with_texture_number()
         if element is None:
             if len(names) > 1:
-                used_texture = (
-                    f"of its {len(names)} textures only {format_name(names[0])} is used"
+                self.notes.warn(
+                    f"of its {len(names)} textures only {format_name(names[0])} is "
+                    "used, as its faces have no texnumber"
                 )
-                self.notes.warn(f"{used_texture}, as its faces have no texnumber")
             return np.zeros(len(counts), np.int64)
         numbers = _to_integers(self.elements[element].scalars["texnumber"])
         if element == "face":
@@ -682,13 +724,22 @@ class _Properties:
             # The first corner of an empty polygon at the end would be out of range.
             first_corner = np.cumsum(counts) - counts
             texture = numbers[corners[np.minimum(first_corner, len(corners) - 1)]]
-        n_wrong = int(((texture < -1) | (texture >= len(names))).sum())
+        is_wrong = (texture < -1) | (texture >= len(names))
+        n_wrong = int(is_wrong.sum())
         if n_wrong:
             self.notes.warn(
                 f"{n_wrong:,} faces have a texnumber of a texture that it "
                 "does not name; they have none"
             )
-        return np.where((texture >= 0) & (texture < len(names)), texture, -1)
+        return np.where(is_wrong, -1, texture)
+
+    def _find_element_with_texture_number(self) -> str | None:
+        """Return which element has a `texnumber`: faces, else vertices, or none."""
+        for element in ("face", "vertex"):
+            scalars = self._get_scalars(element)
+            if self._find_group(element, scalars, [("texnumber",)]):
+                return element
+        return None
 
     def make_surfaces(
         self, names: Sequence[str], *, has_no_colors: bool
@@ -727,9 +778,9 @@ def _to_integers(values: npt.NDArray[np.generic]) -> IntArray:
 def _find_scale(values: Float64Array, kind: np.dtype[np.generic]) -> float:
     """Return the value of full brightness in colors (N, C) of a type.
 
-    It is 1 for floats, unless they are clearly in [0, 255]. Integers have the smallest
-    of 255, 65535 and their type's largest value that all of them fit, but 16-bit ones
-    are always of 65535.
+    Of floats it is 1, or 255 if some are clearly over 1. Of integers of 8 bits it is
+    255, and of 16 bits 65535. Wider ones often hold values of a narrower type: it is
+    the smallest of 255, 65535 and their type's largest value that all of them fit.
     """
     largest = float(np.nan_to_num(values).max(initial=0.0))
     if kind.kind == "f":

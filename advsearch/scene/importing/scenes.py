@@ -117,11 +117,12 @@ def import_scene(path: Path, node: str) -> ImportedScene:
     header = gltf.read_header(path, data)
     parts, notes = read_parts(path, data)
     node_poses = dict(iterate_poses(header))
+    # the named node with all below it is the object; the rest surrounds it
     object_nodes = header.find_descendants([_find_node(path, header, parts, node)])
     object_parts = [part for part in parts if part.node in object_nodes]
     lights = _find_node_lights(header, node_poses)
-    n_others = len({part.node for part in parts} - object_nodes)
-    _check_surroundings(path, n_others + len(lights))
+    n_other_meshes = len({part.node for part in parts} - object_nodes)
+    _check_surroundings(path, n_other_meshes + len(lights))
     front = find_front(path, header)
     frame = _compute_frame(object_parts, compute_rotation("y", front.axis))
     names = UniqueNames(RESERVED_NAMES)
@@ -479,11 +480,6 @@ def _make_lamp(
 ) -> PointLamp | SpotLamp:
     """Return a light of a file as a lamp.
 
-    A directional light has lux. It becomes a lamp so far away that its rays are
-    parallel, with an intensity of lux times squared distance, which is the same lux at
-    the object. Lengths of others are divided by the object's size, so that intensities
-    are divided by its square.
-
     Args:
         path: the file, for messages.
         name: name of the lamp.
@@ -495,15 +491,7 @@ def _make_lamp(
     Raises:
         InputError: it is too far away or too bright.
     """
-    intensity = np.array(light.color) * light.intensity / candela_per_unit
-    if light.type == "directional":
-        direction = frame.rotation @ pose[:3, 2]  # it shines along its -z
-        length = max(float(np.linalg.norm(direction)), 1e-12)  # not 0
-        position = gltf_parts.DIRECTIONAL_LIGHT_DISTANCE * direction / length
-        intensity = intensity * gltf_parts.DIRECTIONAL_LIGHT_DISTANCE**2
-    else:
-        position = frame.to_frame(frame.rotation @ pose[:3, 3])
-        intensity = intensity / frame.size**2
+    position, intensity = _position_light(light, candela_per_unit, pose, frame)
     # one limit for distances and intensities; NaN is out of range
     is_in_range = np.abs([*position, *intensity]) <= MAX_DISTANCE
     if not is_in_range.all():
@@ -526,6 +514,30 @@ def _make_lamp(
         cutoff=math.degrees(light.spot.outerConeAngle),
         beam=math.degrees(light.spot.innerConeAngle),
     )
+
+
+def _position_light(
+    light: LightEntry,
+    candela_per_unit: float,
+    pose: Float64Array,
+    frame: FileFrame,
+) -> tuple[Float64Array, Float64Array]:
+    """Return the position (3,) of a light and its radiant intensity (3,).
+
+    A directional light has lux. It becomes a lamp so far away that its rays are
+    parallel, with an intensity of lux times squared distance, which is the same lux at
+    the object. Lengths of others are divided by the object's size, so that intensities
+    are divided by its square. Arguments are those of `_make_lamp`.
+    """
+    intensity = np.array(light.color) * light.intensity / candela_per_unit
+    if light.type == "directional":
+        direction = frame.rotation @ pose[:3, 2]  # it shines along its -z
+        length = max(float(np.linalg.norm(direction)), 1e-12)  # not 0
+        position = gltf_parts.DIRECTIONAL_LIGHT_DISTANCE * direction / length
+        intensity = intensity * gltf_parts.DIRECTIONAL_LIGHT_DISTANCE**2
+        return position, intensity
+    position = frame.to_frame(frame.rotation @ pose[:3, 3])
+    return position, intensity / frame.size**2
 
 
 def _make_cameras(
@@ -560,21 +572,34 @@ def _make_camera(
     aspect_ratio = camera.perspective.aspectRatio
     half_tangent = math.tan(camera.perspective.yfov / 2.0)
     fov = math.degrees(2.0 * math.atan(half_tangent * max(aspect_ratio or 1.0, 1.0)))
-    is_mirrored = np.linalg.det(axes) < 0.0
+    problem = _find_camera_problem(matrix, fov)
+    if problem:
+        raise InputError(f"{path}: expected the camera {name} {problem}, or remove it")
+    return PosedCamera(matrix, fov, upright=aspect_ratio is None)
+
+
+def _find_camera_problem(matrix: Float64Array, fov: float) -> str | None:
+    """Return why a camera cannot be imported, as the end of a message, or None.
+
+    Args:
+        matrix: (4, 4) its pose, with unit vectors as axes.
+        fov: its field of view in degrees.
+    """
+    axes = matrix[:3, :3]
     if not (np.abs(matrix[:3, 3]) <= MAX_DISTANCE).all():  # NaN is not
-        problem = f"within {MAX_DISTANCE:g} object sizes, got more; correct its place"
-    elif not np.allclose(np.linalg.norm(axes, axis=0), 1.0):
-        problem = (
+        return f"within {MAX_DISTANCE:g} object sizes, got more; correct its place"
+    if not np.allclose(np.linalg.norm(axes, axis=0), 1.0):
+        return (
             "to look somewhere, got axes without length; correct the scale of its node"
         )
-    elif not np.allclose(axes.T @ axes, np.eye(3), atol=MAX_AXIS_COSINE) or is_mirrored:
+    is_mirrored = np.linalg.det(axes) < 0.0
+    is_rectangular = np.allclose(axes.T @ axes, np.eye(3), atol=MAX_AXIS_COSINE)
+    if is_mirrored or not is_rectangular:
         got = "mirrored" if is_mirrored else "sheared"
         advice = "apply the scale of the nodes above it (in Blender Ctrl A)"
-        problem = f"under nodes that turn, move and scale it, got {got} axes; {advice}"
-    elif not 0.0 < fov <= MAX_FOV:
-        problem = (
+        return f"under nodes that turn, move and scale it, got {got} axes; {advice}"
+    if not 0.0 < fov <= MAX_FOV:
+        return (
             f"with a field of view up to {MAX_FOV:g} degrees, got {fov:.4g}; correct it"
         )
-    else:
-        return PosedCamera(matrix, fov, upright=aspect_ratio is None)
-    raise InputError(f"{path}: expected the camera {name} {problem}, or remove it")
+    return None

@@ -10,11 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.assets import (
-    Float64Array,
-)
+from advsearch.scene.assets import Float32Array, Float64Array
 from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.importing.files import Notes, decode_text, describe_content
+from advsearch.scene.importing.files import Notes, decode_text, find_kind
 from advsearch.scene.importing.parts import NEUTRAL_GREY, ImportedPart, ImportedSurface
 
 Attributes = npt.NDArray[np.uint16]
@@ -27,7 +25,10 @@ _NAME_LINE = re.compile(
     re.IGNORECASE | re.MULTILINE,
 )
 _WORDS = frozenset("facet outer vertex endloop endfacet end".split())
-_COLOR_FLAG = 0x8000
+_COLOR_FLAG = 0x8000  # the highest bit of a facet's attribute
+# of a binary file: the header, then the number of facets in 4 bytes
+_HEADER_SIZE = 80
+_FACETS_START = _HEADER_SIZE + 4
 
 
 def read_stl(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
@@ -40,27 +41,19 @@ def read_stl(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     Raises:
         FileFormatError: the file is corrupt, or has no facets.
     """
-    # A header of 80 bytes, the number of facets in 4, and 50 bytes for each.
-    expected_size = 84
-    if len(data) >= 84:
-        (n_facets,) = struct.unpack_from("<I", data, 80)
-        expected_size += 50 * n_facets
+    n_facets = 0
+    if len(data) >= _FACETS_START:
+        (n_facets,) = struct.unpack_from("<I", data, _HEADER_SIZE)
+    expected_size = _FACETS_START + _FACET_DTYPE.itemsize * n_facets
     corner_colors = None
-    surface = ImportedSurface()
     if len(data) == expected_size:
-        notes.check_faces((expected_size - 84) // 50)
-        facets = np.frombuffer(data, _FACET_DTYPE, offset=84)
-        points = facets["vertices"].astype(np.float64).reshape(-1, 3)
-        colors = _read_colors(data[:80], facets["attribute"], notes)
-        if colors is not None:
-            corner_colors = np.repeat(colors[:, None], 3, axis=1)
-            # white, which the colors of facets multiply
-            surface = ImportedSurface(color=np.ones(3, np.float32))
+        notes.check_faces(n_facets)
+        points, corner_colors = _read_facets(data, notes)
     elif data.lstrip()[:5].lower() == b"solid" and b"\x00" not in data:
         points = _parse_text(data, notes)
     else:
-        got = describe_content(data)
-        if "another" in got:
+        got = find_kind(data)
+        if got is None:
             got = f"{len(data)} bytes, which is neither ASCII nor that long"
         raise notes.damaged(
             f"an STL file (in binary, {expected_size} bytes for its number of facets)",
@@ -70,12 +63,49 @@ def read_stl(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
         raise FileFormatError(
             f"{path}: expected a mesh with faces, got none; export triangles"
         )
+    surface = ImportedSurface()
+    if corner_colors is not None:
+        # white, which the colors of facets multiply
+        surface = ImportedSurface(color=np.ones(3, np.float32))
     faces = np.arange(len(points)).reshape(-1, 3)
     return [
         ImportedPart(
             vertices=points, faces=faces, colors=corner_colors, surface=surface
         )
     ]
+
+
+def _read_facets(data: bytes, notes: Notes) -> tuple[Float64Array, Float64Array | None]:
+    """Return the points (3 F, 3) and the linear colors (F, 3, 3) of a binary file.
+
+    They are those of the corners of its facets; colors are None if it has none.
+    """
+    facets = np.frombuffer(data, _FACET_DTYPE, offset=_FACETS_START)
+    points = facets["vertices"].astype(np.float64).reshape(-1, 3)
+    colors = _read_colors(data[:_HEADER_SIZE], facets["attribute"], notes)
+    if colors is None:
+        return points, None
+    return points, np.repeat(colors[:, None], 3, axis=1)
+
+
+def _read_magics_color(head: bytes, notes: Notes) -> Float32Array | None:
+    """Return the display color (3,) of the object that Magics writes into the header.
+
+    None if it has none. An opacity and a material, which are not read, are recorded.
+    """
+    keyword_start = head.find(b"COLOR=")
+    color_start = keyword_start + len(b"COLOR=")
+    n_channels = 4  # red, green, blue and opacity, a byte each
+    if keyword_start < 0 or color_start + n_channels > _HEADER_SIZE:
+        return None
+    if b"MATERIAL=" in head:
+        notes.record("header entry", "MATERIAL")
+    color = np.frombuffer(head, np.uint8, 3, color_start) / np.float32(255.0)
+    opacity = head[color_start + 3]
+    # 0, which would make it invisible, counts as none stated
+    if 0 < opacity < 255:
+        notes.record("opacity of its header entry", "COLOR")
+    return np.asarray(color, np.float32)
 
 
 def _parse_text(data: bytes, notes: Notes) -> Float64Array:
@@ -124,24 +154,18 @@ def _read_colors(
         attributes: (F,) attribute bytes of the facets.
         notes: notes about the file.
     """
-    magics_position = head.find(b"COLOR=")
+    # (F, 3) the highest bits first, which are VisCAM's red and Magics' blue
     channels = [(attributes >> shift) & 31 for shift in (10, 5, 0)]
     colors = np.stack(channels, axis=1).astype(np.float32) / np.float32(31.0)
-    # up to 70: so that the four bytes after it are in the header of 80
-    if 0 <= magics_position <= 70:
-        if b"MATERIAL=" in head:
-            notes.record("header entry", "MATERIAL")
+    object_color = _read_magics_color(head, notes)
+    if object_color is not None:
+        colors = colors[:, ::-1]
+        default_color = object_color
         # Where no facet has any bit set, all have the color of the object.
         has_color = (attributes & _COLOR_FLAG == 0) & bool(attributes.any())
-        colors = colors[:, ::-1]
-        default_color = np.frombuffer(
-            head, np.uint8, 3, magics_position + 6
-        ) / np.float32(255.0)
-        if 0 < head[magics_position + 9] < 255:
-            notes.record("opacity of its header entry", "COLOR")
     else:
-        has_color = attributes & _COLOR_FLAG != 0
         default_color = np.full(3, NEUTRAL_GREY, np.float32)
+        has_color = attributes & _COLOR_FLAG != 0
         if not has_color.any():
             if attributes.any():
                 notes.record(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -55,6 +56,12 @@ _MAX_TEXEL_RATIO = 1.5
 _MAX_SAMPLES = 1 << 18
 _MAX_STEPS = 256
 _FILL_FRACTION = 0.5  # approximate fraction of an atlas that its charts fill
+# area in UV space below which a face is a point or a line
+_MIN_FACE_UV_AREA = 1e-12
+SHARED_LIGHT_REASON = (
+    "several faces share a texture that emits light; it was unwrapped anew "
+    "and its texture resampled"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,32 +106,25 @@ def apply_textures(
     used_surfaces = _list_used_surfaces(soup, surfaces)
     first_surface = used_surfaces[0]
     is_uniform = all(surface.has_same_maps(first_surface) for surface in used_surfaces)
+    # `soup.colors` are factors of the base color
     has_uniform_factor = bool((soup.colors == soup.colors[0, 0]).all())
-    material = index_materials(soup, surfaces)[1]
-    # First the ways that need no baking, which return; the rest is baked.
+    _, material = index_materials(soup, surfaces)
+    # What needs no baking returns; the rest is baked.
     is_lit_twice = False
     if is_uniform and has_uniform_factor:
         if not first_surface.images:
             return _texture_plain(soup, first_surface, material)
-        is_untinted = first_surface.texture is None or soup.colors.min() == 1.0
-        if is_untinted and np.isfinite(soup.uvs).all():
-            uvs, images = _crop_to_window(
-                _move_into_unit_square(soup),
-                pictures=first_surface.images,
-                colors=first_surface.texture,
-            )
-            is_usable = _is_usable(soup, uvs)
-            is_lit_twice = is_usable and _is_lit_twice(uvs, first_surface, images)
-            if is_usable and not is_lit_twice:
+        cropped = _crop_images(soup, first_surface)
+        if cropped is not None:
+            uvs, images = cropped
+            is_lit_twice = _is_lit_twice(uvs, first_surface, images)
+            if not is_lit_twice:
                 return _texture_with_images(
                     soup, uvs, first_surface.with_images(images)
                 )
     unwrapped_soup = unwrap(soup, material)
     maps = bake(unwrapped_soup.uvs, soup, surfaces)
-    reason = (
-        "several faces share a texture that emits light; it was unwrapped anew "
-        "and its texture resampled"
-    )
+    reason = SHARED_LIGHT_REASON
     if not is_lit_twice:
         reason = _describe_reason(soup, used_surfaces, is_uniform, has_uniform_factor)
     notes.warn(f"{reason} ({_describe_size(len(maps.color), soup, surfaces)})")
@@ -316,8 +316,7 @@ def _is_usable(soup: TriangleSoup, uvs: Float64Array) -> bool:
         return False
     uv_area = np.abs(compute_doubled_areas(uvs)) / 2.0
     surface_area = np.linalg.norm(soup.compute_face_vectors(), axis=1)
-    # 1e-12: faces that are a point or a line in UV space
-    squashed_area = surface_area[uv_area < 1e-12].sum()
+    squashed_area = surface_area[uv_area < _MIN_FACE_UV_AREA].sum()
     return bool(
         squashed_area <= _MAX_SQUASHED * surface_area.sum()
         and uv_area.sum() >= _MIN_UV_AREA
@@ -343,6 +342,23 @@ def _move_into_unit_square(soup: TriangleSoup) -> Float64Array:
     np.minimum.at(chart_corner, chart[vertex.reshape(-1)], flat_uvs)
     uvs: Float64Array = soup.uvs - np.floor(chart_corner + _UV_TOLERANCE)[chart[vertex]]
     return uvs
+
+
+def _crop_images(
+    soup: TriangleSoup, surface: ImportedSurface
+) -> tuple[Float64Array, Sequence[Float32Array]] | None:
+    """Return the file's UVs (F, 3, 2) moved into [0, 1], and the images for them.
+
+    None if these cannot be used: colors change the texture, faces lack UVs, or the UVs
+    are unusable. `surface` is that of all faces, and has images.
+    """
+    is_untinted = surface.texture is None or soup.colors.min() == 1.0
+    if not is_untinted or not np.isfinite(soup.uvs).all():
+        return None
+    uvs, images = _crop_to_window(
+        _move_into_unit_square(soup), pictures=surface.images, colors=surface.texture
+    )
+    return (uvs, images) if _is_usable(soup, uvs) else None
 
 
 def _crop_to_window(
@@ -427,37 +443,87 @@ def bake(
         Maps (N, N, ...) with room for the texels that the object shows.
     """
     size = _choose_size(_count_texels(soup, surfaces))
-    face, rows, columns, weights = rasterize_triangles(
-        _to_texels(uvs, (size, size)), (size, size), tolerance=1e-9
+    texels = _Texels(
+        *rasterize_triangles(
+            _to_texels(uvs, (size, size)), (size, size), tolerance=1e-9
+        )
     )
-    maps = _make_blank_maps(surfaces, size)  # filled in below
+    maps = _make_blank_maps(surfaces, size)
     # (T, 3) factor of the base color at each texel
-    factor = np.einsum("tk,tkc->tc", weights, soup.colors[face])
-    for surface, texel in zip(
-        surfaces, group_indices(soup.part_ids[face]), strict=False
-    ):
-        if not len(texel):
+    factor = np.einsum("tk,tkc->tc", texels.weights, soup.colors[texels.face])
+    # the texels of each part, up to the last one that has any
+    texels_of_part = group_indices(soup.part_ids[texels.face])
+    for surface, index in zip(surfaces, texels_of_part, strict=False):
+        if not len(index):
             continue
-        y = rows[texel]
-        x = columns[texel]
-        file_uvs = np.einsum("tk,tkc->tc", weights[texel], soup.uvs[face[texel]])
-        texel_color = _sample_base_color(surface, file_uvs, soup, surfaces)
-        maps.color[y, x, : texel_color.shape[1]] = _tint(texel_color, factor[texel])
-        if not np.isfinite(file_uvs).all():
-            continue  # no UVs in the file: neither bumps nor emission
-        if maps.normals is not None and surface.normal_map is not None:
-            maps.normals[y, x] = convert_normals(
-                sample_texture(surface.normal_map, file_uvs),
-                soup,
-                uvs,
-                face[texel],
-                weights[texel],
-            )
-        if maps.emission is not None and surface.emission is not None:
-            maps.emission[y, x] = sample_texture(surface.emission, file_uvs)
+        part_texels = texels.select(index)
+        file_uvs = part_texels.interpolate(soup.uvs)
+        color = _sample_base_color(surface, file_uvs, soup, surfaces)
+        tinted_color = _tint(color, factor[index])
+        maps.color[part_texels.row, part_texels.column, : color.shape[1]] = tinted_color
+        if np.isfinite(file_uvs).all():
+            _bake_bumps_and_emission(maps, surface, part_texels, file_uvs, soup, uvs)
     is_inside = np.zeros((size, size), np.bool_)
-    is_inside[rows, columns] = True
+    is_inside[texels.row, texels.column] = True
     return _fill_gaps(maps, is_inside)
+
+
+def _bake_bumps_and_emission(
+    maps: SurfaceMaps,
+    surface: ImportedSurface,
+    texels: _Texels,
+    file_uvs: Float64Array,
+    soup: TriangleSoup,
+    uvs: Float64Array,
+) -> None:
+    """Fill in the normals and the emission of a part, as far as it has some.
+
+    Args:
+        maps: the maps of the object.
+        surface: the surface of the part.
+        texels: the texels that the part covers.
+        file_uvs: (T, 2) UVs of the file at these texels.
+        soup: the object.
+        uvs: (F, 3, 2) new UVs of its faces.
+    """
+    y = texels.row
+    x = texels.column
+    if maps.normals is not None and surface.normal_map is not None:
+        maps.normals[y, x] = convert_normals(
+            sample_texture(surface.normal_map, file_uvs),
+            soup,
+            uvs,
+            texels.face,
+            texels.weights,
+        )
+    if maps.emission is not None and surface.emission is not None:
+        maps.emission[y, x] = sample_texture(surface.emission, file_uvs)
+
+
+class _Texels(NamedTuple):
+    """Texels (T,) of a map that faces cover, as `rasterize_triangles` returns them.
+
+    Attributes:
+        face: (T,) the face that each is on.
+        row: (T,).
+        column: (T,).
+        weights: (T, 3) barycentric weights of the corners of its face.
+    """
+
+    face: IntArray
+    row: IntArray
+    column: IntArray
+    weights: Float64Array
+
+    def select(self, index: IntArray) -> _Texels:
+        """Return some of the texels."""
+        return _Texels(
+            self.face[index], self.row[index], self.column[index], self.weights[index]
+        )
+
+    def interpolate(self, values: Float64Array) -> Float64Array:
+        """Return values (F, 3, C) of corners at the texels, (T, C)."""
+        return np.asarray(np.einsum("tk,tkc->tc", self.weights, values[self.face]))
 
 
 def _make_blank_maps(surfaces: Sequence[ImportedSurface], size: int) -> SurfaceMaps:
@@ -598,11 +664,12 @@ def _compute_sample_weights(steps: int) -> Float64Array:
     # grid points at which a small triangle of either kind begins within the large one
     is_up = i + j < steps
     is_down = i + j < steps - 1
-    # of the second and the third corner: steps along the two sides, as fractions
-    weight_b, weight_c = (
-        np.concatenate([index[is_up] + 1.0 / 3.0, index[is_down] + 2.0 / 3.0]) / steps
-        for index in (i, j)
-    )
+    # steps from the first corner to each center along the two sides
+    center_i = np.concatenate([i[is_up] + 1.0 / 3.0, i[is_down] + 2.0 / 3.0])
+    center_j = np.concatenate([j[is_up] + 1.0 / 3.0, j[is_down] + 2.0 / 3.0])
+    # as fractions of a side they are the weights of the second and the third corner
+    weight_b = center_i / steps
+    weight_c = center_j / steps
     return np.stack([1.0 - weight_b - weight_c, weight_b, weight_c], axis=1)
 
 
@@ -682,21 +749,14 @@ def _unmirror(
     mirrored_fraction = float(area[is_mirrored].sum() / area.sum())
     if normals is None or mirrored_fraction < MIN_MIRRORED_FRACTION:
         return soup, maps
-    # (almost) all faces are mirrored
-    if 1.0 - mirrored_fraction < MIN_MIRRORED_FRACTION:
-        # y -> 1 - y of stored texels in [0, 1] reverses the sign
-        flipped_normals = normals * np.array([1, -1, 1], np.float32) + np.array(
-            [0, 1, 0], np.float32
-        )
-        return soup, replace(maps, normals=flipped_normals)
+    if 1.0 - mirrored_fraction < MIN_MIRRORED_FRACTION:  # (almost) all faces are
+        return soup, replace(maps, normals=_reverse_component(normals, 1))
     new_uvs = uvs.copy()
     # Both halves have half of the width: u in [0, 2] first, then halved.
     new_uvs[is_mirrored, :, 0] = 2.0 - new_uvs[is_mirrored, :, 0]
     new_uvs[:, :, 0] /= 2.0
-    # x -> 1 - x reverses the sign of the bumps along u
-    mirrored_normals = normals[:, ::-1] * np.array([-1, 1, 1], np.float32) + np.array(
-        [1, 0, 0], np.float32
-    )
+    # in the mirrored half, bumps along u are reversed
+    mirrored_normals = _reverse_component(normals[:, ::-1], 0)
     emission = maps.emission
     # a single texel is one value everywhere
     if emission is not None and emission.shape != (1, 1, 3):
@@ -704,6 +764,18 @@ def _unmirror(
     color = np.concatenate([maps.color, maps.color[:, ::-1]], axis=1)
     normals = np.concatenate([normals, mirrored_normals], axis=1)
     return replace(soup, uvs=new_uvs), SurfaceMaps(color, normals, emission)
+
+
+def _reverse_component(normals: Float32Array, component: int) -> Float32Array:
+    """Return a normal map (H, W, 3) with x (0) or y (1) of its normals reversed.
+
+    A component n is stored as (n + 1) / 2, so that its texels t become 1 - t.
+    """
+    factor = np.ones(3, np.float32)
+    factor[component] = -1.0
+    offset = np.zeros(3, np.float32)
+    offset[component] = 1.0
+    return normals * factor + offset
 
 
 def convert_normals(
@@ -757,9 +829,10 @@ def _compute_tangents(
     used_faces, used_index = np.unique(face, return_inverse=True)
     a, b, c = (soup.points[soup.faces[used_faces, k]] for k in range(3))
     uvs = soup.uvs[used_faces]
+    v = uvs[:, :, 1]
     # v of the second and third corner, from the first one
-    (_, v1) = (uvs[:, 1] - uvs[:, 0]).T
-    (_, v2) = (uvs[:, 2] - uvs[:, 0]).T
+    v1 = v[:, 1] - v[:, 0]
+    v2 = v[:, 2] - v[:, 0]
     handedness = np.sign(compute_doubled_areas(uvs))[:, None]
     # d position / d u is (b - a) v2 - (c - a) v1 over the UVs' doubled area, of which
     # only the sign matters here

@@ -40,14 +40,16 @@ class TrackedKeys(Generic[T]):
         self.repeated: list[str] = []
         self._fold = fold
         self._prefix = prefix
+        # All others are by folded keys.
         self._values: dict[str, T] = {}
-        self._spelling: dict[str, str] = {}
+        self._spelling: dict[str, str] = {}  # keys as the file spells them
         self._read: set[str] = set()
         self._nested: dict[str, TrackedKeys[Any]] = {}
         for key, value in values.items():
             folded = fold(key)
             if folded in self._spelling:
-                self.repeated.append(self._spelling[folded])
+                earlier_key = self._spelling[folded]
+                self.repeated.append(earlier_key)
             self._values[folded] = value
             self._spelling[folded] = key
 

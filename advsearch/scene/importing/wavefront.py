@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NoReturn
+from typing import NamedTuple, NoReturn
 
 import numpy as np
 import numpy.typing as npt
@@ -93,22 +93,13 @@ def _triangulate_faces(
     return position, uv, normal, polygon
 
 
-def _measure_mapped_faces(
-    uv: IndexedValues, position: IndexedValues, is_selected: BoolArray
-) -> tuple[Float64Array, Float64Array]:
-    """Return UVs (F, 3, 2) and doubled areas (F,) of selected faces that have UVs."""
-    is_selected = is_selected & (uv.rows >= 0).all(axis=1)
-    selected_uvs = uv.values[uv.rows[is_selected]]
-    vectors = compute_area_vectors(position.values[position.rows[is_selected]])
-    return selected_uvs, np.linalg.norm(vectors, axis=1)
-
-
 def _transform_uvs(
     uv: IndexedValues, square: int, mtl_surface: MtlSurface
 ) -> IndexedValues:
-    """Return UVs relative to their square, as the textures of a material are laid.
+    """Return texture coordinates as the textures of a material are laid.
 
-    That is scaled and shifted (``-s`` and ``-o``).
+    They are counted from the corner of their UDIM square, then scaled (``-s``) and
+    shifted (``-o``).
     """
     corner = mtl_surfaces.get_square_corner(square)
     uvs = (uv.values - corner) * mtl_surface.scale + mtl_surface.offset
@@ -122,6 +113,47 @@ def _note_repetition(uvs: Float64Array, notes: Notes) -> None:
             " has textures that are not to repeat beyond their edges "
             "(-clamp); here they do"
         )
+
+
+@dataclass(frozen=True, eq=False)
+class _Triangles:
+    """The T triangles of a file, with what the statements before them set.
+
+    Attributes:
+        position: points of their corners.
+        uv: texture coordinates of their corners.
+        normal: normals of their corners.
+        colors: (T, 3, 3) linear colors of their corners, None if the file has none.
+        material_names: names of the materials.
+        material: (T,) index of the material; -1 before the first ``usemtl``.
+        square: (T,) UDIM square, 0 where one image is for all.
+        is_flat: (T,) whether smoothing is off.
+        has_uvs: (T,) whether all corners have texture coordinates.
+    """
+
+    position: IndexedValues
+    uv: IndexedValues
+    normal: IndexedValues
+    colors: Float64Array | None
+    material_names: Sequence[str]
+    material: IntArray
+    square: IntArray
+    is_flat: BoolArray
+    has_uvs: BoolArray
+
+    def measure_mapped_faces(
+        self, material_name: str, square: int
+    ) -> tuple[Float64Array, Float64Array]:
+        """Return UVs (F, 3, 2) and doubled areas (F,) of the triangles with a material.
+
+        Those of another UDIM square, and those without UVs, are left out.
+        """
+        material = self.material_names.index(material_name)
+        is_selected = (self.material == material) & (self.square == square)
+        is_selected = is_selected & (self.uv.rows >= 0).all(axis=1)
+        uvs = self.uv.values[self.uv.rows[is_selected]]
+        points = self.position.values[self.position.rows[is_selected]]
+        return uvs, np.linalg.norm(compute_area_vectors(points), axis=1)
 
 
 def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
@@ -138,64 +170,104 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     tables = {kind: lines.read_table(kind) for kind in TABLES}
     if not len(tables["v"]):
         raise notes.damaged(EXPECTED, data)
-    corners, corner_counts, face_rows = lines.read_faces(
-        {kind: len(table) for kind, table in tables.items()}
-    )
+    faces = lines.read_faces({kind: len(table) for kind, table in tables.items()})
+    _, corner_counts, _ = faces
     if (corner_counts < 3).all():
         raise FileFormatError(
             f"{path}: expected a mesh with faces, got points or "
             "lines only; export triangles"
         )
 
-    def find_mapped_faces(
-        name: str, square_number: int
-    ) -> tuple[Float64Array, Float64Array]:
-        """Return UVs (F, 3, 2) and doubled areas (F,) of the faces with a material."""
-        # The reader calls it only after the arrays below exist.
-        is_selected = (material == names.index(name)) & (square == square_number)
-        return _measure_mapped_faces(uv, position, is_selected)
+    statements = _parse_statements(lines, notes)
+    reader = MtlReader(
+        References(path),
+        notes,
+        # called only when materials are converted: after the triangles exist
+        lambda name, square: triangles.measure_mapped_faces(name, square),
+    )
+    _read_libraries(reader, statements.library_lines, notes)
+    triangles = _make_triangles(lines, tables, faces, statements, reader)
+    names_libraries = bool(statements.library_lines)
+    return [
+        _make_part(triangles, group, reader, names_libraries)
+        for group in group_faces(
+            triangles.material, triangles.has_uvs, triangles.is_flat, triangles.square
+        )
+    ]
 
-    reader = MtlReader(References(path), notes, find_mapped_faces)
-    library_lines, material_changes, smoothing_changes = _parse_statements(lines, notes)
-    _read_libraries(reader, library_lines, notes)
 
+def _make_triangles(
+    lines: ObjLines,
+    tables: Mapping[str, Float64Array],
+    faces: tuple[IntArray, IntArray, IntArray],
+    statements: _Statements,
+    reader: MtlReader,
+) -> _Triangles:
+    """Return the triangles of a file's faces, with what the statements set.
+
+    Args:
+        lines: lines of the file.
+        tables: the rows of the file's points, UVs and normals.
+        faces: what `ObjLines.read_faces` returns.
+        statements: statements of the file.
+        reader: reader of the materials.
+    """
+    notes = lines.notes
+    corners, corner_counts, face_rows = faces
     position, uv, normal, polygon = _triangulate_faces(
         tables, corners, corner_counts, notes
     )
     rows = face_rows[polygon]
-    names, material = _find_values_in_effect(material_changes, rows)
+    names, material = _find_values_in_effect(statements.material_changes, rows)
     notes.check_most(len(names), MAX_MATERIALS, "at most {} materials")
-    is_flat = _find_flat_faces(smoothing_changes, rows, normal, notes)
-    colors = _read_colors(lines, tables["v"], notes)
-    if colors is not None:
-        colors = colors[position.rows]
-    has_uvs = np.asarray((uv.rows >= 0).all(axis=1))
-    square = _find_squares(reader, names, material, uv)
+    is_flat = _find_flat_faces(statements.smoothing_changes, rows, normal, notes)
+    vertex_colors = _read_colors(lines, tables["v"], notes)
+    return _Triangles(
+        position=position,
+        uv=uv,
+        normal=normal,
+        colors=None if vertex_colors is None else vertex_colors[position.rows],
+        material_names=names,
+        material=material,
+        square=_find_squares(reader, names, material, uv),
+        is_flat=is_flat,
+        has_uvs=np.asarray((uv.rows >= 0).all(axis=1)),
+    )
 
-    parts = []
-    for group in group_faces(material, has_uvs, is_flat, square):
-        first_triangle = group[0]
-        name = names[material[first_triangle]] if material[first_triangle] >= 0 else ""
-        square_number = int(square[first_triangle])
-        mtl_surface = _find_material(
-            reader, name, square_number, colors is not None, bool(library_lines)
-        )
-        surface, tint = _combine_colors(mtl_surface.surface, colors, group, notes)
-        group_uv = _transform_uvs(uv, square_number, mtl_surface)
-        if mtl_surface.is_clamped and has_uvs[first_triangle]:
-            _note_repetition(group_uv.values[uv.rows[group]], notes)
-        parts.append(
-            split_at_corners(
-                group,
-                points=position,
-                normals=normal,
-                uvs=group_uv,
-                colors=tint,
-                surface=surface,
-                flat=bool(is_flat[first_triangle]),
-            )
-        )
-    return parts
+
+def _make_part(
+    triangles: _Triangles, group: IntArray, reader: MtlReader, names_libraries: bool
+) -> ImportedPart:
+    """Return a group of triangles with the same material, UDIM square and smoothing.
+
+    Args:
+        triangles: all triangles of the file.
+        group: indices of those in the group, which all have UVs or all none.
+        reader: reader of the materials.
+        names_libraries: whether the file names material files.
+    """
+    first = group[0]  # what holds of one holds of all
+    name = ""
+    if triangles.material[first] >= 0:
+        name = triangles.material_names[triangles.material[first]]
+    square = int(triangles.square[first])
+    has_colors = triangles.colors is not None
+    mtl_surface = _find_material(reader, name, square, has_colors, names_libraries)
+    surface, tint = _combine_colors(
+        mtl_surface.surface, triangles.colors, group, reader.notes
+    )
+    uv = _transform_uvs(triangles.uv, square, mtl_surface)
+    if mtl_surface.is_clamped and triangles.has_uvs[first]:
+        _note_repetition(uv.values[uv.rows[group]], reader.notes)
+    return split_at_corners(
+        group,
+        points=triangles.position,
+        normals=triangles.normal,
+        uvs=uv,
+        colors=tint,
+        surface=surface,
+        flat=bool(triangles.is_flat[first]),
+    )
 
 
 def _read_libraries(
@@ -274,9 +346,15 @@ def _find_material(
 ) -> MtlSurface:
     """Return the material of a name, or a plain one and a note if there is none.
 
-    Without a name the surface is plain, and nothing is noted. `square_number` is the
-    UDIM square; `names_libraries` is whether the file names material files, of which
-    then a note says that none could be read.
+    Without a name the surface is plain, and nothing is noted.
+
+    Args:
+        reader: reader of the materials.
+        name: name of the material, perhaps empty.
+        square_number: the UDIM square, 0 for none.
+        has_colors: whether vertices have colors.
+        names_libraries: whether the file names material files. If so and none could be
+            read, a note says that already.
     """
     if not name:
         return MtlSurface(ImportedSurface())
@@ -292,7 +370,7 @@ def _find_material(
         reader.notes.warn(
             f" uses the material {format_name(name)}, which {lacking_files}; {substitute_text}"
         )
-    elif not names_libraries:  # otherwise a note says that none could be read
+    elif not names_libraries:
         reader.notes.warn(
             f" uses materials and names no material file (mtllib); {substitute_text}"
         )
@@ -336,15 +414,22 @@ def _reaches_beyond(uvs: Float64Array) -> bool:
     return not (uvs.min() >= -WRAP_TOLERANCE and uvs.max() <= 1.0 + WRAP_TOLERANCE)
 
 
-def _parse_statements(
-    lines: ObjLines, notes: Notes
-) -> tuple[list[str], list[tuple[int, str]], list[tuple[int, str]]]:
-    """Parse the statements that are no numbers, and note those that are left out.
+class _Statements(NamedTuple):
+    """The statements of a file that are no numbers.
 
-    Returns:
-        The texts after ``mtllib``; and with the row of each, the material names after
-        ``usemtl`` and the words after ``s`` (smoothing).
+    Attributes:
+        library_lines: the texts after ``mtllib``, which names material files.
+        material_changes: rows and material names of ``usemtl``.
+        smoothing_changes: rows and words of ``s``.
     """
+
+    library_lines: list[str]
+    material_changes: list[tuple[int, str]]
+    smoothing_changes: list[tuple[int, str]]
+
+
+def _parse_statements(lines: ObjLines, notes: Notes) -> _Statements:
+    """Parse the statements that are no numbers, and note those that are left out."""
     library_lines = list[str]()
     material_changes = list[tuple[int, str]]()
     smoothing_changes = list[tuple[int, str]]()
@@ -362,7 +447,7 @@ def _parse_statements(
         # What only groups faces, or is switched off, changes nothing.
         elif key not in GROUPING and clean_argument not in ("off", "0"):
             notes.record("statement", keyword)
-    return library_lines, material_changes, smoothing_changes
+    return _Statements(library_lines, material_changes, smoothing_changes)
 
 
 def _find_values_in_effect(
@@ -571,18 +656,15 @@ class ObjLines:
             if not len(kind_indices):
                 continue
             self._resolve_relative(kind_indices, kind, rows, sizes)
-            if kind_indices.max() > counts[kind]:
+            largest = kind_indices.max()
+            if largest > counts[kind]:
                 corner_ends = np.cumsum(sizes)
-                face = np.searchsorted(
-                    corner_ends, int(kind_indices.argmax()), side="right"
-                )
-                got = (
-                    f"{counts[kind]}, and a face on line {rows[face] + 1} that refers "
-                    f"to number {kind_indices.max()}"
-                )
+                corner = int(kind_indices.argmax())
+                face = np.searchsorted(corner_ends, corner, side="right")
                 raise self.notes.damaged(
-                    f"at least {kind_indices.max()} {kind!r} lines",
-                    f"{got} (is the file cut short?)",
+                    f"at least {largest} {kind!r} lines",
+                    f"{counts[kind]}, and a face on line {rows[face] + 1} that refers "
+                    f"to number {largest} (is the file cut short?)",
                 )
         return corners - 1, sizes, rows  # the file counts from 1, and has 0 for none
 
@@ -775,13 +857,13 @@ def _parse_corners(data: Bytes) -> tuple[IntArray, IntArray] | None:
     is_digit = ~(is_blank | is_slash)
     # a blank is before the first number: the keyword was blanked out
     number_starts = np.flatnonzero(is_digit[1:] & ~is_digit[:-1]) + 1
-    is_first = is_blank[number_starts - 1]
-    # the byte two before a number is a slash too, if there are two
+    is_first = is_blank[number_starts - 1]  # of its corner
+    # whether two slashes are before it, which counts only if it is not the first
     column = _find_columns(is_first, is_slash[number_starts - 2])
-    # a number whose three predecessors are in its corner too
+    # three numbers in a row that are not the first of a corner: it has four
     has_fourth = ~(is_first[3:] | is_first[2:-1] | is_first[1:-2])
     is_malformed = (
-        (is_slash[1:] & is_blank[:-1]).any()
+        (is_slash[1:] & is_blank[:-1]).any()  # a corner begins with a slash
         or not _IN_CORNERS[data].all()
         or has_fourth.any()
         or (column > 2).any()

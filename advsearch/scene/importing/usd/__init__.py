@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -56,23 +57,7 @@ def convert_usd(path: Path, data: bytes) -> bytes:
         )
     with tempfile.TemporaryDirectory(prefix="advsearch-usd-") as folder:
         target = Path(folder) / "scene.glb"
-        package_folder = Path(folder) / "package"
-        package_folder.mkdir()
-        arguments = [
-            str(stored_files.scale_limit(MAX_MEMORY)),
-            str(path.resolve()),
-            str(target),
-            str(package_folder),
-        ]
-        program = [sys.executable, "-W", "ignore", "-c", _LIMITED_SCRIPT, *arguments]
-        process = reading.run_converter(
-            path,
-            "usd-core",
-            program,
-            folder=reading.SUBPROCESS_DIRECTORY,
-            seconds=USD_TIMEOUT_S,
-            env=None,
-        )
+        process = _run_conversion(path, target)
         if process.returncode or not target.is_file():
             raise _make_conversion_error(path, process.stderr, process.returncode)
         for name in json.loads(process.stdout.splitlines()[-1]):
@@ -80,6 +65,29 @@ def convert_usd(path: Path, data: bytes) -> bytes:
         return stored_files.read_bytes(
             target, "a glTF file", 4 * stored_files.LARGEST_FILE
         )
+
+
+def _run_conversion(path: Path, target: Path) -> subprocess.CompletedProcess[str]:
+    """Let a process of its own convert a file, with a limit of memory.
+
+    `target` is the path of the result. Packages are unpacked beside it.
+    """
+    package_folder = target.with_name("package")
+    package_folder.mkdir()
+    arguments = [
+        str(stored_files.scale_limit(MAX_MEMORY)),
+        str(path.resolve()),
+        str(target),
+        str(package_folder),
+    ]
+    return reading.run_converter(
+        path,
+        "usd-core",
+        [sys.executable, "-W", "ignore", "-c", _LIMITED_SCRIPT, *arguments],
+        folder=reading.SUBPROCESS_DIRECTORY,
+        seconds=USD_TIMEOUT_S,
+        env=None,
+    )
 
 
 def _make_conversion_error(

@@ -220,11 +220,10 @@ class _LayerCheck:
         suffix = Path(outer).suffix.lower()
         has_odd_name = any(sign in outer for sign in "`[]:\0")
         is_layer = suffix == PACKAGE_SUFFIX or (suffix in LAYER_SUFFIXES and not inner)
-        is_acceptable = is_layer and not has_odd_name
-        layer_file = self._folder
-        if is_acceptable:
+        layer_file = None
+        if is_layer and not has_odd_name:
             layer_file = Path(os.path.realpath(path.parent / outer))
-        if not is_acceptable or not reading.is_inside(layer_file, self._folder):
+        if layer_file is None or not reading.is_inside(layer_file, self._folder):
             raise errors.FileFormatError(
                 f"{self.file.name}: names the layer {name[:100]!r}, which is no USD "
                 "file in its folder and is not "
@@ -296,10 +295,8 @@ class _LayerCheck:
         is_inside = from_entry in entries or (
             not outer.startswith(".") and from_root in entries
         )
-        if not is_inside or Path(outer).suffix.lower() not in (
-            *LAYER_SUFFIXES,
-            PACKAGE_SUFFIX,
-        ):
+        suffix = Path(outer).suffix.lower()
+        if not is_inside or suffix not in (*LAYER_SUFFIXES, PACKAGE_SUFFIX):
             raise errors.FileFormatError(
                 f"{self.file.name}: {package} names the layer {layer[:100]!r}, which "
                 "is no USD file in that package "

@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -36,6 +36,37 @@ MAX_TINTS = 16
 PARTICLES_PREFIX = "ParticleField"  # prefix of the types of Gaussian splats
 PURPOSES = ("default", "render")
 Array = npt.NDArray[Any]
+
+
+class MeshValues(NamedTuple):
+    """Values of a mesh, such as its normals.
+
+    Attributes:
+        values: (N, width).
+        interpolation: what a value is of, as USD calls it: the mesh ("constant"), a
+            face ("uniform"), a point ("vertex", "varying") or a corner ("faceVarying").
+    """
+
+    values: Array
+    interpolation: str
+
+
+class MeshFaces(NamedTuple):
+    """The faces of a mesh.
+
+    Attributes:
+        points: (P, 3).
+        counts: (F,) the number of corners of each face.
+        corners: (C,) the points of the corners of all faces.
+        triangles: (T, 3) what faces are divided into, as rows of `corners`.
+        face: (T,) of each triangle.
+    """
+
+    points: Array
+    counts: Array
+    corners: Array
+    triangles: Array
+    face: Array
 
 
 def main(source: str, target: str, folder: str) -> None:
@@ -137,28 +168,13 @@ class Conversion:
         self.unit = self._read_unit()
         if self.stage.HasAuthoredTimeCodeRange():
             self._note("is animated; what is there first is read")
-        up_rotation = _TO_Y_UP
-        if UsdGeom.GetStageUpAxis(self.stage) == "Y":
-            up_rotation = np.eye(4)
-        stage_matrix = up_rotation @ np.diag([self.unit, self.unit, self.unit, 1.0])
         header = self.header
-        nodes = header["nodes"]
-        nodes.append(
-            {"name": "stage", "matrix": stage_matrix.T.ravel().tolist(), "children": []}
+        header["nodes"].append(self._make_stage_node())
+        self._add_nodes()
+        has_splats = any(
+            str(prim.GetTypeName()).startswith(PARTICLES_PREFIX)
+            for prim in self._iterate_prims()
         )
-        name_counts = Counter(prim.GetName() for prim in self._iterate_prims())
-        node_of_path: dict[Any, int] = {}
-        has_splats = False
-        for prim in self._iterate_prims():
-            if str(prim.GetTypeName()).startswith(PARTICLES_PREFIX):
-                has_splats = True
-            self._note_left_out(prim)
-            if prim.IsA(UsdGeom.Imageable) and not prim.IsA(UsdGeom.Subset):
-                is_unique = name_counts[prim.GetName()] == 1
-                self._add_node(prim, is_unique, node_of_path)
-        for node in nodes:
-            if not node["children"]:
-                del node["children"]
         header["scenes"] = [{"nodes": [0]}]
         header["scene"] = 0
         if has_splats and not header["meshes"]:
@@ -169,9 +185,32 @@ class Conversion:
         if self.lights:
             header["extensions"] = {"KHR_lights_punctual": {"lights": self.lights}}
         header["asset"]["extras"] = {"left_out": self._format_notes(has_splats)}
+        # glTF has no empty lists
         return self.buffer.to_bytes(
             {key: value for key, value in header.items() if value or key == "asset"}
         )
+
+    def _add_nodes(self) -> None:
+        """Add the prims below the stage's node, and note what is left out of them."""
+        name_counts = Counter(prim.GetName() for prim in self._iterate_prims())
+        node_of_path: dict[Any, int] = {}
+        for prim in self._iterate_prims():
+            self._note_left_out(prim)
+            if prim.IsA(UsdGeom.Imageable) and not prim.IsA(UsdGeom.Subset):
+                is_unique = name_counts[prim.GetName()] == 1
+                self._add_node(prim, is_unique, node_of_path)
+        for node in self.header["nodes"]:
+            if not node["children"]:
+                del node["children"]
+
+    def _make_stage_node(self) -> dict[str, Any]:
+        """Return the node that turns and scales the stage to glTF's axes and metres."""
+        up_rotation = _TO_Y_UP
+        if UsdGeom.GetStageUpAxis(self.stage) == "Y":
+            up_rotation = np.eye(4)
+        matrix = up_rotation @ np.diag([self.unit, self.unit, self.unit, 1.0])
+        # glTF stores columns
+        return {"name": "stage", "matrix": matrix.T.ravel().tolist(), "children": []}
 
     def _read_unit(self) -> float:
         """Return the unit of the stage in metres."""
@@ -233,10 +272,9 @@ class Conversion:
             parent = next(
                 (node_of_path[at] for at in ancestors if at in node_of_path), 0
             )
-        self._add_content(prim, node)
-        if "moved" in node:
-            # The skeleton places it in the world.
-            node["matrix"] = node.pop("moved")
+        skeleton_matrix = self._add_content(prim, node)
+        if skeleton_matrix is not None:  # it poses the mesh in the world
+            node["matrix"] = skeleton_matrix.ravel().tolist()
             parent = 0
         node_of_path[path] = len(nodes)
         nodes[parent]["children"].append(len(nodes))
@@ -260,15 +298,16 @@ class Conversion:
         """Note something that is left out."""
         self.note_counts[what] += 1
 
-    def _add_content(self, prim: Any, node: dict[str, Any]) -> None:
+    def _add_content(self, prim: Any, node: dict[str, Any]) -> Array | None:
         """Add the mesh, camera or light of a prim to its node.
 
-        What is invisible, or for guides or proxies, is left out with a note.
+        What is invisible, or for guides or proxies, is left out with a note. Returns
+        what `_add_mesh` does; None if the prim is no mesh.
         """
         is_mesh = prim.IsA(UsdGeom.Mesh)
         is_camera = prim.IsA(UsdGeom.Camera)
         if not (is_mesh or is_camera or prim.HasAPI(UsdLux.LightAPI)):
-            return
+            return None
         imageable = UsdGeom.Imageable(prim)
         if imageable.ComputeVisibility(FIRST_TIME) == UsdGeom.Tokens.invisible:
             self._note("has something invisible, which is left out")
@@ -278,11 +317,12 @@ class Conversion:
                 f"{imageable.ComputePurpose()!r}, which is left out"
             )
         elif is_mesh:
-            self._add_mesh(prim, node)
+            return self._add_mesh(prim, node)
         elif is_camera:
             self._add_camera(UsdGeom.Camera(prim), node)
         else:
             self._add_light(prim, node)
+        return None
 
     # ---- Cameras and lights ----
 
@@ -290,9 +330,9 @@ class Conversion:
         """Add a camera to a node.
 
         One that is not perspective becomes an orthographic entry, which the reader of
-        glTF leaves out with a note. Aperture and focal length are lengths in the same
-        unit. A shift of the aperture is left out, with a note.
+        glTF leaves out with a note. A shift of the aperture is left out, with a note.
         """
+        # lengths in the same unit
         width = _get_first(camera, "HorizontalAperture")
         height = _get_first(camera, "VerticalAperture")
         focal_length = _get_first(camera, "FocalLength")
@@ -320,39 +360,21 @@ class Conversion:
     def _add_light(self, prim: Any, node: dict[str, Any]) -> None:
         """Add a distant or a spherical light to a node; others are noted.
 
-        USD has radiance, and glTF candela, or lux for a distant light. So the radiance
-        is integrated over the disk that a sphere is seen as, or over the cone under
-        which a distant light is seen. A "normalised" light of USD has a power that does
-        not depend on its size. The light's middle is where the node is.
+        USD has radiance, and glTF candela, or lux for a distant light. The light's
+        middle is where the node is.
         """
         light = UsdLux.LightAPI(prim)
         kind = prim.GetTypeName()
-        intensity = _get_first(light, "Intensity") * 2.0 ** _get_first(
-            light, "Exposure"
-        )
-        is_normalized = _get_first(light, "Normalize")
-        color = np.array(_get_first(light, "Color"), np.float64)
-        if _get_first(light, "EnableColorTemperature"):
-            temperature = _get_first(light, "ColorTemperature")
-            color *= np.array(UsdLux.BlackbodyTemperatureAsRgb(temperature))
+        stops = _get_first(light, "Exposure")
+        radiance = _get_first(light, "Intensity") * 2.0**stops
+        color = _read_light_color(light)
         if kind == "DistantLight":
-            angle = _get_first(UsdLux.DistantLight(prim), "Angle")
-            half_angle = math.radians(angle) / 2.0
             entry: dict[str, Any] = {"type": "directional"}
-            if not is_normalized and half_angle > 0.0:
-                # radiance to irradiance of what faces it
-                intensity *= math.pi * math.sin(half_angle) ** 2
+            intensity = _compute_illuminance(prim, radiance)
         elif kind == "SphereLight":
-            # Radiance times the visible disk, pi r^2. A normalised light is divided by
-            # the area of the sphere, 4 pi r^2.
-            if is_normalized:
-                intensity *= 0.25
-            else:
-                intensity *= (
-                    math.pi * _get_first(UsdLux.SphereLight(prim), "Radius") ** 2
-                )
-            intensity *= self.unit**2  # the radius is in the stage's unit
             entry = _make_point_light(prim)
+            # the radius is in the stage's unit
+            intensity = _integrate_over_sphere(prim, radiance) * self.unit**2
             self._note("has a SphereLight, which shines from its middle here")
         else:
             self._note(
@@ -360,9 +382,7 @@ class Conversion:
                 "`controls=light` light a scene"
             )
             return
-        has_valid_power = math.isfinite(intensity) and intensity >= 0.0
-        has_valid_color = np.isfinite(color).all() and (color >= 0.0).all()
-        if not has_valid_power or not has_valid_color:
+        if not _is_valid_power(np.array([*color, intensity])):
             raise errors.FileFormatError(
                 f"{self.source}: expected the light {node['name']} to have a power of "
                 "at least 0"
@@ -379,68 +399,51 @@ class Conversion:
 
     # ---- Meshes ----
 
-    def _add_mesh(self, prim: Any, node: dict[str, Any]) -> None:
+    def _add_mesh(self, prim: Any, node: dict[str, Any]) -> Array | None:
         """Add a mesh to a node: one primitive for each material and tint.
 
-        A mesh that a skeleton poses leaves its matrix in the node's entry "moved".
+        Returns:
+            The matrix (4, 4), for rows, of the skeleton that poses the mesh in the
+            world; None if none does.
         """
         mesh = UsdGeom.Mesh(prim)
         points = _to_array(_get_first(mesh, "Points"), np.float64, 3)
         counts = _to_array(_get_first(mesh, "FaceVertexCounts"), np.int64)
         corners = _to_array(_get_first(mesh, "FaceVertexIndices"), np.int64)
         if not len(points) or not len(counts):
-            return
+            return None
         self._check_corners(prim, len(points), counts, corners)
-        rest_matrix, points = self._pose_at_rest(prim, points)
-        if rest_matrix is not None:
-            node["moved"] = rest_matrix.ravel().tolist()
+        skeleton_matrix, points = self._pose_at_rest(prim, points)
         triangles, face = self._triangulate(mesh, points, counts, corners)
         primitives = self._make_primitives(
-            prim,
-            mesh,
-            points=points,
-            counts=counts,
-            corners=corners,
-            triangles=triangles,
-            face=face,
+            prim, mesh, MeshFaces(points, counts, corners, triangles, face)
         )
         if primitives:
             node["mesh"] = len(self.header["meshes"])
             self.header["meshes"].append(
                 {"name": node["name"], "primitives": primitives}
             )
+        return skeleton_matrix
 
     def _make_primitives(
-        self,
-        prim: Any,
-        mesh: Any,
-        points: Array,
-        counts: Array,
-        corners: Array,
-        triangles: Array,
-        face: Array,
+        self, prim: Any, mesh: Any, mesh_faces: MeshFaces
     ) -> list[dict[str, Any]]:
         """Return one primitive for each material and tint of a mesh.
 
-        Args:
-            prim: prim of the mesh.
-            mesh: the mesh.
-            points: (N, 3).
-            counts: the number of corners of each face.
-            corners: the points of the corners of all faces.
-            triangles: (T, 3) rows of `corners`.
-            face: (T,) of each triangle.
+        `prim` is the prim of the mesh.
         """
         primvars = UsdGeom.PrimvarsAPI(prim)
-        normals = self._read_normals(mesh, primvars, points, corners[triangles])
+        normals = self._read_normals(
+            mesh, primvars, mesh_faces.points, mesh_faces.corners[mesh_faces.triangles]
+        )
         primitives = []
-        for bound, faces in self._iterate_materials(prim, mesh, len(counts)):
+        n_faces = len(mesh_faces.counts)
+        for bound, bound_faces in self._iterate_materials(prim, mesh, n_faces):
             for material, colors, tinted_faces in self._split_by_tint(
-                bound, primvars, faces, counts, corners
+                bound, primvars, bound_faces, mesh_faces
             ):
-                is_selected = np.isin(face, tinted_faces)
-                corner_rows = triangles[is_selected].reshape(-1)
-                if not len(corner_rows):
+                is_selected = np.isin(mesh_faces.face, tinted_faces)
+                if not is_selected.any():
                     continue
                 attributes = {
                     "NORMAL": normals,
@@ -448,12 +451,7 @@ class Conversion:
                     **self._read_layouts(primvars, bound.layouts),
                 }
                 entry = self._make_primitive(
-                    str(prim.GetPath()),
-                    points,
-                    corners,
-                    corner_rows,
-                    face[is_selected],
-                    attributes,
+                    str(prim.GetPath()), mesh_faces, is_selected, attributes
                 )
                 primitives.append({**entry, "material": material})
         return primitives
@@ -492,7 +490,7 @@ class Conversion:
 
     def _read_normals(
         self, mesh: Any, primvars: Any, points: Array, triangles: Array
-    ) -> tuple[Array, str] | None:
+    ) -> MeshValues | None:
         """Return the normals (N, 3) of a mesh and their interpolation, or None.
 
         A primvar wins over the attribute. A mesh that is to be subdivided has smooth
@@ -502,23 +500,21 @@ class Conversion:
         if normals is None:
             values = _to_array(_get_first(mesh, "Normals"), np.float64, 3)
             if len(values):
-                normals = values, str(mesh.GetNormalsInterpolation())
+                normals = MeshValues(values, str(mesh.GetNormalsInterpolation()))
         if _get_first(mesh, "SubdivisionScheme") != UsdGeom.Tokens.none:
             self._note(
                 "has a mesh that is to be subdivided, which is shown as it is, "
                 "and smooth"
             )
-            normals = _compute_smooth_normals(points, triangles), "vertex"
+            normals = MeshValues(_compute_smooth_normals(points, triangles), "vertex")
         return normals
 
     def _make_primitive(
         self,
         path: str,
-        points: Array,
-        corners: Array,
-        corner_rows: Array,
-        face: Array,
-        attributes: dict[str, tuple[Array, str] | None],
+        mesh_faces: MeshFaces,
+        is_selected: Array,
+        attributes: dict[str, MeshValues | None],
     ) -> dict[str, Any]:
         """Return a primitive as an entry of the header; its data goes to the buffer.
 
@@ -527,65 +523,81 @@ class Conversion:
 
         Args:
             path: path of the prim, for messages.
-            points: (P, 3).
-            corners: (C,) the point of each corner of the mesh.
-            corner_rows: (3 T,) the corners of the triangles, as rows of `corners`.
-            face: (T,) the face of each triangle.
-            attributes: values (N, width) and interpolation, by the names of glTF; None
-                for none.
+            mesh_faces: the faces of the mesh.
+            is_selected: (T,) which triangles the primitive has, one at least.
+            attributes: attributes by the names of glTF; None for none.
 
         Raises:
             FileFormatError: an attribute has fewer values than the mesh needs.
         """
-        index_by_interpolation = {
-            "vertex": corners[corner_rows],
-            "varying": corners[corner_rows],
-            "faceVarying": corner_rows,
-            "uniform": face.repeat(3),
-        }
-        constant_index = np.zeros(len(corner_rows), np.int64)
-        # A column for the point and one for each attribute: which of its values each
-        # corner has. Without values, or with one for all, that is the first.
-        indices = [corners[corner_rows]]
-        for attribute in attributes.values():
-            index = constant_index
-            if attribute is not None:
-                values, interpolation = attribute
-                index = index_by_interpolation.get(interpolation, constant_index)
-                if index.max() >= len(values):
-                    raise errors.FileFormatError(
-                        f"{self.source}: expected as many values "
-                        f"as corners on {path}, got fewer"
-                    )
-            indices.append(index)
+        index_columns = self._index_values(path, mesh_faces, is_selected, attributes)
         # Corners with the same values become one vertex.
-        unique_rows, inverse = np.unique(
-            np.stack(indices, axis=1), axis=0, return_inverse=True
+        vertices, vertex_of_corner = np.unique(
+            index_columns, axis=0, return_inverse=True
         )
         accessors = {
             "POSITION": self.buffer.add_accessor(
-                points[unique_rows[:, 0]].astype(np.float32), "VEC3", bounds=True
+                mesh_faces.points[vertices[:, 0]].astype(np.float32),
+                "VEC3",
+                bounds=True,
             )
         }
         for column, (name, attribute) in enumerate(attributes.items(), 1):
             if attribute is not None:
-                values = attribute[0][unique_rows[:, column]].astype(np.float32)
+                values = attribute.values[vertices[:, column]].astype(np.float32)
                 accessor_type = f"VEC{values.shape[1]}"
                 accessors[name] = self.buffer.add_accessor(values, accessor_type)
         index_accessor = self.buffer.add_accessor(
-            inverse.reshape(-1).astype(np.uint32), "SCALAR"
+            vertex_of_corner.reshape(-1).astype(np.uint32), "SCALAR"
         )
-        return {"attributes": accessors, "mode": 4, "indices": index_accessor}
+        triangles_mode = 4  # of glTF
+        return {
+            "attributes": accessors,
+            "mode": triangles_mode,
+            "indices": index_accessor,
+        }
 
-    def _read_uvs(
-        self, primvars: Any, layout: TextureLayout
-    ) -> tuple[Array, str] | None:
-        """Return texture coordinates as glTF has them, v down, or None.
+    def _index_values(
+        self,
+        path: str,
+        mesh_faces: MeshFaces,
+        is_selected: Array,
+        attributes: dict[str, MeshValues | None],
+    ) -> Array:
+        """Return which values the corners of selected triangles have, (3 T, columns).
+
+        The first column is the index of the point. Each attribute has a column with the
+        index of its value, 0 if it has one for all, or none. Arguments and errors are
+        those of `_make_primitive`.
+        """
+        corner_rows = mesh_faces.triangles[is_selected].reshape(-1)
+        corner_points = mesh_faces.corners[corner_rows]
+        index_by_interpolation = {
+            "vertex": corner_points,
+            "varying": corner_points,
+            "faceVarying": corner_rows,
+            "uniform": mesh_faces.face[is_selected].repeat(3),
+        }
+        constant_index = np.zeros(len(corner_rows), np.int64)
+        columns = [corner_points]
+        for attribute in attributes.values():
+            index = constant_index
+            if attribute is not None:
+                index = index_by_interpolation.get(
+                    attribute.interpolation, constant_index
+                )
+                if index.max() >= len(attribute.values):
+                    raise errors.FileFormatError(
+                        f"{self.source}: expected as many values "
+                        f"as corners on {path}, got fewer"
+                    )
+            columns.append(index)
+        return np.stack(columns, axis=1)
+
+    def _read_uvs(self, primvars: Any, layout: TextureLayout) -> MeshValues | None:
+        """Return texture coordinates (N, 2) as glTF has them, v down, or None.
 
         The transform of the material is applied.
-
-        Returns:
-            Values (N, 2), and their interpolation.
         """
         values = None
         if layout.primvar:
@@ -601,15 +613,14 @@ class Conversion:
                     f"has a mesh without the primvar {name!r} of a texture, of "
                     "which one texel is shown"
                 )
-            values = np.array([layout.fallback]), "constant"
-        st, interpolation = values
-        transformed = layout.transform(st)
+            values = MeshValues(np.array([layout.fallback]), "constant")
+        transformed = layout.transform(values.values)
         uvs = np.stack([transformed[:, 0], 1.0 - transformed[:, 1]], axis=1)
-        return uvs, interpolation
+        return MeshValues(uvs, values.interpolation)
 
     def _read_layouts(
         self, primvars: Any, layouts: Iterable[TextureLayout]
-    ) -> dict[str, tuple[Array, str] | None]:
+    ) -> dict[str, MeshValues | None]:
         """Return the texture coordinates of layouts, by the names that glTF has for
         them.
         """
@@ -623,9 +634,8 @@ class Conversion:
         bound: BoundMaterial,
         primvars: Any,
         faces: Array,
-        counts: Array,
-        corners: Array,
-    ) -> Iterator[tuple[int, tuple[Array, str] | None, Array]]:
+        mesh_faces: MeshFaces,
+    ) -> Iterator[tuple[int, MeshValues | None, Array]]:
         """Split faces with a material by their colors and opacities.
 
         A material may take both from primvars. If faces have up to `MAX_TINTS` colors,
@@ -637,8 +647,7 @@ class Conversion:
             bound: the material.
             primvars: those of the mesh.
             faces: (F,) faces with the material.
-            counts: (P,) corners of each face of the mesh.
-            corners: (C,) the point of each corner.
+            mesh_faces: all faces of the mesh.
 
         Yields:
             Index of a glTF material, vertex colors or None, and faces.
@@ -647,22 +656,15 @@ class Conversion:
             yield bound.index, None, faces
             return
         if bound.is_default:
-            has_color = primvars.FindPrimvarWithInheritance("displayColor").HasValue()
-            color_text = " and displayColor: grey (0.18)"
-            if has_color:
-                color_text = ": of its displayColor"
-            self._note(
-                f"has a mesh without material{color_text}, with roughness 0.5 "
-                "and no metal, as USD's default"
-            )
+            self._note_default_material(primvars)
         colors = _read_primvar(primvars, bound.color)
         opacities = _read_primvar(primvars, bound.opacity)
-        opacity = self._compute_face_opacities(opacities, faces, counts, corners)
+        opacity = self._compute_face_opacities(opacities, faces, mesh_faces)
         # (F, 3) the color of each face that its material gets; NaN: it gets none
         tints = np.full((len(faces), 3), np.nan)
         vertex_colors = colors
-        if colors is not None and colors[1] in ("constant", "uniform"):
-            face_colors = _compute_face_values(colors, faces, counts, corners)
+        if colors is not None and colors.interpolation in ("constant", "uniform"):
+            face_colors = _compute_face_values(colors, faces, mesh_faces)
             if len(np.unique(face_colors, axis=0)) <= MAX_TINTS:
                 tints = face_colors
                 vertex_colors = None
@@ -677,26 +679,32 @@ class Conversion:
             material = self._surfaces.make_tinted(bound, color, key_opacity)
             yield material, vertex_colors, faces[is_selected]
 
+    def _note_default_material(self, primvars: Any) -> None:
+        """Note that a mesh has no material, and the color that it has instead."""
+        has_color = primvars.FindPrimvarWithInheritance("displayColor").HasValue()
+        color_text = " and displayColor: grey (0.18)"
+        if has_color:
+            color_text = ": of its displayColor"
+        self._note(
+            f"has a mesh without material{color_text}, with roughness 0.5 "
+            "and no metal, as USD's default"
+        )
+
     def _compute_face_opacities(
-        self,
-        opacities: tuple[Array, str] | None,
-        faces: Array,
-        counts: Array,
-        corners: Array,
+        self, opacities: MeshValues | None, faces: Array, mesh_faces: MeshFaces
     ) -> Array:
         """Return the opacity of each face, (F, 1); NaN where the material's holds.
 
         They are rounded to 1/255, so that few are different; more than `MAX_TINTS` are
-        replaced by their mean, with a note. `opacities` are values and interpolation of
-        a primvar, or None; other arguments are those of `_compute_face_values`.
+        replaced by their mean, with a note. `opacities` are those of a primvar; other
+        arguments are those of `_compute_face_values`.
         """
         if opacities is None:
             return np.full((len(faces), 1), np.nan)
-        face_values = _compute_face_values(opacities, faces, counts, corners)
+        face_values = _compute_face_values(opacities, faces, mesh_faces)
         opacity = np.round(face_values.clip(0.0, 1.0) * 255.0) / 255.0
-        values, interpolation = opacities
-        is_of_vertices = interpolation not in ("constant", "uniform")
-        if is_of_vertices and len(np.unique(values)) > 1:
+        is_of_vertices = opacities.interpolation not in ("constant", "uniform")
+        if is_of_vertices and len(np.unique(opacities.values)) > 1:
             self._note("has an opacity of vertices, of which faces have the mean")
         if len(np.unique(opacity)) > MAX_TINTS:
             self._note(
@@ -728,9 +736,6 @@ class Conversion:
     def _pose_at_rest(self, prim: Any, points: Array) -> tuple[Array | None, Array]:
         """Pose the points of a mesh by its skeleton at rest.
 
-        A joint moves points by the inverse of its bind transform, then its rest
-        transform. USD's matrices are for rows, so that the first one is on the left.
-
         Returns:
             The matrix (4, 4) of the skeleton, for rows, and the points (P, 3) in it;
             (None, points) if the mesh has no skeleton, or one that cannot be posed.
@@ -742,26 +747,54 @@ class Conversion:
         skeleton_query = self._skins.GetSkelQuery(skeleton) if skeleton else None
         if not skeleton_query:
             return None, points
-        rest_transforms = skeleton_query.ComputeJointSkelTransforms(
-            FIRST_TIME, atRest=True
-        )
-        bind_transforms = skeleton_query.GetJointWorldBindTransforms()
-        if not rest_transforms or len(rest_transforms) != len(bind_transforms):
+        transforms = _compute_joint_transforms(skinning, skeleton_query)
+        if transforms is None:
             return None, points
-        transforms = [
-            bind.GetInverse() * joint
-            for bind, joint in zip(bind_transforms, rest_transforms, strict=True)
-        ]
-        mapper = skinning.GetJointMapper()
-        if mapper and not mapper.IsNull() and not mapper.IsIdentity():
-            transforms = mapper.RemapTransforms(type(rest_transforms)(transforms))
         skinned = Vt.Vec3fArray([Gf.Vec3f(*map(float, point)) for point in points])
-        matrices = Vt.Matrix4dArray(list(transforms))
+        matrices = Vt.Matrix4dArray(transforms)
         if not skinning.ComputeSkinnedPoints(matrices, skinned, FIRST_TIME):
             return None, points
         xformable = UsdGeom.Xformable(skeleton.GetPrim())
         to_world = xformable.ComputeLocalToWorldTransform(FIRST_TIME)
         return np.array(to_world), _to_array(skinned, np.float64, 3)
+
+
+def _compute_joint_transforms(skinning: Any, skeleton_query: Any) -> list[Any] | None:
+    """Return how each joint of a skin moves points at rest, or None if that is unknown.
+
+    It is the inverse of its bind transform, then its rest transform. USD's matrices are
+    for rows, so that the first one is on the left.
+
+    Args:
+        skinning: query of the skin, which may have its joints in an order of its own.
+        skeleton_query: query of the skeleton.
+    """
+    rest_transforms = skeleton_query.ComputeJointSkelTransforms(FIRST_TIME, atRest=True)
+    bind_transforms = skeleton_query.GetJointWorldBindTransforms()
+    if not rest_transforms or len(rest_transforms) != len(bind_transforms):
+        return None
+    transforms = [
+        bind.GetInverse() * joint
+        for bind, joint in zip(bind_transforms, rest_transforms, strict=True)
+    ]
+    mapper = skinning.GetJointMapper()
+    if mapper and not mapper.IsNull() and not mapper.IsIdentity():
+        transforms = mapper.RemapTransforms(type(rest_transforms)(transforms))
+    return list(transforms)
+
+
+def _is_valid_power(powers: Array) -> bool:
+    """Return whether all of some powers (N,) are finite and at least 0."""
+    return bool((np.isfinite(powers) & (powers >= 0.0)).all())
+
+
+def _read_light_color(light: Any) -> Array:
+    """Return the linear color (3,) of a light: its own times that of its temperature."""
+    color = np.array(_get_first(light, "Color"), np.float64)
+    if _get_first(light, "EnableColorTemperature"):
+        temperature = _get_first(light, "ColorTemperature")
+        color *= np.array(UsdLux.BlackbodyTemperatureAsRgb(temperature))
+    return color
 
 
 def _make_point_light(prim: Any) -> dict[str, Any]:
@@ -782,28 +815,27 @@ def _make_point_light(prim: Any) -> dict[str, Any]:
 
 
 def _compute_face_values(
-    primvar: tuple[Array, str], faces: Array, counts: Array, corners: Array
+    primvar: MeshValues, faces: Array, mesh_faces: MeshFaces
 ) -> Array:
     """Return the values (F, C) of some faces; those of their corners are averaged.
 
-    Values are of the mesh ("constant"), of faces ("uniform"), of points ("vertex" and
-    "varying"), or of corners. Indices beyond the values have the last of them.
+    Indices beyond the values have the last of them.
 
     Args:
-        primvar: values (N, C) and their interpolation.
+        primvar: values (N, C) of the mesh.
         faces: (F,) faces.
-        counts: (P,) corners of each face of the mesh.
-        corners: (C,) the point of each corner.
+        mesh_faces: all faces of the mesh.
     """
     values, interpolation = primvar
+    counts = mesh_faces.counts
     if interpolation in ("constant", "uniform"):
         value_index = np.zeros(len(faces), np.int64)
         if interpolation == "uniform":
             value_index = faces
         return np.asarray(values[np.minimum(value_index, len(values) - 1)])
-    corner_index = np.arange(len(corners))
+    corner_index = np.arange(len(mesh_faces.corners))
     if interpolation in ("vertex", "varying"):
-        corner_index = corners
+        corner_index = mesh_faces.corners
     corner_values = values[np.minimum(corner_index, len(values) - 1)]
     # A row of zeros, since the last faces may have no corners: they begin at the end,
     # where `reduceat` needs a row.
@@ -811,6 +843,31 @@ def _compute_face_values(
     starts = np.cumsum(counts) - counts
     sums = np.add.reduceat(padded_values, starts)
     return np.asarray((sums / np.maximum(counts, 1)[:, None])[faces])
+
+
+def _compute_illuminance(prim: Any, radiance: float) -> float:
+    """Return the lux of a distant light on what faces it.
+
+    Its radiance is integrated over the cone under which it is seen. A "normalised"
+    light of USD states its illuminance, whatever the cone.
+    """
+    angle = _get_first(UsdLux.DistantLight(prim), "Angle")
+    half_angle = math.radians(angle) / 2.0
+    if _get_first(UsdLux.LightAPI(prim), "Normalize") or not half_angle > 0.0:
+        return radiance
+    return radiance * (math.pi * math.sin(half_angle) ** 2)
+
+
+def _integrate_over_sphere(prim: Any, radiance: float) -> float:
+    """Return the radiance of a spherical light times the disk that it is seen as.
+
+    The disk is pi r^2. A "normalised" light of USD has a power that does not depend on
+    its size: its radiance is divided by the area of the sphere, 4 pi r^2.
+    """
+    if _get_first(UsdLux.LightAPI(prim), "Normalize"):
+        return radiance * 0.25
+    radius: float = _get_first(UsdLux.SphereLight(prim), "Radius")
+    return radiance * (math.pi * radius**2)
 
 
 # From a stage whose z is up to glTF, whose y is.
@@ -822,19 +879,18 @@ def _get_first(schema: Any, name: str) -> Any:
     return getattr(schema, f"Get{name}Attr")().Get(FIRST_TIME)
 
 
-def _flatten_primvar(primvar: Any, width: int) -> tuple[Array, str] | None:
-    """Return the values (N, width) of a primvar and their interpolation, or None."""
+def _flatten_primvar(primvar: Any, width: int) -> MeshValues | None:
+    """Return the values (N, width) of a primvar, or None if it has none."""
     if not primvar or not primvar.HasValue():
         return None
     values = _to_array(primvar.ComputeFlattened(FIRST_TIME), np.float64, width)
-    return values, str(primvar.GetInterpolation())
+    return MeshValues(values, str(primvar.GetInterpolation()))
 
 
-def _read_primvar(primvars: Any, use: PrimvarUse | None) -> tuple[Array, str] | None:
+def _read_primvar(primvars: Any, use: PrimvarUse | None) -> MeshValues | None:
     """Return the values (N, C) of a primvar that a surface uses, or of its fallback.
 
-    Returns:
-        The values and their interpolation; None if the surface uses none.
+    None if the surface uses none.
     """
     if use is None:
         return None
@@ -842,9 +898,9 @@ def _read_primvar(primvars: Any, use: PrimvarUse | None) -> tuple[Array, str] | 
     if use.name:
         primvar = primvars.FindPrimvarWithInheritance(use.name)
         values = _flatten_primvar(primvar, len(use.fallback))
-    if values is None or not len(values[0]):
-        return np.array([use.fallback]), "constant"
-    return np.nan_to_num(values[0]), values[1]
+    if values is None or not len(values.values):
+        return MeshValues(np.array([use.fallback]), "constant")
+    return MeshValues(np.nan_to_num(values.values), values.interpolation)
 
 
 def _to_array(values: Any, kind: Any, width: int = 0) -> Array:

@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -179,6 +179,14 @@ class Shader:
     def get_number(self, name: str, default: float) -> float:
         """Return the finite number of an input, or `default`."""
         return self.get_numbers(name, (default,))[0]
+
+
+def _is_neutral(attribute: Any, neutral: float | tuple[float, ...]) -> bool:
+    """Return whether an attribute that produces an input has no or a neutral value."""
+    if _is_output(attribute):  # of another shader
+        return False
+    value = attribute.Get(FIRST_TIME)
+    return value is None or np.allclose(np.array(value, np.float64), neutral, atol=1e-3)
 
 
 def _is_output(attribute: Any) -> bool:
@@ -354,8 +362,8 @@ class UsdSurfaces:
     def load_texels(self, use: UsdTextureUse) -> Array | None:
         """Return an image (H, W, 4) in linear values, before scale and bias.
 
-        None, and a note, if it cannot be decoded. An image is decoded once for each
-        material.
+        None, and a note, if it cannot be decoded. It is kept until the next material is
+        converted, so that one which shows it twice decodes it once.
         """
         key = (use.data, use.is_srgb)
         if key not in self._texels:
@@ -416,6 +424,28 @@ class UsdSurfaces:
         return entries.index(entry)
 
 
+class _TextureInputs(NamedTuple):
+    """The inputs of the shader of a texture.
+
+    Attributes:
+        asset: asset path of the image, or None.
+        color_space: "raw", "sRGB", or "auto".
+        scale: (4,) factors of the channels.
+        bias: (4,) what is added after scaling.
+        layout: its texture coordinates.
+        wraps: wrap modes along s and t, as in glTF.
+        fallback: the color that stands in for a missing image, or None.
+    """
+
+    asset: Any
+    color_space: str
+    scale: tuple[float, ...]
+    bias: tuple[float, ...]
+    layout: TextureLayout
+    wraps: tuple[int, int]
+    fallback: tuple[float, ...] | None
+
+
 def _read_fallback(node: Shader) -> tuple[float, ...] | None:
     """Return the color that stands in for a missing image; None if there is none."""
     if node.get_value("fallback") is None:
@@ -460,10 +490,8 @@ class PreviewSurface:
                 "diffuse colour is read"
             )
         shader.inputs.mark_read("clearcoatRoughness")  # named with the clearcoat
-        if (
-            str(shader.get_value("opacityMode") or "presence") != "presence"
-            and entry.get("alphaMode") == "BLEND"
-        ):
+        opacity_mode = str(shader.get_value("opacityMode") or "presence")
+        if opacity_mode != "presence" and entry.get("alphaMode") == "BLEND":
             self.surfaces.note(
                 "has materials with opacityMode transparent; here "
                 "highlights fade with the opacity too"
@@ -481,19 +509,14 @@ class PreviewSurface:
         """
 
         def is_quiet(name: str, shader_input: Any) -> bool:
-            """Return whether an input changes nothing: its value is neutral."""
+            """Return whether an input changes nothing."""
             if name == "specularColor" and not is_specular:
                 return True
-            neutral = NEUTRAL_VALUES.get(name)
-            for attribute in UsdShade.Utils.GetValueProducingAttributes(shader_input):
-                if _is_output(attribute) or neutral is None:
-                    return False
-                value = attribute.Get(FIRST_TIME)
-                if value is not None and not np.allclose(
-                    np.array(value, np.float64), neutral, atol=1e-3
-                ):
-                    return False
-            return True
+            producers = UsdShade.Utils.GetValueProducingAttributes(shader_input)
+            if name not in NEUTRAL_VALUES:
+                return len(producers) == 0
+            neutral = NEUTRAL_VALUES[name]
+            return all(_is_neutral(attribute, neutral) for attribute in producers)
 
         for name in self.shader.inputs.find_unread(is_quiet):
             label = "an ior other than 1.5" if name == "ior" else name
@@ -520,13 +543,16 @@ class PreviewSurface:
 
         Args:
             name: the input.
-            kinds: ids of the readers of primvars that count.
+            kinds: ids of the shaders that count: they read primvars of a type.
             default: the default of the input, for its number of channels.
         """
         source = self.shader.find_source(name)
-        if source is None or source[0].kind not in kinds:
+        if source is None:
             return None
-        reader = self._track_shader(source[0])
+        source_shader, _ = source
+        if source_shader.kind not in kinds:
+            return None
+        reader = self._track_shader(source_shader)
         primvar = str(reader.get_value("varname") or "")
         return PrimvarUse(primvar, reader.get_numbers("fallback", [0.0] * len(default)))
 
@@ -554,31 +580,48 @@ class PreviewSurface:
         source = self.shader.find_source(name)
         if source is None:
             return None
-        node = self._track_shader(source[0])
-        output = source[1]
+        source_shader, output = source
+        node = self._track_shader(source_shader)
         if node.kind != UV_TEXTURE:
             self.surfaces.note(f"has a {name} of {node.kind[:100]}, which is left out")
             return None
-        fallback = _read_fallback(node)
-        scale = node.get_numbers("scale", NO_SCALE)
-        bias = node.get_numbers("bias", NO_BIAS)
-        layout = self._find_layout(node)
-        wraps = self._read_wraps(node)
-        color_space = str(node.get_value("sourceColorSpace") or "auto")
-        asset = node.get_value("file")
+        # All inputs are read first: they are known, whatever follows.
+        inputs = _TextureInputs(
+            asset=node.get_value("file"),
+            color_space=str(node.get_value("sourceColorSpace") or "auto"),
+            scale=node.get_numbers("scale", NO_SCALE),
+            bias=node.get_numbers("bias", NO_BIAS),
+            layout=self._find_layout(node),
+            wraps=self._read_wraps(node),
+            fallback=_read_fallback(node),
+        )
         if output not in CHANNELS:
             self.surfaces.note(
                 f"has a {name} of the output {output[:50]!r} of a picture, which is "
                 "left out"
             )
             return None
-        channels = CHANNELS[output]
-        path = "" if asset is None else str(asset.path)
-        data = self._load_image(asset, path, name)
+        return self._load_texture(name, inputs, CHANNELS[output])
+
+    def _load_texture(
+        self, name: str, inputs: _TextureInputs, channels: Sequence[int]
+    ) -> UsdTextureUse | tuple[float, ...] | None:
+        """Return a texture with the bytes of its image.
+
+        Args:
+            name: the input of the surface that it is connected to.
+            inputs: inputs of its shader.
+            channels: channels of the image that the input takes.
+
+        Returns:
+            As `_find_texture`.
+        """
+        path = "" if inputs.asset is None else str(inputs.asset.path)
+        data = self._load_image(inputs.asset, path, name)
         if data is None:
-            if fallback is None:
+            if inputs.fallback is None:
                 return None
-            return tuple(fallback[channel] for channel in channels)
+            return tuple(inputs.fallback[channel] for channel in channels)
         if channels == CHANNELS["a"] and data.startswith(EXR):
             self.surfaces.note(
                 f"has a {name} of the alpha of an .exr picture, which is left out"
@@ -587,13 +630,25 @@ class PreviewSurface:
         return UsdTextureUse(
             path=path,
             data=data,
-            is_srgb=self._is_srgb(color_space, data),
+            is_srgb=self._is_srgb(inputs.color_space, data),
             channels=channels,
-            scale=scale,
-            bias=bias,
-            layout=layout,
-            wraps=wraps,
+            scale=inputs.scale,
+            bias=inputs.bias,
+            layout=inputs.layout,
+            wraps=inputs.wraps,
         )
+
+    def _find_texture_or_value(
+        self, name: str, value: tuple[float, ...]
+    ) -> tuple[UsdTextureUse | None, tuple[float, ...]]:
+        """Return the texture that an input is connected to, if any, and its value.
+
+        The value is `value`, or that which stands in for a missing image.
+        """
+        use = self._find_texture(name)
+        if isinstance(use, tuple):
+            return None, use
+        return use, value
 
     def _load_image(self, asset: Any, path: str, name: str) -> bytes | None:
         """Return the bytes of the image of an input; None, and a note, if there is
@@ -674,7 +729,11 @@ class PreviewSurface:
         )
         s, t = node.get_numbers(input_name, (0.0, 0.0))
         u, v, _ = matrix @ np.array([s, t, 1.0])
-        return TextureLayout("", (0.0, 0.0), (0.0, 0.0, float(u), 0.0, 0.0, float(v)))
+        return TextureLayout(
+            primvar="",
+            fallback=(0.0, 0.0),
+            matrix=(0.0, 0.0, float(u), 0.0, 0.0, float(v)),
+        )
 
     def _make_slot(self, texture: int, layout: TextureLayout) -> dict[str, int]:
         """Return the entry that refers to a texture, by its index, with some
@@ -703,48 +762,50 @@ class PreviewSurface:
         Returns:
             The primvars that replace color and opacity; None where there is none.
         """
-        shader = self.shader
         color_primvar = self._find_primvar(
             "diffuseColor", READERS_OF_COLORS, DEFAULT_COLOR
         )
         opacity_primvar = self._find_primvar("opacity", (READER_OF_NUMBERS,), (1.0,))
-        color_use = None if color_primvar else self._find_texture("diffuseColor")
-        opacity_use = None if opacity_primvar else self._find_texture("opacity")
-        threshold = shader.get_number("opacityThreshold", 0.0)
-        color = list(shader.get_numbers("diffuseColor", DEFAULT_COLOR))
-        opacity = shader.get_number("opacity", 1.0)
-        # A tuple is the value that stands in for a missing image.
-        if isinstance(color_use, tuple):
-            color = list(np.broadcast_to(color_use, 3))
-            color_use = None
-        if isinstance(opacity_use, tuple):
-            opacity = opacity_use[0]
-            opacity_use = None
-        if (
-            opacity_use is not None
-            and color_use is not None
-            and opacity_use.layout != color_use.layout
-        ):
-            self.surfaces.note(
-                "has an opacity with other texture coordinates than the "
-                "colour's, which is left out"
-            )
-            opacity_use = None
-        texture, color = self._add_base_texture(color_use, opacity_use, color)
+        color_use = None
+        opacity_use = None
+        color = self.shader.get_numbers("diffuseColor", DEFAULT_COLOR)
+        opacity = self.shader.get_numbers("opacity", (1.0,))
+        threshold = self.shader.get_number("opacityThreshold", 0.0)
+        if color_primvar is None:
+            color_use, color = self._find_texture_or_value("diffuseColor", color)
+        if opacity_primvar is None:
+            opacity_use, opacity = self._find_texture_or_value("opacity", opacity)
+        opacity_use = self._drop_other_layout(opacity_use, color_use)
+        # one number, in place of a missing image, is a grey
+        color = tuple(map(float, np.broadcast_to(color, 3)))
+        texture, factor = self._add_base_texture(color_use, opacity_use, [*color])
         if texture is not None:
             first_use = color_use or opacity_use
             assert first_use is not None
             surface["baseColorTexture"] = self._make_slot(texture, first_use.layout)
         has_opacity_map = texture is not None and opacity_use is not None
-        alpha = 1.0 if has_opacity_map else opacity
-        factor = [min(max(channel, 0.0), 1.0) for channel in (*color, alpha)]
+        factor.append(1.0 if has_opacity_map else opacity[0])
+        factor = [min(max(channel, 0.0), 1.0) for channel in factor]
         surface["baseColorFactor"] = factor
         if has_opacity_map or factor[3] < 1.0 or opacity_primvar is not None:
-            if threshold > 0.0:
-                entry.update({"alphaMode": "MASK", "alphaCutoff": threshold})
-            else:
-                entry["alphaMode"] = "BLEND"
+            _set_alpha_mode(entry, threshold)
         return color_primvar, opacity_primvar
+
+    def _drop_other_layout(
+        self, opacity_use: UsdTextureUse | None, color_use: UsdTextureUse | None
+    ) -> UsdTextureUse | None:
+        """Return the texture of the opacity; None, and a note, if its texture
+        coordinates are not those of the color's texture.
+        """
+        if opacity_use is None or color_use is None:
+            return opacity_use
+        if opacity_use.layout == color_use.layout:
+            return opacity_use
+        self.surfaces.note(
+            "has an opacity with other texture coordinates than the "
+            "colour's, which is left out"
+        )
+        return None
 
     def _add_base_texture(
         self,
@@ -821,12 +882,41 @@ class PreviewSurface:
         """Fill in roughness and metallic of the glTF material.
 
         glTF has one image for both, in which each is a channel; a number without an
-        image fills its channel. So an image with other texture coordinates than the
-        first is replaced by its mean, and a primvar by its fallback, with a note.
+        image fills its channel.
 
         Args:
             surface: its pbrMetallicRoughness.
             is_specular: whether the material has the workflow without metals.
+        """
+        factor_by_name, plane_by_name, packed_use = self._find_planes()
+        if is_specular:  # this workflow has no metals
+            factor_by_name["metallic"] = 0.0
+            plane_by_name.pop("metallic", None)
+        if not plane_by_name or packed_use is None:
+            surface["metallicFactor"] = factor_by_name["metallic"]
+            surface["roughnessFactor"] = factor_by_name["roughness"]
+            return
+        texture = self.surfaces.add_image(
+            _pack_planes(plane_by_name, factor_by_name), packed_use.sampler
+        )
+        # The image has the numbers, which the factors multiply.
+        surface["metallicFactor"] = 1.0
+        surface["roughnessFactor"] = 1.0
+        surface["metallicRoughnessTexture"] = self._make_slot(
+            texture, packed_use.layout
+        )
+
+    def _find_planes(
+        self,
+    ) -> tuple[dict[str, float], dict[str, Array], UsdTextureUse | None]:
+        """Find the numbers and the images of roughness and metallic.
+
+        An image with other texture coordinates than the first is replaced by its mean,
+        and a primvar by its fallback, with a note.
+
+        Returns:
+            The numbers by name; the values (H, W) of images by name; and the texture
+            whose coordinates these have, None if there are none.
         """
         factor_by_name: dict[str, float] = {}
         plane_by_name: dict[str, Array] = {}
@@ -845,22 +935,7 @@ class PreviewSurface:
             else:
                 plane_by_name[name] = plane
                 packed_use = use
-        if is_specular:  # this workflow has no metals
-            factor_by_name["metallic"] = 0.0
-            plane_by_name.pop("metallic", None)
-        if not plane_by_name or packed_use is None:
-            surface["metallicFactor"] = factor_by_name["metallic"]
-            surface["roughnessFactor"] = factor_by_name["roughness"]
-            return
-        texture = self.surfaces.add_image(
-            _pack_planes(plane_by_name, factor_by_name), packed_use.sampler
-        )
-        # The image has the numbers, which the factors multiply.
-        surface["metallicFactor"] = 1.0
-        surface["roughnessFactor"] = 1.0
-        surface["metallicRoughnessTexture"] = self._make_slot(
-            texture, packed_use.layout
-        )
+        return factor_by_name, plane_by_name, packed_use
 
     def _read_number_or_image(
         self, name: str, default: float
@@ -896,22 +971,23 @@ class PreviewSurface:
                 "says; write raw if it holds numbers"
             )
 
+    def _note_constant_normal(self) -> None:
+        """Note a normal that is no image, unless it is upright."""
+        normal = self.shader.get_numbers("normal", UPRIGHT)
+        if not np.allclose(normal, UPRIGHT, atol=1e-3):
+            self.surfaces.note(
+                "has materials with one normal everywhere, which is left out"
+            )
+
     def _add_normal(self, entry: dict[str, Any]) -> None:
         """Fill in the normal map.
 
-        Texels of 8 bits become normals by a scale of 2 and a bias of -1, which glTF
-        implies. So an image of 8 bits with these is taken as it is; also if they are
-        missing and its texels look like normals. Others are decoded and written anew. A
-        single normal for all, or one channel, is left out with a note. `entry` is the
-        glTF material.
+        An image of 8 bits with the scale and the bias that glTF implies is taken as it
+        is. Others are decoded and written anew. A single normal for all, or one
+        channel, is left out with a note. `entry` is the glTF material.
         """
         if self.shader.find_source("normal") is None:
-            if not np.allclose(
-                self.shader.get_numbers("normal", UPRIGHT), UPRIGHT, atol=1e-3
-            ):
-                self.surfaces.note(
-                    "has materials with one normal everywhere, which is left out"
-                )
+            self._note_constant_normal()
             return
         use = self._find_texture("normal")
         if isinstance(use, tuple) or use is None:
@@ -921,46 +997,52 @@ class PreviewSurface:
                 "has a normal of one channel of a picture, which is left out"
             )
             return
-        # USD requires scale and bias, which many exporters leave out.
-        if use.is_plain and is_of_8_bits(use.data):
-            texels = self.surfaces.load_texels(replace(use, is_srgb=False))
-            if texels is not None and reading.has_normals(texels[:, :, :3]):
-                use = replace(use, scale=NORMAL_SCALE, bias=NORMAL_BIAS, is_srgb=False)
-                self.surfaces.note(
-                    "has a normal map of 8 bits without scale (2, 2, 2, 1) and bias "
-                    "(-1, -1, -1, 0), which are added"
-                )
-        if (
+        use = self._complete_normal_scale(use)
+        has_implied_scale = (
             not use.is_srgb
             and use.scale[:3] == NORMAL_SCALE[:3]
             and use.bias[:3] == NORMAL_BIAS[:3]
-        ):
-            if is_of_8_bits(use.data):
-                entry["normalTexture"] = self._make_slot(
-                    self.surfaces.add_texture(use.data, use.sampler), use.layout
-                )
-                return
+        )
+        if has_implied_scale and is_of_8_bits(use.data):
+            texture = self.surfaces.add_texture(use.data, use.sampler)
+            entry["normalTexture"] = self._make_slot(texture, use.layout)
+            return
         self._note_srgb("normal", use)
         normals = self.surfaces.compute_values(use)
         if normals is not None:
+            # stored as (n + 1) / 2
             texture = self.surfaces.add_image(normals * 0.5 + 0.5, use.sampler)
             entry["normalTexture"] = self._make_slot(texture, use.layout)
+
+    def _complete_normal_scale(self, use: UsdTextureUse) -> UsdTextureUse:
+        """Return a normal map with the scale and bias that texels of 8 bits need.
+
+        USD requires them, and many exporters leave them out. They are added, with a
+        note, if there are none and the texels look like normals.
+        """
+        if not use.is_plain or not is_of_8_bits(use.data):
+            return use
+        texels = self.surfaces.load_texels(replace(use, is_srgb=False))
+        if texels is None or not reading.has_normals(texels[:, :, :3]):
+            return use
+        self.surfaces.note(
+            "has a normal map of 8 bits without scale (2, 2, 2, 1) and bias "
+            "(-1, -1, -1, 0), which are added"
+        )
+        return replace(use, scale=NORMAL_SCALE, bias=NORMAL_BIAS, is_srgb=False)
 
     def _add_emission(self, entry: dict[str, Any]) -> None:
         """Fill in the emission, whose factor may be larger than 1.
 
         An image of sRGB texels times factors is taken as it is; another one is written
-        anew, divided by its largest value, which becomes the factor. glTF's factors are
-        at most 1: the largest one beyond that goes to an extension. `entry` is the glTF
-        material.
+        anew. `entry` is the glTF material.
         """
-        factor: Sequence[float] = self.shader.get_numbers(
-            "emissiveColor", (0.0, 0.0, 0.0)
+        black = (0.0, 0.0, 0.0)
+        use, value = self._find_texture_or_value(
+            "emissiveColor", self.shader.get_numbers("emissiveColor", black)
         )
-        use = self._find_texture("emissiveColor")
-        if isinstance(use, tuple):
-            factor = list(np.broadcast_to(use, 3))
-        elif use is not None and _is_scaled_texel(use, max_scale=math.inf):
+        factor: Sequence[float] = list(map(float, np.broadcast_to(value, 3)))
+        if use is not None and _is_scaled_texel(use, max_scale=math.inf):
             texture = self.surfaces.add_texture(use.data, use.sampler)
             entry["emissiveTexture"] = self._make_slot(texture, use.layout)
             factor = use.scale[:3]
@@ -971,21 +1053,36 @@ class PreviewSurface:
             values = np.broadcast_to(
                 np.maximum(np.nan_to_num(values), 0.0), (*values.shape[:2], 3)
             )
+            # divided by its largest value, which becomes the factor
             largest = max(float(values.max()), 1e-6)
             levels = color.linear_to_srgb((values / largest).astype(np.float32))
             texture = self.surfaces.add_image(levels, use.sampler)
             entry["emissiveTexture"] = self._make_slot(texture, use.layout)
             factor = [largest] * 3
-        factor = [max(channel, 0.0) for channel in factor]
-        strength = max(factor)
-        if strength > 0.0:
-            entry["emissiveFactor"] = [
-                channel / max(strength, 1.0) for channel in factor
-            ]
-            if strength > 1.0:
-                entry["extensions"] = {
-                    "KHR_materials_emissive_strength": {"emissiveStrength": strength}
-                }
+        _write_emission_factor(entry, [max(channel, 0.0) for channel in factor])
+
+
+def _set_alpha_mode(entry: dict[str, Any], threshold: float) -> None:
+    """Let the opacity of a glTF material be a mask if there is a threshold, over 0."""
+    if threshold > 0.0:
+        entry.update({"alphaMode": "MASK", "alphaCutoff": threshold})
+    else:
+        entry["alphaMode"] = "BLEND"
+
+
+def _write_emission_factor(entry: dict[str, Any], factor: Sequence[float]) -> None:
+    """Fill in the factor of the emission of a glTF material, unless it is black.
+
+    glTF's factors are at most 1: the largest one beyond that goes to an extension.
+    """
+    strength = max(factor)
+    if strength <= 0.0:
+        return
+    entry["emissiveFactor"] = [channel / max(strength, 1.0) for channel in factor]
+    if strength > 1.0:
+        entry["extensions"] = {
+            "KHR_materials_emissive_strength": {"emissiveStrength": strength}
+        }
 
 
 def _pack_planes(planes: Mapping[str, Array], factors: Mapping[str, float]) -> Array:
@@ -1021,7 +1118,10 @@ def _compute_transform(node: Shader) -> Array:
 
 
 def _is_scaled_texel(use: UsdTextureUse, max_scale: float = 1.0) -> bool:
-    """Return whether colors are sRGB texels of 8 bits times factors up to a limit."""
+    """Return whether colors are sRGB texels of 8 bits times factors up to a limit.
+
+    glTF has just such textures, so that the image needs no conversion.
+    """
     is_color = use.is_srgb and len(use.channels) == 3 and use.bias[:3] == NO_BIAS[:3]
     return (
         is_color
