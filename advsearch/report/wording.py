@@ -35,6 +35,9 @@ SIMILARITY = "similarity"
 COMMAND = "command"
 """Tasks whose predictions have words of their own; others are quoted."""
 
+PLAIN_UNITS = ("", "1")
+"""Units that are not written after a value: of what has no unit, and of a plain number."""
+
 _MARGINS = {
     CLASSIFICATION: "how far the right prediction leads the wrong one, in logits",
     DETECTION: "how far the best right box is over the score that counts, in log-odds; "

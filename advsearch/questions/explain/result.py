@@ -268,7 +268,7 @@ def _make_headline(result: ExplainResult) -> str:
 
 def _pair_section(pair: NearestRight) -> ResultPart:
     """Return the sentence and the images of a failure and the nearest right image."""
-    unit = f" {pair.unit}" if pair.unit not in ("", "1") else ""
+    unit = "" if pair.unit in wording.PLAIN_UNITS else f" {pair.unit}"
     wrong_value = _format_value(pair.wrong_at)
     right_value = _format_value(pair.right_at)
     text = (

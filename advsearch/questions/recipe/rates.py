@@ -174,7 +174,7 @@ def get_numeric_column(rows: Rows, name: str) -> Any:
 def format_unit(rows: Rows, name: str) -> str:
     """Format the unit of a column to follow a number: " m", or "" if it has none."""
     unit = rows.attrs["units"].get(name, "")
-    if unit in ("", "1", "name"):
+    if unit in (*wording.PLAIN_UNITS, "name"):  # "name" is that of a discrete choice
         return ""
     return f" {unit}"
 

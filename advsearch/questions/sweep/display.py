@@ -510,7 +510,7 @@ def _axis_table(name: str, rows: Sequence[AxisRow], task: str) -> ResultPart:
         task: name of the task.
     """
     title = name
-    if rows[0].unit not in ("", "name", "1"):
+    if rows[0].unit not in (*wording.PLAIN_UNITS, "name"):  # "name": a discrete choice
         title += f", {rows[0].unit}"
     listed = list(rows)
     if len(rows) > MAX_TEXT_ROWS:
