@@ -517,9 +517,10 @@ def find_typical_failures(
 ) -> list[tuple[int, rules.RuleConditions]]:
     """Return the indices of failures, the most typical first, each with its rule.
 
-    Rules take turns, a row belongs to the first that covers it, and what fails under
-    none of them, with no conditions, is the last to take a turn. The most typical
-    failure of a rule is the one nearest to the mean of its failures, by ranks.
+    A failure belongs to the first rule that covers it. Rules take turns in giving their
+    next typical failure; what fails under none of them takes the last turn, with no
+    conditions. The most typical failure of a rule is nearest to the mean of its
+    failures, by the ranks of the parameters.
 
     Args:
         table: the rows.
@@ -527,12 +528,13 @@ def find_typical_failures(
         limit: failures that are returned, at most.
     """
     ranks = _rank_rows(table)  # (n, parameters)
-    is_left: rules.Mask = ~table["correct"].to_numpy()
-    queues = []
+    is_unassigned: rules.Mask = ~table["correct"].to_numpy()
     no_conditions: rules.RuleConditions = ()  # cover every row
+    # for each rule its failures, the most typical first
+    queues = []
     for conditions in (*(rule.conditions for rule in counted_rules), no_conditions):
-        indices = np.flatnonzero(is_left & rules.find_covered(conditions, table))
-        is_left[indices] = False
+        indices = np.flatnonzero(is_unassigned & rules.find_covered(conditions, table))
+        is_unassigned[indices] = False
         if not len(indices):
             continue
         distance = np.abs(ranks[indices] - ranks[indices].mean(axis=0)).sum(axis=1)
@@ -540,7 +542,7 @@ def find_typical_failures(
         queues.append([(index, conditions) for index in most_typical_first])
     failures = []
     for turn in zip_longest(*queues):
-        # None: the queue of a rule has ended
+        # a rule whose queue has ended has None
         failures += [failure for failure in turn if failure is not None]
     return failures[:limit]
 

@@ -432,8 +432,10 @@ def _make_rule_claim(number: int, rule: RuleRow) -> views.Claim:
 
 
 def _make_envelope_claim(box: EnvelopeRow) -> views.Claim:
-    """Return what is claimed of a box of values that holds, by the rows that did not
-    choose it.
+    """Return the claim that a model is right inside a box of parameter values.
+
+    One half of the rows chose the box. The claim counts the other half, which tested
+    it.
     """
     extent = box.make_extent("right, of rows that did not choose the box")
     where = wording.format_conditions(box.conditions)

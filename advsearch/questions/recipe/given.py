@@ -237,8 +237,8 @@ def _describe_named(
         rows: rows with object and texture.
         names_texture: for each texture, whether the prediction of each of its rows
             (n,) names it.
-        options: options of the figure; a texture without `classes` has no name that a
-            prediction could have.
+        options: options of the figure. Its `classes` are the names of textures that a
+            prediction can have; a texture without any cannot be named.
     """
     text = [
         "The prediction is the object, whatever its texture: "
@@ -699,9 +699,11 @@ def find_triangle(mixture: Sequence[float], side: int) -> Triangle:
     """Return the triangle of a ternary diagram that three fractions (3,) lie in.
 
     A triangle is (a, b, points_down): the first two fractions times `side`, rounded
-    down, and whether it points down. With the third one, rounded likewise, they add up
-    to side - 1 in a triangle that points up, and to side - 2 in one that points down.
-    `side` is the number of triangles along a side of the diagram.
+    down, and whether it points down.
+
+    Args:
+        mixture: three fractions, whose sum is 1.
+        side: number of triangles along a side of the diagram.
     """
     a, b, c = (int(fraction * side) for fraction in mixture)
     # The sum is `side` at a corner, which several triangles share. It counts for one of
@@ -713,35 +715,38 @@ def find_triangle(mixture: Sequence[float], side: int) -> Triangle:
             b -= 1
         else:
             c -= 1
-    return a, b, a + b + c < side - 1
+    # The three numbers add up to `side` before they are rounded down, which takes 1 from
+    # the sum in a triangle that points up, and 2 in one that points down.
+    points_down = a + b + c < side - 1
+    return a, b, points_down
 
 
 def list_triangles(side: int) -> dict[Triangle, tuple[Mixture, Mixture, Mixture]]:
     """Return the triangles of a ternary diagram with the mixtures at their corners.
 
     The key of a triangle is (a, b, points_down): the first two fractions inside it,
-    times `side` and rounded down, and whether it points down.
+    times `side` and rounded down, and whether it points down. Two triangles have the
+    same a and b, and share an edge; at the side of the diagram where the third fraction
+    is small, there is only the one that points up.
 
     Args:
         side: number of triangles along a side of the diagram.
     """
 
     def mixture_at(x: int, y: int) -> Mixture:
-        """Return the fractions at the corner x and y steps along the first two."""
+        """Return the mixture whose first two fractions are x / side and y / side."""
         return x / side, y / side, (side - x - y) / side
 
     corners = {}
     for a in range(side):
         for b in range(side - a):
-            shared_edge = mixture_at(a + 1, b), mixture_at(a, b + 1)
-            corners[a, b, False] = (mixture_at(a, b), *shared_edge)
-            # along one side of the diagram no triangle points down
-            if a + b < side - 1:
-                corners[a, b, True] = (
-                    mixture_at(a + 1, b + 1),
-                    mixture_at(a, b + 1),
-                    mixture_at(a + 1, b),
-                )
+            # the ends of the edge that both triangles share
+            right = mixture_at(a + 1, b)
+            left = mixture_at(a, b + 1)
+            corners[a, b, False] = (mixture_at(a, b), right, left)
+            has_triangle_down = a + b < side - 1
+            if has_triangle_down:
+                corners[a, b, True] = (mixture_at(a + 1, b + 1), left, right)
     return corners
 
 

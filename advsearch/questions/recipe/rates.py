@@ -65,7 +65,8 @@ def read_rows(
     Each row has `object`, `environment`, `model` and the parameters; the prediction
     (`answer`, `correct`, `margin`); `time`, when it was stored (seconds since 1970);
     and `unit`, the independent unit that it belongs to. Rows with the same draw of
-    the same seed share a unit, also across parts.
+    the same seed share a unit, also across parts: rows of a sweep that share a draw,
+    and the trials of the same number of attacks. Any other row is a unit by itself.
 
     Args:
         part: part of the recipe that the run belongs to.
@@ -77,21 +78,23 @@ def read_rows(
     """
     rows = list[dict[str, Any]]()
     units = dict[str, str]()
-    draws = None  # how the rows of a sweep follow from draws
+    sweep_units = None  # how the rows of a sweep follow from draws
     with Store.open_to_read(folder) as store:
         if summary.command == "sweep":
-            draws = workbench.read_units(store, is_sampled=summary.sampler is not None)
+            is_sampled = summary.sampler is not None
+            sweep_units = workbench.read_units(store, is_sampled=is_sampled)
         for row in store.rows():
             if row.kind not in kinds:
                 continue
             if row.kind == "sweep" and row.is_out_of_view:
                 continue
             units |= {name: stored["unit"] for name, stored in row.values.items()}
-            unit = f"{folder.name} {row.kind} {row.id}"  # each row by itself
-            if row.kind == "sweep" and draws is not None:
-                unit = f"{seed} {draws.find_unit(row.step)}"
             if summary.command == "attack":
                 unit = f"{seed} {row.step}"
+            elif row.kind == "sweep" and sweep_units is not None:
+                unit = f"{seed} {sweep_units.find_unit(row.step)}"
+            else:
+                unit = f"{folder.name} {row.kind} {row.id}"
             values = _read_row_values(row, summary)
             rows.append(
                 {**values, "time": row.time, PART_COLUMN: part, "unit": unit, **more}
@@ -456,10 +459,10 @@ def make_rates_figure(rows: Rows, options: RatesOptions) -> FigureContent:
     text = _describe_cells(cells, series, bin_centers is not None, options)
     text += _describe_series(cells, totals, series, options)
     if options.beside and len(baseline_rows):
+        # the part that all others are compared with: its bar comes first
         name = options.names.get(options.beside, options.beside)
         tallies = _count_series("", baseline_rows, series_values, options)
         text += _compare_with_baseline(name, tallies, totals, series, verb)
-        # the baseline comes first
         bars = {name: tallies, **cells}
 
     def draw(figure: Any) -> None:
@@ -552,7 +555,7 @@ def _name_series(series: Sequence[str], options: RatesOptions) -> list[str]:
 def _describe_cells(
     cells: Cells, series: Sequence[str], is_binned: bool, options: RatesOptions
 ) -> list[str]:
-    """Describe the lowest and the highest cell: over a map, or else of each series.
+    """Describe the lowest and the highest cell: of a map, or else of each series.
 
     Args:
         cells: for each row by its name, a tally for each series.
@@ -560,21 +563,9 @@ def _describe_cells(
         is_binned: whether the rows are bins of a number.
         options: options of the figure.
     """
-    verb = "wrong" if options.wrong else "right"
     if options.form == "map":
-        pairs = []
-        for row_name, tallies in cells.items():
-            names = _name_series(series, options)
-            for name, tally in zip(names, tallies, strict=True):
-                pairs.append(tally.with_name(f"{row_name} with {name}"))
-        return describe_extremes(
-            pairs,
-            lowest_prefix="The lowest pair",
-            highest_prefix="the highest",
-            things=f"pairs of {_name_columns(options)}",
-            verb=verb,
-        )
-
+        return _describe_map_cells(cells, series, options)
+    verb = "wrong" if options.wrong else "right"
     text = list[str]()
     where = f" where {options.axis_label}" if is_binned else ""
     has_several_series = len(series) > 1
@@ -592,6 +583,24 @@ def _describe_cells(
             verb=verb,
         )
     return text
+
+
+def _describe_map_cells(
+    cells: Cells, series: Sequence[str], options: RatesOptions
+) -> list[str]:
+    """Describe the lowest and the highest cell of all rows and series of a map."""
+    pairs = []
+    for row_name, tallies in cells.items():
+        names = _name_series(series, options)
+        for name, tally in zip(names, tallies, strict=True):
+            pairs.append(tally.with_name(f"{row_name} with {name}"))
+    return describe_extremes(
+        pairs,
+        lowest_prefix="The lowest pair",
+        highest_prefix="the highest",
+        things=f"pairs of {_name_columns(options)}",
+        verb="wrong" if options.wrong else "right",
+    )
 
 
 def _describe_series(
@@ -992,12 +1001,15 @@ def _add_agreement(
     table: list[list[Cell]],
     series_name: str,
 ) -> None:
-    """Add the agreement of pairs to the bars and the table, of all objects and of each.
+    """Add how often pairs of images agree to the bars and to the table of a figure.
+
+    Two images agree if the model is right about both, or wrong about both.
 
     Args:
-        bars: tallies by object, or `ALL_OBJECTS`; each gets one more.
+        bars: for each object, and for `ALL_OBJECTS`, the tallies of the series; these
+            pairs are one more series.
         pairs: pairs of renderings and other images.
-        table: rows of the table, to which one for each object is added.
+        table: rows of the table, to which one for each entry of the bars is added.
         series_name: name of the other images.
     """
     for name, tallies in bars.items():
@@ -1023,14 +1035,21 @@ def _draw_agreement(figure: Any, bars: Cells, series: Sequence[str]) -> None:
 
 
 def _pair_rows(part_rows: Rows, renderings: Rows) -> Rows:
-    """Join rows with the renderings of the same configuration.
+    """Join the rows of a part with the renderings of the same configuration.
 
-    A configuration is all columns of the renderings but those that say something of a
-    single row. Rows may have more parameters. Columns of a single row come twice: those
-    of the rendering end in `` rendered``.
+    A configuration is all columns of the renderings but those of a single row, such as
+    the prediction. Rows of the part may have further parameters. Columns of a single
+    row come twice: those of the rendering end in `` rendered``.
     """
-    per_row = {PREDICTION_COLUMN, PART_COLUMN, "correct", "margin", "time", "unit"}
-    configuration = [name for name in renderings if name not in per_row]
+    columns_of_row = {
+        PREDICTION_COLUMN,
+        PART_COLUMN,
+        "correct",
+        "margin",
+        "time",
+        "unit",
+    }
+    configuration = [name for name in renderings if name not in columns_of_row]
     return part_rows.merge(renderings, on=configuration, suffixes=("", " rendered"))
 
 
@@ -1092,14 +1111,15 @@ def _describe_photographs(n_pairs: int, n_unpaired: int) -> list[str]:
 
 
 def _describe_where(right: bool, pairs: Rows) -> str:
-    """Describe how often both predictions are right, or wrong, if the first one is.
+    """Describe how often the second prediction of a pair is like the first.
 
-    The first is about the rendering, the second about the other image of a pair. "It"
-    in the sentence is the model, of which the sentence before speaks.
+    The first is about a rendering, the second about another image. The sentence before
+    speaks of the model, which is "it" here.
 
     Args:
-        right: whether the first is right.
-        pairs: pairs of both.
+        right: selects the pairs in which the model is right about the rendering, or
+            else wrong.
+        pairs: pairs of a rendering and another image.
     """
     verb = "right" if right else "wrong"
     is_selected = pairs["correct rendered"] == right

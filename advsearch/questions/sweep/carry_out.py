@@ -158,7 +158,7 @@ def sweep(
             "grid: expected a mapping from parameters to values, got "
             f"{type(grid).__name__}"
         )
-    # What is not passed is as in the attack, if there is one.
+    # What the caller does not pass is as in the attack, if there is one.
     attack_run = _find_attack_run(adversarial_of)
     defaults = _load_defaults(attack_run, scene, grid, controls)
     scenes = _as_list(defaults["object"] if scene is None else scene)
@@ -185,7 +185,7 @@ def sweep(
         naming.check_no_scene_settings(set_options)
     described |= _describe_scenes(scenes, loaded)
     run_setting = {"run": None if run is None else str(run)}
-    # later ones replace earlier ones
+    # of a setting in several of these mappings, the last value counts
     config = SweepConfig(**{**defaults, **described, **set_options, **run_setting})
     config = config.with_python_only_parts(
         _find_python_only(config, networks, loaded, task, tracker, controls)
@@ -214,24 +214,40 @@ def _check_can_use_workers(
     task: AnyTask,
     controls: Controls,
     networks: Sequence[Any],
-    loaded: Sequence[Any],
+    loaded_scenes: Sequence[Any],
     set_options: Mapping[str, Any],
 ) -> None:
     """Raise an error if workers are requested for objects that they cannot load.
 
     Workers are other processes. They load everything by its name, and do not have the
     objects of this session.
+
+    Args:
+        task: task of the models.
+        controls: controls that are sampled.
+        networks: models as the caller passed them: names, files or objects.
+        loaded_scenes: scenes that the caller has loaded.
+        set_options: the settings that the caller passed.
+
+    Raises:
+        InputError: such a setting is among `set_options`.
     """
-    are_named = all(isinstance(network, (str, Path)) for network in networks)
-    has_objects = bool(loaded) or bool(loading.list_session_only_controls(controls))
-    if has_objects or not are_named or isinstance(task, FunctionTask):
+    are_models_named = all(isinstance(network, (str, Path)) for network in networks)
+    is_task_named = not isinstance(task, FunctionTask)
+    has_session_controls = bool(loading.list_session_only_controls(controls))
+    has_session_objects = bool(loaded_scenes) or has_session_controls
+    if has_session_objects or not are_models_named or not is_task_named:
         naming.check_no_worker_settings(set_options)
 
 
 def _find_attack_run(
     adversarial_of: str | Path | AttackResult | None,
 ) -> str | Path | None:
-    """Return the run of an attack. Raises InputError: it was not kept in one."""
+    """Return the run of an attack.
+
+    Raises:
+        InputError: the attack was not kept in a run directory.
+    """
     if not isinstance(adversarial_of, AttackResult):
         return adversarial_of
     if adversarial_of.run is None:
@@ -349,24 +365,26 @@ def _find_python_only(
 
 
 def _check_config(config: SweepConfig) -> None:
-    """Check that workers can load the metrics, and that files have a run directory.
+    """Check that the settings of a sweep can be met.
 
     Raises:
-        InputError: they cannot, or there is none.
+        InputError: workers cannot load a metric, or files are to be stored and there is
+            no run directory.
     """
     if config.workers is not None or config.cluster is not None:
         judging.check_metrics_importable(config.metrics)
-    stored_things = {
+    # settings that store files, with what they store, as the message has it
+    stored_files = {
         "keep_pictures": "them",
         "aov": "the layers",
         "surface": "the map",
     }
-    for name, thing in stored_things.items():
-        is_stored = getattr(config, name) not in ("none", None, False)
-        if config.run is None and is_stored:
+    for setting, stored in stored_files.items():
+        stores_files = getattr(config, setting) not in ("none", None, False)
+        if config.run is None and stores_files:
             raise InputError(
-                f"{name}: expected `run` beside it, the folder that keeps "
-                f"{thing}; name one"
+                f"{setting}: expected `run` beside it, the folder that keeps "
+                f"{stored}; name one"
             )
 
 
@@ -389,14 +407,13 @@ def _run_config(
         models: models as the caller passed them; so are all others.
     """
     resumed = _find_resumable(config)
+    # The directory of a new run is created before the work. It is None without one.
+    context: Any = nullcontext(resumed)
     if config.run is not None and resumed is None:
         check_free(config.run, overwrite=config.overwrite)
-    context: Any = nullcontext(resumed)  # None without a run directory
-    if config.run is not None and resumed is None:
         context = create_before_work(config)
     if config.twins is not None:
-        # a check before the work: raises an error if it cannot be read
-        read_twins(config.twins)
+        read_twins(config.twins)  # a check before the work: raises if it is corrupt
     with context as directory:
         named_scenes = expand_photographs(config, scenes) or load_scenes(config)
         job = _make_job(
@@ -446,9 +463,8 @@ def sweep_from_config(
     """
     if config.run is not None and resumed is None:
         check_free(config.run, overwrite=config.overwrite)
-    # a check before the work: raises an error if the run of twins cannot be read
     if config.twins is not None:
-        read_twins(config.twins)
+        read_twins(config.twins)  # a check before the work: raises if it is corrupt
     progress = progress or NullProgress()
     progress.stage(LOADING)
     return _run_in_directory(config, load_job(config), progress, resumed)
@@ -462,7 +478,8 @@ def _add_adversarial_arm(
 ) -> tuple[NamedScene, ...]:
     """Return the clean scenes, then the same with an adversarial configuration.
 
-    Without `adversarial_of` these are the scenes as they are.
+    These are the two arms of a comparison. Without `adversarial_of` nothing is
+    compared, and the scenes stay as they are.
 
     Args:
         config: the settings.

@@ -59,8 +59,8 @@ def add_frames(
 
     A control that travels along the path is added if there is none. The times of the
     frames become the last axis of the grid, unless it has them already: from 0 to the
-    end of the path, `fps` a second, at least two. If there are several paths, nothing
-    chooses among them and nothing is sampled, then all are swept.
+    end of the path, `fps` a second, at least two. If there are several paths, all are
+    swept, unless a setting chooses among them or paths are sampled.
 
     Args:
         config: settings with a `path`.
@@ -81,21 +81,22 @@ def add_frames(
         # both ends have a frame
         n_frames = max(2, round(seconds * config.fps) + 1)
         grid = {**grid, time_name: f"0:{seconds:g}:{n_frames}"}
-    paths = next(
-        (
-            parameter.options
-            for parameter in travelling.instance_parameters
-            if parameter.name == Control.PATH_PARAMETER
-        ),
-        (),
-    )
-    is_path_free = (
-        path_name not in grid and Control.PATH_PARAMETER not in travelling.specs
-    )
-    if paths and config.samples is None and is_path_free:
-        # Nothing is sampled, so every path is swept.
-        grid = {path_name: list(paths), **grid}
+    is_path_in_grid = path_name in grid
+    is_path_set = Control.PATH_PARAMETER in travelling.specs
+    is_sampled = config.samples is not None
+    if not (is_path_in_grid or is_path_set or is_sampled):
+        paths = _list_paths(travelling)
+        if paths:
+            grid = {path_name: paths, **grid}
     return sampled, grid
+
+
+def _list_paths(travelling: Any) -> list[Any]:
+    """Return the paths among which a control can choose; none if it has a single one."""
+    for parameter in travelling.instance_parameters:
+        if parameter.name == Control.PATH_PARAMETER:
+            return list(parameter.options)
+    return []
 
 
 def find_time_axis(axes: Sequence[Axis]) -> int | None:
@@ -274,35 +275,38 @@ class Drives:
         return _CompleteDrives(flags[selected], distance[selected], steps[selected])
 
     def compute_rates(self) -> list[DriveRates]:
-        """Compute the rates over drives of each model, by adversarial scene.
+        """Compute the rates over drives of each model, without and with the adversarial
+        configuration.
 
         Frames without the object count neither as right nor as part of a gap. Models
         without a complete drive are left out.
         """
         rates = list[DriveRates]()
         named_scenes = self._job.scenes
-        for answer in dict.fromkeys(named_scene.arm for named_scene in named_scenes):
+        # the arms of a comparison, without and with the adversarial configuration; a
+        # single one without a name if nothing is compared
+        for arm in dict.fromkeys(named_scene.arm for named_scene in named_scenes):
             scenes = [
                 scene
                 for scene, named_scene in enumerate(named_scenes)
-                if named_scene.arm == answer
+                if named_scene.arm == arm
             ]
             for model in range(len(self._job.models)):
                 drives = self._select_complete(scenes, model)
                 if len(drives.flags):
-                    rates.append(self._compute_rates(drives, model, answer))
+                    rates.append(self._compute_rates(drives, model, arm))
         return rates
 
     def _compute_rates(
-        self, drives: _CompleteDrives, model: int, answer: str
+        self, drives: _CompleteDrives, model: int, arm: str
     ) -> DriveRates:
         """Compute the rates of one model over drives.
 
         Args:
             drives: drives with all their frames.
             model: index of the model.
-            answer: name of the scene that they have, clean or adversarial; empty if
-                the sweep has no adversarial one.
+            arm: name of the scene that they have, clean or adversarial; empty if the
+                sweep has no adversarial one.
         """
         n_frames = len(self.times)
         first_distance = _first_right_distance(drives)
@@ -320,7 +324,7 @@ class Drives:
         max_flicker = (n_frames - 1) / self.seconds
         return DriveRates(
             model=self._job.models[model].name,
-            answer=answer or None,
+            answer=arm or None,
             drives=n_drives,
             repeats=math.ceil(len(drives.flags) / n_drives),
             frames=n_frames,
@@ -406,8 +410,8 @@ class Drives:
     ) -> TrackRates | None:
         """Compute what a tracker makes of the boxes of drives.
 
-        A frame is lost if the object is visible and no track is on it. A lost frame is
-        loose if a track would be on it with less overlap.
+        A frame is lost if the object is visible and no track is on it. A lost frame
+        counts as loose if some track overlaps the object, but too little.
 
         Args:
             model: index of the model.
@@ -425,13 +429,15 @@ class Drives:
         if any(step not in self._frame_of_step for step in steps.flat):
             return None
         frames = [[self._frame_of_step[step] for step in row] for row in steps.tolist()]
-        drives = [
+        tracked_drives = [
             track_drive(drive_frames, tracker, task.iou) for drive_frames in frames
         ]
         lost_loosely = _compute_lost_loosely(task, tracker, frames)
-        lost = np.array([drive.lost for drive in drives], dtype=float)
-        switches = np.array([drive.switches for drive in drives], dtype=float)
-        longest_gap = np.array([drive.gap for drive in drives], dtype=float)
+        lost = np.array([tracked.lost for tracked in tracked_drives], dtype=float)
+        switches = np.array(
+            [tracked.switches for tracked in tracked_drives], dtype=float
+        )
+        longest_gap = np.array([tracked.gap for tracked in tracked_drives], dtype=float)
         n_frames = len(self.times)
         seconds_bounds = (0.0, n_frames * self._frame_interval)
         return TrackRates(
@@ -478,10 +484,10 @@ class Drives:
 def _compute_lost_loosely(
     task: Detection, tracker: Tracker, frames: Sequence[Sequence[DetectedFrame]]
 ) -> npt.NDArray[np.float64]:
-    """Compute for each drive the fraction (n,) of frames that are lost even loosely.
+    """Compute for each drive the fraction (n,) of frames without any track on the object.
 
-    For that a track needs to overlap the object by `MIN_OVERLAP` only, if that is less
-    than the `iou` of the task.
+    A frame is lost if no track overlaps the object enough. Here little overlap is
+    enough: `MIN_OVERLAP`, or the `iou` of the task if that is less.
 
     Args:
         task: task of the model; a track is on the object from its `iou` on.

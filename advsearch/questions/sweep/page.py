@@ -184,7 +184,7 @@ def _describe_runs(
             images, note = _describe_images(source, source.thumbnails)
             description["pictures"] = images
             image_notes += [] if note is None else [note]
-        descriptions.append(description | _describe_evaluation(path, summary))
+        descriptions.append(description | _describe_for_explorer(path, summary))
     return descriptions, embedded_rows, image_notes
 
 
@@ -235,12 +235,13 @@ def _page_parts_html(path: Path, summary: SweepSummary) -> list[Html | None]:
     ]
 
 
-def _describe_evaluation(run: Path, summary: SweepSummary | None) -> JsonObject:
-    """Return what the explorer has to know of a sweep.
+def _describe_for_explorer(run: Path, summary: SweepSummary | None) -> JsonObject:
+    """Return what the page's explorer of rows has to know of a sweep.
 
-    That is the task, the axes of the grid, and height and width in pixels of the
-    evaluated images if all have one size: boxes are in these. Without a summary it is
-    the task, as far as the settings can be read.
+    That is the task, the axes of the grid, and height and width of the evaluated images
+    in pixels, in which boxes are. With several models there is no size, since they may
+    differ in it. A sweep without a summary yet has the task only, as far as its
+    settings can be read.
     """
     if summary is None:
         with suppress(AdvsearchError):
@@ -250,7 +251,8 @@ def _describe_evaluation(run: Path, summary: SweepSummary | None) -> JsonObject:
         return {}
     formation = summary.image_formation
     size = None
-    if formation is not None and "," not in summary.model:
+    has_single_model = "," not in summary.model
+    if formation is not None and has_single_model:
         size = list[JsonValue](formation.resolution)
     return {
         "task": summary.task,
@@ -361,6 +363,7 @@ def _worst_caption(summary: SweepSummary) -> str:
         f"{name} {wording.format_number(described.value)}"
         for name, described in worst.values.items()
     )
+    # the prediction about the saved image, or about the image of the sweep
     claim = worst.pictured or worst.claimed
     text = f"{values}: the model predicts {format_prediction(summary.task, claim)}"
     rate = worst.verified
