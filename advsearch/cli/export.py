@@ -179,16 +179,17 @@ def _write_table(args: argparse.Namespace, out: Path | None, by_name: str) -> in
             f"{folder}: is a study, whose rows are those of its parts; "
             f"export one of {parts}"
         )
-    # for a terminal the table goes through `print`, which escapes what would steer it
-    on_screen = io.BytesIO() if out is None and sys.stdout.isatty() else None
+    # For a terminal the table goes through `print`, which escapes what would steer it;
+    # else it is written as it is.
+    is_for_terminal = out is None and sys.stdout.isatty()
+    buffer = io.BytesIO()
+    stream = buffer if is_for_terminal else sys.stdout.buffer
     with Store(folder / NAME, read_only=True) as store, output_errors():
-        count = write_rows(
-            store, format, out, on_screen or sys.stdout.buffer, args.kind
-        )
-    if on_screen is not None:
-        print(on_screen.getvalue().decode("utf-8", "replace"), end="")
+        count = write_rows(store, format, out, stream, args.kind)
+    if is_for_terminal:
+        print(buffer.getvalue().decode("utf-8", "replace"), end="")
     if out is None:
-        return 0
+        return output.OK
     text = f"{count} rows in {out}" + ("" if by_name == format else f", as {format}")
     facts = {"command": "export", "rows": count, "format": format, "out": str(out)}
     return output.print_answer(args.json, facts, text, sys.stderr)

@@ -73,11 +73,9 @@ def show(args: argparse.Namespace) -> int:
     match args.what:
         case ["control" | "policy" | "task" as kind, name]:
             return _show_declared(kind, name, args.json)
-        # a word of an experiment, such as recipe, that can describe its choices
-        case [command, name] if command in EXPERIMENTS and (
-            target := get_experiment(command).choice_description
-        ):
-            text, facts = load_attribute(target)(name)
+        case [command, name] if _find_choice_description(command) is not None:
+            describe = load_attribute(_find_choice_description(command))
+            text, facts = describe(name)
             return output.print_answer(args.json, {command: name, **facts}, text)
         case [name]:
             try:
@@ -91,6 +89,17 @@ def show(args: argparse.Namespace) -> int:
     raise InputError(
         f"expected the name of a run, or one of {kinds}, got {' '.join(args.what)!r}"
     )
+
+
+def _find_choice_description(command: str) -> Any:
+    """Return where the function is that describes a choice of an experiment.
+
+    The choices of `recipe` are recipes. None if there is no such experiment, or its
+    choices have no description.
+    """
+    if command not in EXPERIMENTS:
+        return None
+    return get_experiment(command).choice_description or None
 
 
 def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:

@@ -259,7 +259,8 @@ def _cut_piece(piece: Piece, width: float, height: float) -> Iterator[PlacedPart
     """
     left, top = piece.bleed
     n_rows, n_columns = piece.picture.shape[:2]
-    # the length is in pixels without bleed, the room is that beside the marks
+    # The first argument is a length in pixels without bleed. The second one is the page
+    # in pixels, without the frame of a part, which is its bleed and its marks.
     columns = _cut_evenly(
         n_columns - 2 * left, (width - 2 * piece.frame[0]) / piece.pixel[0]
     )

@@ -271,15 +271,15 @@ def make_default_view(result: Result) -> ShownResult:
     tables = {name: value for name, value in values.items() if _is_table(value)}
     facts = _find_plain_facts(result, values, tables)
     # objects with fields, each with the names of those that are on the page
-    described: list[tuple[Fields, set[str]]] = [
+    objects_with_words: list[tuple[Fields, set[str]]] = [
         (result, {name for name, text in facts.items() if text})
     ]
     sections = []
     for name, rows in tables.items():
         table = _make_table(name, rows)
         sections.append(table)
-        described.append((rows[0], set(table.heads)))
-    sections.append(_explain_words(described))
+        objects_with_words.append((rows[0], set(table.heads)))
+    sections.append(_explain_words(objects_with_words))
     brief = result.brief or str(values.get("ending", "done"))
     statement = f"{brief[:1].upper()}{brief[1:]}."
     return ShownResult(statement, sections, facts)
@@ -298,13 +298,13 @@ def _find_plain_facts(
     """Return, as texts by name, those fields of a result that no table and no other
     part of the page shows.
     """
-    # facts are called as a page shows them, fields as Python does
+    # facts are named as a page shows them, fields as Python does
     fact_names = [name.replace(" ", "_") for name in result.facts()]
-    elsewhere = {*_FIELDS_ELSEWHERE, *tables, *fact_names}
+    excluded = {*_FIELDS_ELSEWHERE, *tables, *fact_names}
     return {
         _format_name(name): _format_value(value)
         for name, value in values.items()
-        if name not in elsewhere
+        if name not in excluded
     }
 
 

@@ -370,13 +370,13 @@ def make_problem_with_warnings(
     """
     config = parts.config.model_copy(update=changes)
     model, warnings = parts.model_and_warnings
+    warnings = [*warnings]  # a copy: `make_problem` adds to it
     if "model" in changes:
-        loaded = load_ensemble(config.model, config, parts.task)
-    else:
-        loaded = (model, [*warnings])
-    problem = make_problem(replace(parts, config=config, model_and_warnings=loaded))
+        model, warnings = load_ensemble(config.model, config, parts.task)
+    changed_parts = replace(parts, config=config, model_and_warnings=(model, warnings))
+    problem = make_problem(changed_parts)
     return problem, [
-        *loaded[1],
+        *warnings,
         *describe_adjusted_defaults(problem.space.adjusted_defaults),
     ]
 

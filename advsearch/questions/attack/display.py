@@ -73,7 +73,7 @@ def _matrix_claims(result: MatrixResult) -> Iterator[Claim]:
     """Yield what each scene of a matrix does to each model."""
     for row in result.table:
         for cell in row.tested:
-            searches = None
+            searches = None  # on another model the scene was only tried
             if cell.model == row.attacked:
                 searches = views.format_searches(row.renders, result.policy, False)
             name = f"searched on {row.attacked}, tried on {cell.model}"
@@ -268,8 +268,12 @@ CURVE_NOTE = (
 
 
 def _view_curve(result: CurveResult) -> ShownResult:
-    """Return the view of robust accuracy against epsilon."""
+    """Return the view of robust accuracy against epsilon.
+
+    A page has a chart if there are several epsilons; of a single one a notebook has it.
+    """
     known = [point for point in result.curve if point.accuracy is not None]
+    # without the controls' own epsilons, which have no place on an axis
     points = [point for point in known if point.epsilon is not None]
     has_chart = len(points) > 1
     points_text = "; ".join(
@@ -353,6 +357,7 @@ def _curve_text(result: CurveResult, known: Sequence[CurvePoint]) -> str:
     """
 
     def at(epsilon: float | None) -> str:
+        """Return the end of a clause; empty for the controls' own epsilons."""
         return "" if epsilon is None else f" at epsilon {epsilon:g}"
 
     if not known or not result.table:

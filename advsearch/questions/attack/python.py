@@ -179,16 +179,17 @@ def _check_can_use_workers(
 
     Workers are other processes. They load everything by its name, and do not have the
     objects of this session.
+
+    Raises:
+        InputError: such a setting is among `options`.
     """
-    are_named = all(
-        isinstance(value, (str, Path)) for value in (scene, *list_models(model))
-    )
-    if (
-        not are_named
-        or callable(objective)
-        or session_controls
-        or isinstance(task, FunctionTask)
-    ):
+    objects = [
+        value
+        for value in (scene, *list_models(model))
+        if not isinstance(value, (str, Path))
+    ]
+    has_functions = callable(objective) or isinstance(task, FunctionTask)
+    if objects or has_functions or session_controls:
         naming.check_no_worker_settings(options)
 
 
@@ -226,9 +227,14 @@ def _make_config(
 
 
 def _open_run(run: str | Path | None, resume: bool, config: AttackConfig) -> Any:
-    """Return a context with the run directory, or None.
+    """Return a context with the run directory of an attack; None without one.
 
-    It is that of a stopped run or a new one.
+    It is that of a run that is continued, or a new one.
+
+    Args:
+        run: name or folder of the run; None keeps none.
+        resume: whether a run that is there is continued.
+        config: the settings.
     """
     resumed = None
     if resume and run is not None and is_run(locate_run(run)):

@@ -637,10 +637,11 @@ def evaluate_drive(
 
 
 def _find_path(problem: Problem) -> tuple[Any, int]:
-    """Return the control that travels at random times, and the column of its time.
+    """Find the control that travels at random times.
 
-    Time is its first coordinate in a full configuration. None if there is no such
-    control.
+    Returns:
+        The control, None if there is no such one; and the column of its time in a full
+        configuration, which is the control's first coordinate.
     """
     n_searched = len(problem.searched_space.controls)
     column = len(problem.domain.start)

@@ -202,11 +202,12 @@ def distribute_attacks(
     )
     with open_workers(
         work,
+        # without work no workers are started
         workers=config.workers if missing else None,
         cluster=config.cluster if missing else None,
         tell=progress.message,
     ) as executor:
-        if executor is None:
+        if executor is None:  # none are requested: this process makes the attacks
             return
         progress.stage("attacks on workers", len(missing))
         for done in executor.compute([index] for index in missing):

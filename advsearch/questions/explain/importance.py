@@ -81,7 +81,7 @@ def _find_interacting_pairs(
         table: the predictions and the values of their factors.
         sample: the same predictions.
     """
-    # as many groups of each factor that the cells of two have enough rows on average
+    # so few groups of each factor that the cells of two have enough rows on average
     n_groups = max(2, math.isqrt(sample.n_clusters // MIN_ROWS_PER_CELL))
     group_of_factor = {
         factor: cut_into_groups(table[factor], n_groups)
@@ -184,13 +184,13 @@ class ClusteredPredictions:
         """Estimate the fraction of the variance between groups with its 95 % interval.
 
         Groups of a factor without effect differ by chance, too. What that adds to the
-        fraction on average is subtracted: of independent rows as in the adjusted R
-        squared, of clusters by `expected_statistic`. If that is not known, or there is
-        one group only, nothing is shown: the fraction is 0, from 0 to 1.
+        fraction on average is subtracted: for independent rows as in the adjusted R
+        squared, for clusters by `expected_statistic`. If that is not known, or there is
+        a single group, nothing is shown: the fraction is 0, and its interval 0 to 1.
 
-        For the interval, rows times the fraction, divided by the design effect, is a
-        noncentral chi-squared statistic, or with clusters one of F. Its noncentrality
-        divided by the rows, and times the design effect, is the true fraction.
+        The interval: the statistic (rows times the fraction, divided by the design
+        effect) is noncentral chi-squared, or with clusters noncentral F. The true
+        fraction is its noncentrality, divided by the rows and times the design effect.
 
         Args:
             factors: their names.

@@ -163,9 +163,8 @@ class Renders:
         Args:
             index: index of the rule.
             rule: the rule.
-            uncovered_fraction: uncovered fraction of its rows, that no earlier rule
-                covers.
-            earlier_conditions: earlier conditions of the rules before it.
+            uncovered_fraction: fraction of its rows that no earlier rule covers.
+            earlier_conditions: conditions of the rules before it.
 
         Returns:
             A frame for each sweep, whose units are distinct from those of others.
@@ -177,7 +176,7 @@ class Renders:
                 self.config.confirm / len(self.sweeps) / n_arcs / uncovered_fraction
             )
             for arc in range(n_arcs):
-                # a different number for each rule, sweep and arc
+                # distinct for each rule, sweep and arc
                 number = (index * len(self.sweeps) + sweep_index) * MAX_ARCS + arc
                 seed = seeds.stream(self.config.seed, "confirm", number)
                 self.progress.message(
@@ -275,13 +274,13 @@ class Renders:
         wrong_value = failure[factor]
         values = frame_a[factor].tolist()  # the failure's own value is among them
         failure_row = values.index(wrong_value)
-        is_right = np.asarray(frame_a["correct"] & frame_b["correct"])
-        is_wrong_in_both = not (
-            frame_a["correct"][failure_row] or frame_b["correct"][failure_row]
-        )
-        if not is_wrong_in_both or not is_right.any():
+        is_right_in_both = np.asarray(frame_a["correct"] & frame_b["correct"])
+        is_right_in_any = np.asarray(frame_a["correct"] | frame_b["correct"])
+        if is_right_in_any[failure_row] or not is_right_in_both.any():
             return None
-        nearest_row = self._find_nearest_value(factor, is_right, values, wrong_value)
+        nearest_row = self._find_nearest_value(
+            factor, is_right_in_both, values, wrong_value
+        )
         return NearestRight(
             values=failure,
             parameter=factor,
@@ -447,7 +446,8 @@ class Renders:
     def _select_sweeps(self) -> list[int]:
         """Return the indices of the sweeps whose failures are clustered.
 
-        Features are those of one model: the first one that was swept by itself.
+        Features are those of one model: the first one that was swept by itself. Without
+        such a model no sweep is selected.
         """
         models_of_sweeps = [sweep.config.models for sweep in self.sweeps]
         single = next((names for names in models_of_sweeps if len(names) == 1), None)

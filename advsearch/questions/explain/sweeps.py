@@ -186,6 +186,7 @@ def make_sweep_along(
         seed: seed of the noise.
     """
     values = list_values_along(table[factor], row[factor])
+    # a parameter is named "control.parameter"; object, environment and model are not
     grid: dict[str, object] = {
         name: [row[name]] for name in row if "." in name and is_settable(config, name)
     }
@@ -302,6 +303,7 @@ def make_minimal_config(config: SweepConfig, **changes: object) -> SweepConfig:
         "aov": None,
         "surface": False,
     }
-    # a sampler that was chosen would be refused where nothing is sampled
+    # Without controls nothing is sampled, and a sampler other than the default is
+    # refused.
     sampler = {} if changes.get("controls") else {"sampler": "sobol"}
     return SweepConfig(**{**config.to_json(), **quiet, **changes, **sampler})

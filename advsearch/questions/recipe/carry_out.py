@@ -370,7 +370,9 @@ def _check_column(
     Raises:
         InputError: if no part has it, or only some have.
     """
-    known = {*COMMON_COLUMNS, *([rates.GROUP_COLUMN] if recipe.groups else [])}
+    known = set(COMMON_COLUMNS)  # columns that all parts have
+    if recipe.groups:
+        known.add(rates.GROUP_COLUMN)
     if name in known:
         return
     # a control that does not declare its parameters may have this one

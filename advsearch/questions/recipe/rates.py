@@ -939,7 +939,7 @@ def make_agreement_figure(rows: Rows, options: AgreementOptions) -> FigureConten
     Raises:
         InputError: if a part has no rows or other configurations.
     """
-    # without the columns that only other parts have
+    # `dropna` leaves out the columns that only other parts have
     renderings = _select_part(rows, options.of[0]).dropna(axis=1, how="all")
     if renderings.empty:
         raise InputError(
@@ -947,10 +947,11 @@ def make_agreement_figure(rows: Rows, options: AgreementOptions) -> FigureConten
             f"{options.of[0]!r}, got none"
         )
     objects = [ALL_OBJECTS, *renderings["object"].unique()]
+    # for each object a tally of each series; a series compares with one part's images
     bars: dict[str, list[ClusteredFraction]] = {name: [] for name in objects}
+    series = list[str]()
     text = list[str]()
     table = list[list[Cell]]()
-    series = list[str]()
     for part in (PHOTOGRAPHS, *options.of[1:]):
         part_rows = _select_part(rows, part)
         if part == PHOTOGRAPHS and part_rows.empty:

@@ -757,8 +757,8 @@ def _load_named_scenes(config: SweepConfig) -> list[NamedScene]:
     """
     session_scene: Scene | None = config.python_object(naming.SCENE, config.object)
     if session_scene is not None:  # passed by a Python caller
-        environment = session_scene.description.environment_name
-        return [NamedScene(config.object, environment, session_scene)]
+        name = session_scene.description.environment_name
+        return [NamedScene(config.object, name, session_scene)]
     objects = naming.check_distinct(config.objects, "object")
     environments = naming.check_distinct(config.environments, "environment")
     first_environment = environments[0] if config.environment else None
@@ -772,24 +772,26 @@ def _load_named_scenes(config: SweepConfig) -> list[NamedScene]:
             for name, scene in scenes.items()
         ]
     first_scene = scenes[objects[0]].description
-    # Environments are loaded once, with the first object, and given to all others.
-    maps = {first_environment: first_scene.environment}
+    # Each environment is loaded once, with the first object, and given to all others.
+    environment_by_name = {first_environment: first_scene.environment}
     for name in environments[1:]:
         scene = load_scene(first_scene.object, name)
-        maps[name] = scene.description.environment
-    return [
-        NamedScene(name, environment, scenes[name].with_environment(maps[environment]))
-        for name in objects
-        for environment in maps
-    ]
+        environment_by_name[name] = scene.description.environment
+    named_scenes = []
+    for object_name in objects:
+        for environment_name, environment in environment_by_name.items():
+            scene = scenes[object_name].with_environment(environment)
+            named_scenes.append(NamedScene(object_name, environment_name, scene))
+    return named_scenes
 
 
 def expand_photographs(
     config: SweepConfig, scenes: Iterable[NamedScene]
 ) -> tuple[NamedScene, ...]:
-    """Return scenes, and of a scene in a folder of photographs one for each of them.
+    """Return the scenes, each in every photograph of its folder of photographs.
 
-    They stay as they are if a control draws the photograph, or the grid names it.
+    Scenes without such a folder stay as they are. So do all scenes if a control of the
+    sweep or an axis of its grid chooses the photograph.
     """
     control_names = [
         *config.controls,

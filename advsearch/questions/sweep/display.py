@@ -716,6 +716,7 @@ def _accuracy_extent(description: str, counts: CountedPredictions) -> Extent:
 
 
 DRIVE_HEADS = ("", "mean", "95 % interval", "worst drive")
+PERCENT = " %"  # the unit of rates that are fractions, and written in percent
 
 
 def rate_text(summary: SweepSummary) -> str:
@@ -748,7 +749,7 @@ def drive_rows(drive_rates: DriveRates) -> list[tuple[str, str, str, str]]:
     never = f", never in {drive_rates.never_seen}" if drive_rates.never_seen else ""
     # name, values, unit and remark on the mean
     rates: list[tuple[str, OverDrives | None, str, str]] = [
-        ("frames in which it is right", drive_rates.right, " %", ""),
+        ("frames in which it is right", drive_rates.right, PERCENT, ""),
         (
             "first right at a distance of",
             drive_rates.first_seen,
@@ -760,8 +761,8 @@ def drive_rows(drive_rates: DriveRates) -> list[tuple[str, str, str, str]]:
     ]
     if tracks is not None:
         rates += [
-            ("frames without its track", tracks.lost, " %", ""),
-            ("frames with a loose track instead", tracks.loose, " %", ""),
+            ("frames without its track", tracks.lost, PERCENT, ""),
+            ("frames with a loose track instead", tracks.loose, PERCENT, ""),
             ("identity switches", tracks.switches, "", ""),
             ("longest gap of its track", tracks.longest_gap, " s", ""),
         ]
@@ -780,10 +781,10 @@ def _format_drive_row(
     Args:
         name: name of the rate.
         value: the rate; a dash stands for an interval that it lacks.
-        unit: unit with a space before it; fractions of the unit " %" become percent.
+        unit: unit with a space before it; of a fraction it is `PERCENT`.
         remark: remark on the mean, after it.
     """
-    factor = 100.0 if unit == " %" else 1.0
+    factor = 100.0 if unit == PERCENT else 1.0
     interval = "-"
     if value.interval:
         low, high = value.interval

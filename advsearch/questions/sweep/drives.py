@@ -178,13 +178,20 @@ class Drives:
     _distance_bounds: tuple[float, float] | None = None
 
     def __init__(self, job: Job, rows: Iterable[Row]) -> None:
+        """Sort the rows of a sweep over frames into drives.
+
+        Args:
+            job: the sweep, with an axis of times.
+            rows: its rows so far.
+        """
         axis_index = find_time_axis(job.axes)
         assert axis_index is not None
         self._job = job
         axis = job.axes[axis_index]
         self._units = next(iter(job.load_points(0).values())).units
         self._distance_bounds = compute_distance_bounds(job, axis)
-        # The number of a row is its index in the flat array of this shape.
+        # An array of this shape has an element for each row; the row's number is its
+        # index in the flat array.
         shape = (
             len(job.scenes),
             *(len(axis.values) for axis in job.axes),
@@ -206,10 +213,11 @@ class Drives:
         self.seconds = float(self.times[-1] - self.times[0])
         steps = np.arange(flags.size).reshape(shape)
         # The frames become the last axis, in the order of their times. The arrays begin
-        # with the axis of the scenes, so that axes of the grid are one further back.
-        self._flags = np.moveaxis(flags, axis_index + 1, -1)[..., order]
-        self._steps = np.moveaxis(steps, axis_index + 1, -1)[..., order]
-        self._distance = np.moveaxis(distance, axis_index + 1, -1)[..., order]
+        # with the axis of the scenes, and those of the grid follow.
+        time_axis = axis_index + 1
+        self._flags = np.moveaxis(flags, time_axis, -1)[..., order]
+        self._steps = np.moveaxis(steps, time_axis, -1)[..., order]
+        self._distance = np.moveaxis(distance, time_axis, -1)[..., order]
 
     def _read_rows(
         self,

@@ -319,28 +319,31 @@ class Sweep:
         Args:
             missing: ranges of row numbers; a row is an image and a model.
         """
-        batch_size = self.job.config.batch
         for rows in missing:
-            image = rows.start // self.n_models
-            last_image = -(-rows.stop // self.n_models)  # rounded up
-            while image < last_image:
-                scene_begin = image // self.images_per_scene * self.images_per_scene
-                images = split_into_batches(
-                    image - scene_begin,
-                    min(last_image - scene_begin, self.images_per_scene),
-                    batch_size,
-                )
-                for batch in images:
-                    items = self.job.make_queries(
-                        range(scene_begin + batch.start, scene_begin + batch.stop)
-                    )
-                    yield [
-                        (problem_name, u, query)
-                        for problem_name, u, query in items
-                        if query.index in rows
-                    ]
-                # the first image of the next scene
-                image = scene_begin + self.images_per_scene
+            for images in self._split_images(rows):
+                items = self.job.make_queries(images)
+                yield [
+                    (problem_name, u, query)
+                    for problem_name, u, query in items
+                    if query.index in rows
+                ]
+
+    def _split_images(self, rows: range) -> Iterator[range]:
+        """Yield the images that rows are about, in batches, none over two scenes."""
+        image = rows.start // self.n_models
+        images_end = -(-rows.stop // self.n_models)  # rounded up
+        while image < images_end:
+            scene_begin = image // self.images_per_scene * self.images_per_scene
+            scene_end = scene_begin + self.images_per_scene
+            # batches are counted in the scene
+            batches = split_into_batches(
+                image - scene_begin,
+                min(images_end, scene_end) - scene_begin,
+                self.job.config.batch,
+            )
+            for batch in batches:
+                yield range(scene_begin + batch.start, scene_begin + batch.stop)
+            image = scene_end
 
     def _report(self, n_rows: int, predictions: Predictions) -> None:
         """Report progress by some rows, at most every `REPORT_SECONDS`."""

@@ -200,7 +200,14 @@ def _embed_rows(rows: Any, element_id: str) -> Html:
 def _describe_images(
     source: SweepSource, thumbnails: Thumbnails
 ) -> tuple[JsonObject, Html | None]:
-    """Return where the explorer finds thumbnails, and which are left out, if any."""
+    """Describe for the explorer where the thumbnails of a sweep are.
+
+    They are in a folder beside the page, or embedded in it. A page embeds only as many
+    as fit.
+
+    Returns:
+        The description; and a note if some are left out, else None.
+    """
     images: JsonObject = {"models": thumbnails.configurations_per_image}
     if source.thumbnail_address is not None:
         images["folder"] = source.thumbnail_address

@@ -436,10 +436,12 @@ class SweepPredictor:
         self._groups = self._make_groups(self.method.follows)
 
     def _choose_method(self) -> tuple[BasisPictures | LightOnSurfaces, Refusal | None]:
-        """Return the cheapest method that pays here, and None.
+        """Choose how images are predicted.
 
-        If none does, return a method that is not used, and why: the first that could
-        follow something that varies, else the last.
+        Returns:
+            The cheapest method that pays here, and None. If none pays, a method that is
+            not used, and why not. Something that varies may be what this method could
+            predict, so that its reason concerns the user; else it is the last method.
         """
         refused: list[tuple[BasisPictures | LightOnSurfaces, Refusal]] = []
         for method_type in (BasisPictures, LightOnSurfaces):  # cheapest first
@@ -666,16 +668,17 @@ def combine_transport(
 def prepare_surface_light(
     verifier: Verifier, at: Tensor, coordinates: Tensor, n_images: int
 ) -> None:
-    """Prepare light on surfaces around a configuration, if it is cheaper than renders.
+    """Prepare light on surfaces for trials, if that is cheaper than rendering them.
 
-    The verifier's findings then have it as `transport`, or state why images are
-    rendered where cameras move.
+    The trials vary some numbers around a configuration. The verifier's findings then
+    have the light as `predictor`. If cameras move, but it is not used, they have the
+    reason as `predictor_refusal`.
 
     Args:
         verifier: verifier of the trials, whose sample count is known.
-        at: the configuration (d,).
-        coordinates: coordinates of the numbers that vary (k,).
-        n_images: trials, about.
+        at: (d,) the configuration.
+        coordinates: (k,) indices of the coordinates that vary.
+        n_images: about how many trials there are.
     """
     problem = verifier.problem
     varying = set(coordinates.tolist())
@@ -691,12 +694,13 @@ def prepare_surface_light(
     if not moves_camera or not can_follow:
         return
     findings = verifier.state
-    findings.predictor_refusal = find_scene_refusal(problem.renderer)
+    refusal = find_scene_refusal(problem.renderer)
     min_images = find_break_even(problem.renderer, findings.spp)
-    if findings.predictor_refusal is None and n_images < min_images:
+    if refusal is None and n_images < min_images:
         reason = f"light on surfaces pays from {min_images} pictures on"
-        findings.predictor_refusal = Refusal(reason, RefusalCause.TOO_FEW_STEPS)
-    if findings.predictor_refusal is not None:
+        refusal = Refusal(reason, RefusalCause.TOO_FEW_STEPS)
+    findings.predictor_refusal = refusal
+    if refusal is not None:
         return
     title = "finding the light on surfaces"
     verifier.stages.begin(
@@ -704,7 +708,6 @@ def prepare_surface_light(
     )
     light = SurfaceLight(problem, 0, light_u=at, moving_coordinates=coordinates)
     light.prepare(verifier.stages.progress.advance)
-    findings.predictor = light
     findings.predictor_refusal = light.accuracy_refusal
-    if findings.predictor_refusal is not None:
-        findings.predictor = None
+    is_accurate = light.accuracy_refusal is None
+    findings.predictor = light if is_accurate else None
