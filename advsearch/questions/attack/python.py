@@ -112,11 +112,7 @@ def attack(
     options = _drop_unset(settings)
     if callable(task):
         task = make_task(task)
-    if not isinstance(policy, (str, Mapping, Policy)) or not policy:
-        raise InputError(
-            "policy: expected a name, a mapping with a `name` and options, or an "
-            f"instance, got {describe_value(policy)}"
-        )
+    _check_policy(policy)
     session_controls = [
         *loading.list_session_only_controls(controls),
         *loading.list_session_only_controls(over),
@@ -160,6 +156,19 @@ def attack(
             metrics=judging.load_metrics(config.metrics, metrics),
         )
         return run_attack(parts, as_progress(progress), directory)
+
+
+def _check_policy(policy: object) -> None:
+    """Check that a policy is named, described or made.
+
+    Raises:
+        InputError: it is not.
+    """
+    if not isinstance(policy, (str, Mapping, Policy)) or not policy:
+        raise InputError(
+            "policy: expected a name, a mapping with a `name` and options, or an "
+            f"instance, got {describe_value(policy)}"
+        )
 
 
 def _drop_unset(settings: Mapping[str, object]) -> dict[str, Any]:

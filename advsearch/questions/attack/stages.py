@@ -735,18 +735,7 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
 
     def search_inside(domain: Domain, number: int) -> Tensor:
         """Search a smaller domain, and return the best configuration (d,)."""
-        title = f"search {number + 1} of at most {MAX_SEARCHES}"
-        searches.start("search", title, problem.steps, "`steps` shortens each search")
-        # the first has the name of a search without a bracket
-        kind = f"search {number}" if number else "search"
-        result = searches.search(
-            kind,
-            policy,
-            problem.steps,
-            seeds.stream(problem.seed, "smallest", number),
-            domain=domain,
-            ranked=transport is None,  # what is predicted has no noise
-        )
+        result = _search_budget(searches, policy, domain, number)
         results.append(result)
         # If the attack is interrupted before anything passes, this is its result.
         findings.search = findings.search or results[0]
@@ -779,17 +768,63 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
         problem.domain,
         likely=None if transport is None else transport.is_likely_success,
     )
-    # a full check has `n_trials` trials: so many of them have enough together
-    n_repeats = math.ceil(MIN_CONFIRMING_TRIALS / n_trials)
+    bracket = _confirm(bracket, passes, verifier, problem.domain)
+    findings.bracket = bracket
+    findings.search = _combine_results(results, bracket)
+
+
+def _search_budget(
+    searches: Searches, policy: Policy[Any], domain: Domain, number: int
+) -> SearchResult:
+    """Search one of the smaller and smaller budgets.
+
+    Args:
+        searches: searches of the attack.
+        policy: policy that searches.
+        domain: domain with that budget.
+        number: number of the search, from 0.
+    """
+    problem = searches.problem
+    title = f"search {number + 1} of at most {MAX_SEARCHES}"
+    searches.start("search", title, problem.steps, "`steps` shortens each search")
+    # the first has the kind of the only search of another attack
+    kind = f"search {number}" if number else "search"
+    # The ranking renders the best configurations again. A matrix predicts them without
+    # noise, so that their order is known.
+    has_noise = not isinstance(searches.findings.predictor, Transport)
+    return searches.search(
+        kind,
+        policy,
+        problem.steps,
+        seeds.stream(problem.seed, "smallest", number),
+        domain=domain,
+        ranked=has_noise,
+    )
+
+
+def _confirm(
+    bracket: Bracket,
+    passes: Callable[[Tensor, int], bool],
+    verifier: Verifier,
+    domain: Domain,
+) -> Bracket:
+    """Try the configuration at the upper bound of a bracket again, in full checks.
+
+    Args:
+        bracket: the bracket, perhaps without any configuration.
+        passes: whether a configuration (d,) passes the check of a number.
+        verifier: verifier that tries it.
+        domain: domain with the full budget.
+    """
+    # so many full checks have `MIN_CONFIRMING_TRIALS` trials together
+    n_checks = math.ceil(MIN_CONFIRMING_TRIALS / verifier.n_trials)
     if bracket.u is not None:
         verifier.begin_stage(
             "checking the smallest change",
-            MAX_CONFIRMATIONS * n_repeats * n_trials,
+            MAX_CONFIRMATIONS * n_checks * verifier.n_trials,
             at_most=True,
         )
-    bracket = confirm_bracket(bracket, passes, problem.domain, times=n_repeats)
-    findings.bracket = bracket
-    findings.search = _combine_results(results, bracket)
+    return confirm_bracket(bracket, passes, domain, times=n_checks)
 
 
 def _try_until_decided(

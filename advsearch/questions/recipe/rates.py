@@ -929,6 +929,17 @@ class AgreementOptions(Options):
         return (*self.of, PHOTOGRAPHS)
 
 
+AGREEMENT_HEADS = [
+    "rendering and",
+    "object",
+    # whether the model is right about the rendering, and about the other image
+    *("right, right", "right, wrong", "wrong, right", "wrong, wrong"),
+    "same prediction",
+    "agree",
+    *FRACTION_HEADS,
+]
+
+
 def make_agreement_figure(rows: Rows, options: AgreementOptions) -> FigureContent:
     """Compare predictions about renderings with those about other images of the same.
 
@@ -959,6 +970,7 @@ def make_agreement_figure(rows: Rows, options: AgreementOptions) -> FigureConten
             continue
         pairs = _pair_rows(part_rows, renderings)
         n_unpaired = len(part_rows) - len(pairs)
+        # a photograph may show no rendering, but another part has to have all of them
         if part != PHOTOGRAPHS and n_unpaired:
             raise InputError(
                 f"figures: agreement: expected {part} to have the "
@@ -972,18 +984,10 @@ def make_agreement_figure(rows: Rows, options: AgreementOptions) -> FigureConten
         if part == PHOTOGRAPHS:
             text += _describe_photographs(len(pairs), n_unpaired)
 
-    four_heads = ["right, right", "right, wrong", "wrong, right", "wrong, wrong"]
     return FigureContent(
         title="Renderings and other pictures of the same",
         text=text,
-        columns=[
-            "rendering and",
-            "object",
-            *four_heads,
-            "same prediction",
-            "agree",
-            *FRACTION_HEADS,
-        ],
+        columns=AGREEMENT_HEADS,
         rows=table,
         draw=lambda figure: _draw_agreement(figure, bars, series),
         size=(6.0, 1.7 + 0.2 * len(series) + 0.34 * (len(bars) - 1)),

@@ -486,8 +486,6 @@ class SweptScene:
     """
 
     def __init__(self, job: Job, number: int) -> None:
-        named_scene = job.scenes[number]
-        config = job.config
         self.number = number
         self.job = job
         self.points_of_size = job.load_points(number)
@@ -496,42 +494,48 @@ class SweptScene:
         self.renderer_of_size = {
             size: self._make_renderer(size) for size in self.points_of_size
         }
+        self.problems = tuple(map(self._make_problem, range(len(job.models))))
+        self.predictor_of_size = {
+            size: self._make_predictor(size) for size in self.points_of_size
+        }
+
+    def _make_problem(self, model: int) -> Problem:
+        """Return the problem of a model, by its index."""
+        job = self.job
+        named_scene = job.scenes[self.number]
+        size = job.image_sizes[model]
         make_scene_facts = partial(
             make_facts,
             named_scene.scene.description,
             named_scene.object,
-            config.label,
-            judge=config.judge,
+            job.config.label,
+            judge=job.config.judge,
         )
-        self.problems = tuple(
-            Problem(
-                renderer=self.renderer_of_size[size],
-                space=self.points_of_size[size].space,
-                model=model,
-                task=task,
-                make_facts=make_scene_facts,
-                objective=None,
-                spp=job.spp,
-                seed=config.seed,
-                metrics=job.metrics,
-            )
-            for size, model, task in zip(
-                job.image_sizes, job.models, job.tasks, strict=True
-            )
+        return Problem(
+            renderer=self.renderer_of_size[size],
+            space=self.points_of_size[size].space,
+            model=job.models[model],
+            task=job.tasks[model],
+            make_facts=make_scene_facts,
+            objective=None,
+            spp=job.spp,
+            seed=job.config.seed,
+            metrics=job.metrics,
         )
-        light_seed = seeds.stream(config.seed, "sweep light", number)
-        self.predictor_of_size = dict[ImageSize, SweepPredictor]()
-        for size, points in self.points_of_size.items():
-            # Models of one size share their images, and so the predictor of these.
-            first_model_of_size = job.image_sizes.index(size)
-            self.predictor_of_size[size] = SweepPredictor(
-                problem=self.problems[first_model_of_size],
-                points=points,
-                axes=job.axes,
-                seed=light_seed,
-                specialise=config.specialise,
-                images_before=number * points.count,
-            )
+
+    def _make_predictor(self, size: ImageSize) -> SweepPredictor:
+        """Return what predicts the images of a size, which models of that size share."""
+        config = self.job.config
+        points = self.points_of_size[size]
+        first_model_of_size = self.job.image_sizes.index(size)
+        return SweepPredictor(
+            problem=self.problems[first_model_of_size],
+            points=points,
+            axes=self.job.axes,
+            seed=seeds.stream(config.seed, "sweep light", self.number),
+            specialise=config.specialise,
+            images_before=self.number * points.count,
+        )
 
     @property
     def n_non_finite(self) -> int:

@@ -579,42 +579,15 @@ class Sweep:
         path = None if self.run is None else self.run.path
         verified = worst.verified if worst else None
         formation, gains = self._describe_formation()
-        # Rates count these rows. Their intervals count independent units instead: the
-        # frames of a drive, say, are not independent, and belong to one unit.
-        rows = np.flatnonzero(predictions.is_counted)
-        right = predictions.is_right[rows]
-        units = self.units.find_unit(rows)
-        axes = self._make_axes(rows)
-        outcome = predictions.outcome[rows]
         changes = self._compute_change_rates()
         return SweepSummary(
+            **self._summarize_job(),
+            **self._summarize_predictions(predictions),
             run=None if path is None else str(path),
-            object=config.object,
-            model=",".join(_get_names(job.models)),
-            task=config.task_name,
-            environment=self._environment,
-            controls=_get_names(job.controls),
             ending=ending,
             image_formation=formation,
             gains=gains if len(gains) > 1 else None,
-            drawn={
-                number.name: number.varied_value for number in self._sampled_numbers
-            },
-            planned=self.n_rows,
-            **vars(count_by_unit(right, units, outcome)),
-            out_of_view=int(predictions.is_hidden.sum()),
-            phantoms_out_of_view=predictions.n_phantoms_out_of_view,
-            units=len(np.unique(units)) if self.units.size > 1 and len(units) else None,
-            not_finite=predictions.n_non_finite,
-            answers=predictions.frequent_wrong_labels,
-            axes=_make_axis_rows(axes, right, units, outcome),
-            cells=make_map(axes, right, predictions.margin[rows]),
-            beside=self._compare_arms(predictions),
             worst=worst,
-            grid={axis.name: len(axis.values) for axis in job.axes},
-            samples=job.samples,
-            sampler=config.sampler if self.points.is_sampled else None,
-            spp=job.spp,
             renders=self._count_renders(verified),
             transport=self._combine_transport(),
             surface=self._surface,
@@ -625,12 +598,54 @@ class Sweep:
                 self.stages.seconds.get("sweep", 0.0)
             ),
             seconds={**self.stages.seconds, "total": self.stages.total},
-            seed=config.seed,
             warnings=[*job.warnings, *self._remarks(predictions, verified, changes)],
             command_line=config.command_line(path),
             python_only=config.python_only,
             twins=self._find_twins(),
         )
+
+    def _summarize_job(self) -> dict[str, Any]:
+        """Return the fields of a summary about what was swept."""
+        job = self.job
+        config = job.config
+        return {
+            "object": config.object,
+            "model": ",".join(_get_names(job.models)),
+            "task": config.task_name,
+            "environment": self._environment,
+            "controls": _get_names(job.controls),
+            "drawn": {
+                number.name: number.varied_value for number in self._sampled_numbers
+            },
+            "planned": self.n_rows,
+            "grid": {axis.name: len(axis.values) for axis in job.axes},
+            "samples": job.samples,
+            "sampler": config.sampler if self.points.is_sampled else None,
+            "spp": job.spp,
+            "seed": config.seed,
+        }
+
+    def _summarize_predictions(self, predictions: Predictions) -> dict[str, Any]:
+        """Return the fields of a summary that count the predictions of all rows so far."""
+        # Rates count these rows. Their intervals count independent units instead: the
+        # frames of a drive, say, are not independent, and belong to one unit.
+        rows = np.flatnonzero(predictions.is_counted)
+        right = predictions.is_right[rows]
+        units = self.units.find_unit(rows)
+        outcome = predictions.outcome[rows]
+        axes = self._make_axes(rows)
+        has_shared_units = self.units.size > 1 and len(units) > 0
+        return {
+            **vars(count_by_unit(right, units, outcome)),
+            "out_of_view": int(predictions.is_hidden.sum()),
+            "phantoms_out_of_view": predictions.n_phantoms_out_of_view,
+            "units": len(np.unique(units)) if has_shared_units else None,
+            "not_finite": predictions.n_non_finite,
+            "answers": predictions.frequent_wrong_labels,
+            "axes": _make_axis_rows(axes, right, units, outcome),
+            "cells": make_map(axes, right, predictions.margin[rows]),
+            "beside": self._compare_arms(predictions),
+        }
 
     @property
     def _environment(self) -> str:
