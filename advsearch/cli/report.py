@@ -240,12 +240,12 @@ def _copy_named_by_pose(folder: Path, run: Path, out: Path) -> Path:
                 f"under `file`, got {file.name!r}"
             )
         steps = [step for step, values in rows if _has_pose(values, pose)]
-        _check_single(steps, location, run, pose)
+        _check_single_rendering(steps, location, run, pose)
         shutil.copyfile(file, out / f"rendering-{steps[0]}-{file.name}")
     return out
 
 
-def _check_single(
+def _check_single_rendering(
     steps: Sequence[int], location: str, run: Path, pose: Mapping[str, str | None]
 ) -> None:
     """Raise an error unless a single rendering of a run has a pose.

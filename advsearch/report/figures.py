@@ -498,6 +498,7 @@ def _find_free_height(
 
     def is_free(y: int) -> bool:
         """Return whether the text would cover no other one at this height."""
+        # it lies to the right or left of each, or below or above it
         return all(
             x > x1 or x0 > x + width or y > y1 or y0 > y + height
             for x0, y0, x1, y1 in text_boxes

@@ -389,8 +389,8 @@ def _draw_part(axes: Axes, part: PlacedPart, convert: Any) -> None:
     picture = piece.picture[y0 - bleed_y : y1 + bleed_y, x0 - bleed_x : x1 + bleed_x]
     if convert is not None:
         picture = np.asarray(ImageCms.applyTransform(Image.fromarray(picture), convert))
-    # left and right, top and bottom edge in millimetres: trim is without bleed, outer
-    # with it
+    # Left and right, top and bottom edge in millimetres: `trim` of the part without its
+    # bleed, `outer` with it.
     trim_x = part.x, part.x + (x1 - x0) * pixel_width
     trim_y = part.y, part.y + (y1 - y0) * pixel_height
     outer_x = trim_x[0] - bleed_x * pixel_width, trim_x[1] + bleed_x * pixel_width

@@ -116,11 +116,10 @@ def make_line(row: Any, names: Iterable[str], prediction: int) -> dict[str, Any]
         "network" if name == "model" else name: value_of.get(name, "none")
         for name in names
     }
-    environment, model = (str(value_of.get(name, "none")) for name in PLACED)
     return {
         "id": f"{row.step}",
-        "environment": environment,
-        "model": model,
+        "environment": str(value_of.get("environment", "none")),
+        "model": str(value_of.get("object", "none")),
         "is_correct": str(bool(row.correct)),
         # 0.0 minus the margin: the negative of 0.0 would be written as -0.0
         "loss": None if row.margin is None else 0.0 - row.margin,

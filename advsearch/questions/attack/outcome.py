@@ -760,7 +760,7 @@ def _count_renders(findings: RunState, problem: Problem) -> dict[str, int]:
             counts["unprinted"] = n_rendered + n_gradients
         else:
             counts[kind] = n_rendered
-            if kind == "search":
+            if kind == "search":  # the random search has no gradients
                 counts["gradient"] += n_gradients
     if predictor:
         counts["search"] += predictor.n_traced

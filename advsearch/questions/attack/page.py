@@ -151,8 +151,8 @@ def _image_parts(
         animated: whether there are frames of the search.
     """
     images = run / directory.IMAGES
-    gain = f"{files.DIFFERENCE_GAIN:g} times magnified, grey where nothing changed"
-    difference = Picture("images/difference.png", gain, "Difference")
+    caption = f"{files.DIFFERENCE_GAIN:g} times magnified, grey where nothing changed"
+    difference = Picture("images/difference.png", caption, "Difference")
     yield ResultPart(
         "What the model sees",
         pictures=[[*_clean_and_adversarial(summary, ".png"), difference]],

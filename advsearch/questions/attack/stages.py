@@ -916,7 +916,8 @@ def verify_failures(verifier: Verifier, result: SearchResult) -> None:
     if known is None or not known.examples or rule.is_conditional:
         return
     # If the model is wrong about the clean scene, a failure says nothing.
-    if rule.is_already_wrong(count_right(findings.clean_trials, 1)):
+    clean_counts = count_right(findings.clean_trials, 1)  # at any sample count
+    if rule.is_already_wrong(clean_counts):
         return
     failures = known.examples[:MAX_TRIED_FAILURES]
     verifier.begin_stage(

@@ -222,7 +222,8 @@ def distribute_attacks(
 def _check_not_lost(chains: Sequence[Chain], done: BatchResult) -> None:
     """Raise an error if the worker of an attack died."""
     if done.lost:
-        lost_attack = chains[done.items[0]][0]
+        chain_index = done.items[0]  # the only item of the batch
+        lost_attack = chains[chain_index][0]
         title = lost_attack.config.object
         if lost_attack.subject != title:
             title += f" with {lost_attack.subject}"

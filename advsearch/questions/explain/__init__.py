@@ -133,7 +133,7 @@ def explain(context: RunContext[ExplainConfig]) -> ExplainResult:
         environment=settings.join_names(sweep.summary.environment for sweep in sweeps),
         controls=sweeps[0].summary.controls,
         parameters=list(table.attrs["units"]),
-        # counts of all rows: correct, configurations, interval, accuracy, outcomes
+        # the counts of all rows: right, total, interval, share and outcomes
         **vars(findings.count_right(table)),
         # draws, where several rows share one
         units=None if table["unit"].is_unique else table["unit"].nunique(),

@@ -87,8 +87,10 @@ def count_axis_values(values: Any) -> int:
 def cut_scene_settings(
     config: SweepConfig, values_inside: Mapping[str, Sequence[Any]]
 ) -> dict[str, str | None]:
-    """Return the settings object, environment and model with only those names that have
-    rows under conditions; unchanged where there are no such rows.
+    """Return object, environment and model of a sweep that renders under conditions.
+
+    Each has only those names that have rows under the conditions; all names if there
+    are no such rows.
 
     Args:
         config: settings of the sweep.

@@ -65,8 +65,8 @@ def read_rows(
     Each row has `object`, `environment`, `model` and the parameters; the prediction
     (`answer`, `correct`, `margin`); `time`, when it was stored (seconds since 1970);
     and `unit`, the independent unit that it belongs to. Rows with the same draw of
-    the same seed share a unit, also across parts: rows of a sweep that share a draw,
-    and the trials of the same number of attacks. Any other row is a unit by itself.
+    the same seed share a unit, also across parts. So do the trials of several attacks
+    that have the same number. Any other row is a unit by itself.
 
     Args:
         part: part of the recipe that the run belongs to.

@@ -439,13 +439,13 @@ def _find_resumable(config: SweepConfig) -> Path | None:
         return None
     path = locate_run(config.run)
     config_file = path / CONFIG
-    if config.overwrite or not is_run(path) or not config_file.is_file():
+    has_run = is_run(path) and config_file.is_file()
+    if config.overwrite or not has_run:
         return None
     stored = SweepConfig.from_yaml(config_file, config.session_settings)
     has_same_settings = stored.to_json() == config.make_repeatable().to_json()
-    if not has_same_settings or is_finished(path):
-        return None
-    return path
+    can_continue = has_same_settings and not is_finished(path)
+    return path if can_continue else None
 
 
 def sweep_from_config(
@@ -516,7 +516,11 @@ def _add_adversarial_arm(
 
 
 def _as_list(value: Any) -> list[Any]:
-    """Return scenes or models as a list. Raises InputError: there is none."""
+    """Return scenes or models as a list.
+
+    Raises:
+        InputError: the list is empty.
+    """
     values = list(value) if isinstance(value, (list, tuple)) else [value]
     if not values:
         raise InputError(

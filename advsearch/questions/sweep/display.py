@@ -420,6 +420,7 @@ def _page_parts(
             note=sentence,
         )
     for index, rates in enumerate(summary.drives or ()):
+        # the title stands above all tables, and the images are of the worst drive
         is_first = index == 0
         yield ResultPart(
             "Whole drives" if is_first else "",

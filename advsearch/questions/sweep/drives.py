@@ -358,10 +358,10 @@ class Drives:
     def _describe_drives(
         self, drives: _CompleteDrives, first_distance: npt.NDArray[np.float64]
     ) -> list[DriveRecord]:
-        """Return the values of the first drives, each by itself.
+        """Return the values of the first `MAX_LISTED_DRIVES` drives, each by itself.
 
         Args:
-            drives: n of them.
+            drives: n drives.
             first_distance: (n,) at the first right frame; NaN if there is none.
         """
         right_fraction = _right_fraction(drives.flags)
@@ -549,7 +549,8 @@ def summarize_drives(
     Args:
         values: (n,) one for each time that a drive was evaluated.
         worst: selects the worst of them: `min` or `max`.
-        bounds: bounds of the values whatever a model predicts, from the plan.
+        bounds: smallest and largest value that a drive of the sweep can have, whatever
+            a model predicts; None if they are not known.
         drive_of_value: (n,) the drive of each value. Values of one drive differ in
             noise alone, and are averaged first. None: each has a drive of its own.
     """

@@ -711,7 +711,7 @@ class Sweep:
         transport = [
             summary for summaries in self._transport.values() for summary in summaries
         ]
-        # without a batch in this session, what the loaded scene has
+        # A continued sweep may have no batch to evaluate: then the loaded scene is told.
         if not self._transport and self._scenes.scene is not None:
             predictors = self._scenes.scene.predictor_of_size.values()
             transport = [predictor.summarize() for predictor in predictors]

@@ -415,7 +415,8 @@ INDEX = "index.html"
 def write_bundle(runs: Sequence[Path], folder: Path) -> Path:
     """Write a directory with a page, the rows and the thumbnails of sweeps.
 
-    Of a run of another command, it has its page.
+    A single run of another command may be in place of the sweeps: then the directory
+    has its page, and those of its parts.
 
     Args:
         runs: run directories.
@@ -477,11 +478,12 @@ def _write_source(run: Path, index: int, folder: Path) -> SweepSource:
         rows = f"rows-{index}.bin"
         write_bytes(folder / rows, pack_columns(columns))
     image_folder = f"pictures-{index}"
-    stored = find_thumbnails(run)
-    for number in stored.numbers if stored else ():
+    thumbnails = find_thumbnails(run)
+    numbers = thumbnails.numbers if thumbnails else ()
+    for number in numbers:
         file = thumbnail_path(folder / image_folder, number)
         target = folder / image_folder / file.parent.name / file.name
         write_bytes(target, read_thumbnail(run, number))
     return SweepSource(
-        run.name, rows, thumbnails=stored, thumbnail_address=image_folder
+        run.name, rows, thumbnails=thumbnails, thumbnail_address=image_folder
     )

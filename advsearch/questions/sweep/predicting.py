@@ -156,6 +156,7 @@ class Groups:
             number: number of the image.
             index: index of the member in the group, in [0, group_size).
         """
+        # the digits of a number are its indices along the axes
         member_digits = list(self._all_axes.digits(number))
         within_axes = [
             axis for axis, is_within in enumerate(self._is_within) if is_within

@@ -337,15 +337,14 @@ class SurfaceCounts:
             kind: kind of the parts, a key of `SurfaceParts.kinds`.
             compared: comparison of the parts, from `compare_parts`.
         """
-        strongest = list[SurfacePart]()
-        for has_sign in (compared.difference > 0.0, compared.difference < 0.0):
-            candidates = compared[compared.significant & has_sign]
-            strongest += [
-                self._describe_part(part, counts, compared)
-                for part in self._select_spread(candidates)
-            ]
         is_worse = compared.significant & (compared.difference > 0)
         is_better = compared.significant & (compared.difference < 0)
+        strongest = list[SurfacePart]()
+        for is_candidate in (is_worse, is_better):
+            strongest += [
+                self._describe_part(part, counts, compared)
+                for part in self._select_spread(compared[is_candidate])
+            ]
         return SurfaceTable(
             object=object_name,
             model=model,
@@ -850,6 +849,7 @@ def _draw(panels: Sequence[Panel], figure: Any) -> None:
         map_axes.set_title(panel.title)
         _draw_views(view_axes, panel.views, cell_colors)
 
+    # the color bar stands beside all rows, and need not be as high
     shrink = 0.8 if len(panels) == 1 else 0.4
     bar = figure.colorbar(scale, ax=axes, shrink=shrink, format=_format_percent)
     bar.set_label(
