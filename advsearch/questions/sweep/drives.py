@@ -46,7 +46,9 @@ from advsearch.tasks.boxes import MIN_OVERLAP
 
 MAX_ANIMATED_FRAMES = 60
 MAX_LISTED_DRIVES = 1000  # drives of a model that a result lists
-# flags of a frame, besides 1 (right) and 0 (not right)
+# what a model's flag of a frame can be
+WRONG = 0
+RIGHT = 1
 UNKNOWN = -1  # there is no row
 HIDDEN = 2  # nothing of the object is in the image
 Flags = npt.NDArray[np.int8]
@@ -148,7 +150,7 @@ class _CompleteDrives(NamedTuple):
     """The n drives of which all frames are known, in which the object is visible.
 
     Attributes:
-        flags: (n, frames) 1 where the model is right, 0 where it is not, HIDDEN.
+        flags: (n, frames) RIGHT, WRONG or HIDDEN.
         distance: (n, frames) to the object; NaN where that is not known.
         steps: (n, frames) numbers of the rows.
     """
@@ -319,7 +321,7 @@ class Drives:
         n_frames = len(self.times)
         first_distance = _first_right_distance(drives)
         drive_records = self._describe_drives(drives, first_distance)
-        has_right = np.asarray((drives.flags == 1).any(axis=1))
+        has_right = np.asarray((drives.flags == RIGHT).any(axis=1))
 
         # Rows of one draw differ in noise alone: they are repeats of one drive.
         first_images = drives.steps[:, 0] // len(self._job.models)
@@ -387,12 +389,12 @@ class Drives:
 
     def _longest_gaps(self, flags: Flags) -> npt.NDArray[np.float64]:
         """Return the seconds (n,) of the longest run of wrong frames of each drive."""
-        runs = np.array([find_longest_run(is_wrong) for is_wrong in flags == 0])
+        runs = np.array([find_longest_run(is_wrong) for is_wrong in flags == WRONG])
         return runs * self._frame_interval
 
     def _changes_per_second(self, flags: Flags) -> npt.NDArray[np.float64]:
         """Return how often each drive (n,) changes between right and wrong a second."""
-        is_right = flags == 1
+        is_right = flags == RIGHT
         is_visible = flags != HIDDEN
         both_visible = is_visible[:, 1:] & is_visible[:, :-1]
         is_change = (is_right[:, 1:] != is_right[:, :-1]) & both_visible
@@ -519,7 +521,7 @@ def find_longest_run(flags: npt.NDArray[np.bool_]) -> int:
 
 def _first_right_distance(drives: _CompleteDrives) -> npt.NDArray[np.float64]:
     """Return the distance (n,) at the first right frame; NaN if there is none."""
-    is_right = drives.flags == 1
+    is_right = drives.flags == RIGHT
     first_frame = is_right.argmax(axis=1)
     distance = drives.distance[np.arange(len(first_frame)), first_frame]
     return np.where(is_right.any(axis=1), distance, np.nan)
@@ -527,7 +529,7 @@ def _first_right_distance(drives: _CompleteDrives) -> npt.NDArray[np.float64]:
 
 def _right_fraction(flags: Flags) -> npt.NDArray[np.float64]:
     """Return the fraction (n,) of the visible frames (n, frames) that are right."""
-    n_right = (flags == 1).sum(axis=1)
+    n_right = (flags == RIGHT).sum(axis=1)
     n_visible = (flags != HIDDEN).sum(axis=1)
     return np.asarray(n_right / n_visible)
 
