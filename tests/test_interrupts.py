@@ -140,7 +140,7 @@ from advsearch.cli import main
 def given(argv):
     threading.Timer(1.0, print, ["begun"], {"flush": True}).start()  # an interrupt before the next line would end this
     hashlib.pbkdf2_hmac("sha256", b"", b"", 2**31 - 1)  # native code that knows no signals
-main._run_and_tell, sys.argv = given, ["advsearch"]
+main._run_and_report_errors, sys.argv = given, ["advsearch"]
 sys.exit(main.main())
 """
 

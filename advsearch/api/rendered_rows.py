@@ -183,7 +183,7 @@ def _render_sweep_image(
         picture=picture,
         task=job.tasks[0],
         facts=make_object_facts(scene.scene, scene.object, job.config),
-        renderer=view.renderers[job.image_sizes[0]],
+        renderer=view.renderer_of_size[job.image_sizes[0]],
         u=query.u,
         rows=rows,
         values=rows[0].values,

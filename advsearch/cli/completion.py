@@ -14,7 +14,7 @@ from advsearch.cli.main import (
     argument,
     command,
     list_commands,
-    without_commands,
+    make_parser_without_commands,
 )
 from advsearch.cli.show import REGISTRIES, list_names
 from advsearch.errors import InputError
@@ -54,19 +54,21 @@ def completion(args: argparse.Namespace) -> int:
         raise InputError(
             "completion needs the package shtab; install it with: pip install shtab"
         ) from error
-    # a parser with all commands and flags
-    parser, commands = without_commands()
+    # the loop below adds all commands with their flags
+    parser, commands = make_parser_without_commands()
     # names of each kind of thing, such as models, that a flag may take
     names_of_kind = {
         kind: sorted(list_names(kind)) for kind in NAMED.values() if kind in REGISTRIES
     }
     for name in list_commands():
         for action in add_command(commands, name)._actions:
+            takes_no_value = action.nargs == 0
+            has_choices = action.choices is not None  # which shtab completes itself
+            if takes_no_value or has_choices:
+                continue
+            # a positional argument has no flag
             flag = action.option_strings[-1] if action.option_strings else ""
             names = names_of_kind.get(NAMED.get(flag, ""))
-            takes_no_value = action.nargs == 0
-            if takes_no_value or action.choices is not None:
-                continue
             if names and flag not in OR_A_FILE:
                 action.choices = names
                 continue

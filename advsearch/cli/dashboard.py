@@ -70,7 +70,7 @@ def dashboard(args: argparse.Namespace) -> int:
         raise InputError(f"--port: expected a number from 0 to 65535, got {args.port}")
     # damaged runs are allowed: the page with the list says what is wrong with each
     runs = [find_run(name, checked=False) for name in args.runs]
-    # "module:function" of a part of the package that may be left out
+    # PHOTOGRAPH_PAGES is "module:function"; an installation may lack the module
     has_photographs = is_present(PHOTOGRAPH_PAGES.partition(":")[0])
     photographs = load_attribute(PHOTOGRAPH_PAGES)() if has_photographs else None
     server = Dashboard(

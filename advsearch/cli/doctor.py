@@ -50,6 +50,8 @@ SECONDS_ALLOWED = 300
 OPTIONAL = {"pyarrow": "advsearch export does not write Parquet"}
 """Packages without which the rest works, and what is lost."""
 
+PROBE_PROCESS = ""
+"""The name under which `run_probe` returns how the process itself ended."""
 PROBE = (sys.executable, "-m", "advsearch.cli.doctor_probe")
 
 _SMALL_PACKAGES = ("OpenEXR", "imageio", "matplotlib", "cma", "xatlas", "pyarrow")
@@ -77,18 +79,24 @@ def doctor(args: argparse.Namespace) -> int:
         file=sys.stderr,
     )
     parts = diagnose()
-    good = all(part.status in (OK, WARNING) for part in parts)
+    is_good = all(part.status in (OK, WARNING) for part in parts)
     if args.json:
         output.print_json(
             {
                 "schema": 1,
                 "command": "doctor",
-                "ok": good,
+                "ok": is_good,
                 "parts": [asdict(part) for part in parts],
             }
         )
-        return 0 if good else FELL_SHORT
-    # late: what is missing is told without it, too
+    else:
+        _print_parts(parts, is_good=is_good)
+    return 0 if is_good else FELL_SHORT
+
+
+def _print_parts(parts: Sequence[Component], *, is_good: bool) -> None:
+    """Print a table of the parts, what to do about each, and whether all is good."""
+    # late: where rich is missing, --json still says so
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
@@ -107,11 +115,10 @@ def doctor(args: argparse.Namespace) -> int:
     for part in parts:
         if part.fix:
             console.print(f"{escape(part.name)}: {escape(part.fix)}", soft_wrap=True)
-    if good:
+    if is_good:
         console.print("Everything that is necessary works.")
     else:
         console.print("[red]Something necessary does not work.[/]")
-    return 0 if good else FELL_SHORT
 
 
 def diagnose() -> list[Component]:
@@ -139,8 +146,27 @@ def run_probe(command: Sequence[str] = PROBE) -> dict[str, tuple[bool, str]]:
 
     Returns:
         By name, whether the part worked, with a detail or the error. The part that
-        ended the process and those after it are missing. Under the name "" stands
-        whether the process itself ended well, with how it ended.
+        ended the process and those after it are missing. Under the name
+        `PROBE_PROCESS` stands whether the process itself ended well, with how it ended.
+    """
+    output_text, ended_well, ending = _run_probe_process(command)
+    tried = {}
+    for line in output_text.splitlines():
+        try:
+            outcome = json.loads(line)
+            tried[outcome["name"]] = (bool(outcome["ok"]), str(outcome["detail"]))
+        # a line that a library printed
+        except (ValueError, KeyError, TypeError):
+            continue
+    return {**tried, PROBE_PROCESS: (ended_well, ending)}
+
+
+def _run_probe_process(command: Sequence[str]) -> tuple[str, bool, str]:
+    """Run a process.
+
+    Returns:
+        What it wrote to standard output, whether it ended well, and how it ended, which
+        is empty if it ended well.
     """
     try:
         process = subprocess.run(
@@ -151,28 +177,15 @@ def run_probe(command: Sequence[str] = PROBE) -> dict[str, tuple[bool, str]]:
             check=False,
             cwd=SUBPROCESS_DIRECTORY,
         )
-        output_text = process.stdout
-        ended_well = process.returncode == 0
-        ending = _describe_ending(process.returncode, process.stderr)
     except subprocess.TimeoutExpired as expired:
         # then the output is not decoded, whatever `text` says, and may be missing
-        output_bytes = expired.stdout
-        output_text = (
-            output_bytes.decode("utf-8", "replace")
-            if isinstance(output_bytes, bytes)
-            else output_bytes or ""
-        )
-        ended_well = False
+        partial_output = expired.stdout or ""
+        if isinstance(partial_output, bytes):
+            partial_output = partial_output.decode("utf-8", "replace")
         ending = f"the trial took longer than {SECONDS_ALLOWED} s"
-    tried = {}
-    for line in output_text.splitlines():
-        try:
-            outcome = json.loads(line)
-            tried[outcome["name"]] = (bool(outcome["ok"]), str(outcome["detail"]))
-        # a line that a library printed
-        except (ValueError, KeyError, TypeError):
-            continue
-    return {**tried, "": (ended_well, ending)}
+        return partial_output, False, ending
+    ending = _describe_ending(process.returncode, process.stderr)
+    return process.stdout, process.returncode == 0, ending
 
 
 def _describe_ending(status: int, error_text: str) -> str:
@@ -217,34 +230,37 @@ def check_packages(tried: dict[str, tuple[bool, str]]) -> Iterator[Component]:
         # "render" is a trial and no package
         version = "" if name == "render" else find_installed_version(name)
         if version is None:
-            status, why = (
-                (WARNING, f": {OPTIONAL[name]}") if name in OPTIONAL else (MISSING, "")
-            )
-            yield Component(name, "", status, f"not installed{why}", _reinstall(name))
+            yield _make_missing_package(name)
         elif name in ("mitsuba", "drjit"):
             yield Component(name, version, OK, "tried by the render below")
         elif name not in tried:
             # a part before it ended the process
-            yield Component(
-                name,
-                version,
-                BROKEN,
-                f"not reached: {tried[''][1]}",
-                "see libLLVM below",
-            )
-        elif tried[name][0]:
-            yield Component(name, version, OK, tried[name][1])
+            _, ending = tried[PROBE_PROCESS]
+            detail = f"not reached: {ending}"
+            yield Component(name, version, BROKEN, detail, "see libLLVM below")
         else:
-            mend = _reinstall(name)
-            if name == "render":
-                mend = "see libLLVM below, then mend mitsuba and drjit: make setup"
-            yield Component(
-                name,
-                version,
-                WARNING if name in OPTIONAL else BROKEN,
-                tried[name][1],
-                mend,
-            )
+            is_working, detail = tried[name]
+            if is_working:
+                yield Component(name, version, OK, detail)
+            else:
+                yield _make_broken_package(name, version, detail)
+
+
+def _make_missing_package(name: str) -> Component:
+    """Return the entry of a package that is not installed."""
+    if name in OPTIONAL:
+        detail = f"not installed: {OPTIONAL[name]}"
+        return Component(name, "", WARNING, detail, _reinstall(name))
+    return Component(name, "", MISSING, "not installed", _reinstall(name))
+
+
+def _make_broken_package(name: str, version: str, detail: str) -> Component:
+    """Return the entry of a package that did not work; `detail` is its error."""
+    status = WARNING if name in OPTIONAL else BROKEN
+    fix = _reinstall(name)
+    if name == "render":
+        fix = "see libLLVM below, then mend mitsuba and drjit: make setup"
+    return Component(name, version, status, detail, fix)
 
 
 def check_other_packages(requirements: Sequence[str] | None = None) -> Component:
@@ -267,10 +283,11 @@ def check_other_packages(requirements: Sequence[str] | None = None) -> Component
         key=str.lower,
     )
     versions = {name: find_installed_version(name) for name in untried_names}
-    if absent := [name for name, version in versions.items() if version is None]:
-        why = f"not installed: {', '.join(absent)}"
+    absent = [name for name, version in versions.items() if version is None]
+    if absent:
+        detail = f"not installed: {', '.join(absent)}"
         return Component(
-            "other packages", "", MISSING, why, _reinstall(" ".join(absent))
+            "other packages", "", MISSING, detail, _reinstall(" ".join(absent))
         )
     return Component(
         "other packages",
@@ -281,6 +298,7 @@ def check_other_packages(requirements: Sequence[str] | None = None) -> Component
 
 
 def find_installed_version(name: str) -> str | None:
+    """Return the version of an installed package; None if it is not installed."""
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
@@ -288,6 +306,7 @@ def find_installed_version(name: str) -> str | None:
 
 
 def _reinstall(name: str) -> str:
+    """Return what to type to install a package again."""
     return (
         f"pip install --force-reinstall --no-deps {name}, or make clean setup in a "
         "checkout"
@@ -295,47 +314,46 @@ def _reinstall(name: str) -> str:
 
 
 def check_llvm() -> Component:
-    """Check which libLLVM will be used; tell what others there are, and why they are
-    not used.
+    """Check which libLLVM will be used.
+
+    The detail names the other ones too, and why they are not used.
     """
     library_setting = os.environ.get(llvm.ENVIRONMENT_VARIABLE, "")
-    others = llvm.find_libraries()
+    libraries = llvm.find_libraries()
     try:
         chosen = llvm.ensure_llvm()
     except AdvsearchError as error:
-        fix = (
-            f"unset {llvm.ENVIRONMENT_VARIABLE}"
-            if library_setting
-            else (
+        if library_setting:
+            fix = f"unset {llvm.ENVIRONMENT_VARIABLE}"
+        else:
+            fix = (
                 f"{llvm.get_install_command()} (or name a file in "
                 f"{llvm.ENVIRONMENT_VARIABLE})"
             )
-        )
-        return Component(
-            "libLLVM",
-            "",
-            BROKEN if others or library_setting else MISSING,
-            str(error),
-            fix,
-        )
-    refused = [str(c) for c in others if c.refusal]
+        status = BROKEN if libraries or library_setting else MISSING
+        return Component("libLLVM", "", status, str(error), fix)
+    refused = [str(library) for library in libraries if library.refusal]
     usable = [
-        str(c) for c in others if not c.refusal and c.path != chosen.path.resolve()
+        str(library)
+        for library in libraries
+        if not library.refusal and library.path != chosen.path.resolve()
     ]
-    detail = f"chosen: {chosen.path}" + (
-        f", named by {llvm.ENVIRONMENT_VARIABLE}" if library_setting else ""
-    )
-    detail += f"; also usable: {', '.join(usable)}" if usable else ""
-    detail += f"; refused: {', '.join(refused)}" if refused else ""
+    detail = f"chosen: {chosen.path}"
+    if library_setting:
+        detail += f", named by {llvm.ENVIRONMENT_VARIABLE}"
+    if usable:
+        detail += f"; also usable: {', '.join(usable)}"
+    if refused:
+        detail += f"; refused: {', '.join(refused)}"
     return Component("libLLVM", ".".join(map(str, chosen.version)), OK, detail)
 
 
 def check_bundled_scenes() -> Component:
-    """The objects and environments that travel inside the package."""
+    """Check the objects and environments that travel inside the package."""
     name = "bundled scenes"
     fix = "reinstall advsearch; in a checkout: git restore advsearch/bundled/data"
     try:
-        # what is tried
+        # inside the block: the import itself is tried, too
         from advsearch.scene.library import list_environments, list_objects
 
         objects = list_objects()
@@ -343,15 +361,13 @@ def check_bundled_scenes() -> Component:
     except (ImportError, OSError, ValueError, KeyError, AdvsearchError) as error:
         return Component(name, "", MISSING, f"{type(error).__name__}: {error}", fix)
     detail = f"{len(objects)} objects, {len(environments)} environments"
-    return (
-        Component(name, "", OK, detail)
-        if objects and environments
-        else Component(name, "", MISSING, detail, fix)
-    )
+    if objects and environments:
+        return Component(name, "", OK, detail)
+    return Component(name, "", MISSING, detail, fix)
 
 
 def check_reference_weights() -> Component:
-    """The weights and labels of the bundled classifier."""
+    """Check the weights and labels of the bundled classifier."""
     folder = resources.files("advsearch.models") / "data"
     absent = [
         name
@@ -372,7 +388,7 @@ def check_reference_weights() -> Component:
 
 
 def check_kernel_cache(folder: Path) -> Component:
-    """The folder in which Dr.Jit keeps compiled kernels between runs."""
+    """Check the folder in which Dr.Jit keeps compiled kernels between runs."""
     name = "kernel cache"
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -391,12 +407,12 @@ def check_kernel_cache(folder: Path) -> Component:
 
 
 def check_disk(folder: Path) -> Component:
-    """The space left where runs are written by default."""
+    """Check the space that is left where runs are written by default."""
     free = shutil.disk_usage(folder).free
     if free < DISK_WANTED:
-        mend = "free some space, or --run elsewhere"
+        fix = "free some space, or --run elsewhere"
         return Component(
-            "disk", "", WARNING, f"{free / GIB:.1f} GiB free in {folder}", mend
+            "disk", "", WARNING, f"{free / GIB:.1f} GiB free in {folder}", fix
         )
     return Component("disk", "", OK, f"{free / GIB:.0f} GiB free in {folder}")
 
@@ -404,13 +420,13 @@ def check_disk(folder: Path) -> Component:
 def check_hardware() -> Component:
     """Check cores and memory; little memory is a warning."""
     cores = threads.count_cores()
-    memory = 0  # where the system does not tell
+    memory = 0  # bytes; stays 0 where the system does not tell
     with suppress(AttributeError, ValueError, OSError):
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    detail = (
-        f"{platform.system()} {platform.machine()}, {cores} core{'s' * (cores > 1)}"
-    )
-    detail += f", {memory / GIB:.1f} GiB of memory" if memory else ""
+    cores_text = f"{cores} cores" if cores > 1 else f"{cores} core"
+    detail = f"{platform.system()} {platform.machine()}, {cores_text}"
+    if memory:
+        detail += f", {memory / GIB:.1f} GiB of memory"
     if memory and memory < MEMORY_WANTED:
         return Component(
             "machine",

@@ -15,6 +15,7 @@ import json
 import sys
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 PIXELS = 8
 # four standard deviations of the brightness of those pixels at 4 samples; the slope's
@@ -28,11 +29,10 @@ def probe_import(name: str) -> str:
 
 
 def probe_renderer() -> str:
-    """Render a few pixels of a wall in uniform light, and the derivative of their mean
-    with respect to the wall's reflectance.
+    """Render a wall in uniform light, and the derivative by the wall's reflectance.
 
-    Reflectance 0.5 under light of radiance 1 has brightness 0.5, and the derivative is
-    1. Returns what was used.
+    Reflectance 0.5 under light of radiance 1 has brightness 0.5, and the derivative of
+    the brightness is 1. Returns what was used.
 
     Raises:
         ArithmeticError: the numbers differ by more than noise.
@@ -43,33 +43,7 @@ def probe_renderer() -> str:
     mi = import_mitsuba()
     import drjit as dr  # what is probed
 
-    wall = {
-        "type": "rectangle",
-        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}},
-    }
-    film = {
-        "type": "hdrfilm",
-        "width": PIXELS,
-        "height": PIXELS,
-        "rfilter": {"type": "box"},
-    }
-    view = mi.ScalarTransform4f().look_at(
-        origin=[0, 0, 2], target=[0, 0, 0], up=[0, 1, 0]
-    )
-    sensor = {"type": "perspective", "fov": 30, "to_world": view, "film": film}
-    light = {"type": "constant"}
-    # depth 2: light that is reflected once
-    integrator = {"type": "prb", "max_depth": 2}
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "wall": wall,
-            "sensor": sensor,
-            "light": light,
-            "integrator": integrator,
-        },
-        optimize=False,
-    )
+    scene = mi.load_dict(_describe_wall(mi), optimize=False)
     parameters = mi.traverse(scene)
     key = "wall.bsdf.reflectance.value"
     dr.enable_grad(parameters[key])
@@ -87,6 +61,38 @@ def probe_renderer() -> str:
         f"{version}, "
         f"{dr.thread_count()} threads"
     )
+
+
+def _describe_wall(mi: Any) -> dict[str, Any]:
+    """Return a scene for Mitsuba: a wall of reflectance 0.5 in uniform light.
+
+    Args:
+        mi: the module of Mitsuba.
+    """
+    wall = {
+        "type": "rectangle",
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}},
+    }
+    film = {
+        "type": "hdrfilm",
+        "width": PIXELS,
+        "height": PIXELS,
+        "rfilter": {"type": "box"},
+    }
+    view = mi.ScalarTransform4f().look_at(
+        origin=[0, 0, 2], target=[0, 0, 0], up=[0, 1, 0]
+    )
+    sensor = {"type": "perspective", "fov": 30, "to_world": view, "film": film}
+    light = {"type": "constant"}
+    # depth 2: light that is reflected once
+    integrator = {"type": "prb", "max_depth": 2}
+    return {
+        "type": "scene",
+        "wall": wall,
+        "sensor": sensor,
+        "light": light,
+        "integrator": integrator,
+    }
 
 
 def probe_denoiser() -> str:

@@ -88,11 +88,39 @@ def _begin_lower(sentence: str) -> str:
 def export(args: argparse.Namespace) -> int:
     """Write what the arguments of `export` ask for, and return the exit status."""
     out = None if args.out is None else Path(args.out)
-    # the suffix of the file, which may say the format
+    # the suffix of the file, which may name the format
     by_name = "" if out is None else out.suffix.removeprefix(".").lower()
     usable = EXPORTERS.list_usable()
     format = _choose_format(args, by_name, usable)
-    # options that belong to another format are refused
+    _reject_other_options(args, format, usable)
+    # A suffix that no format has means a table too.
+    if format in FORMATS or format not in EXPORTERS:
+        return _write_table(args, out, by_name)
+    exporter = EXPORTERS[format]()
+    if out is None:  # all but tables are files or folders, which nothing can print
+        raise InputError(f"--out: {format} writes {exporter.writes}; give its name")
+    if args.kind is not None and "kind" not in exporter.options:
+        raise InputError("--kind: is only for tables of rows; leave it out")
+    options = {option: getattr(args, option, None) for option in exporter.options}
+    with output.open_answer_progress() as progress:
+        exported = exporter.write(args.run, out, options, progress)
+    facts = {"command": "export", "format": format, **exported.facts, "out": str(out)}
+    return output.print_answer(args.json, facts, exported.text, sys.stderr)
+
+
+def _reject_other_options(
+    args: argparse.Namespace, format: str, usable: Mapping[str, type[Exporter]]
+) -> None:
+    """Raise an error if a flag was given that belongs to other formats only.
+
+    Args:
+        args: arguments of the command.
+        format: the format.
+        usable: exporters by the name of their format.
+
+    Raises:
+        InputError: there is such a flag.
+    """
     for option in OPTIONS:
         owners = [
             name for name, exporter in usable.items() if option in exporter.options
@@ -101,19 +129,6 @@ def export(args: argparse.Namespace) -> int:
             raise InputError(
                 f"--{option}: belongs to --format {' and '.join(owners)}; leave it out"
             )
-    if format in FORMATS or format not in EXPORTERS:
-        return _write_table(args, out, by_name)
-    exporter = EXPORTERS[format]()
-    # other formats are files or folders, which nothing can print
-    if out is None:
-        raise InputError(f"--out: {format} writes {exporter.writes}; give its name")
-    if args.kind is not None and "kind" not in exporter.options:
-        raise InputError("--kind: is only for tables of rows; leave it out")
-    options = {option: getattr(args, option, None) for option in exporter.options}
-    with output.open_command_progress(as_json=True, quiet=False) as progress:
-        exported = exporter.write(args.run, out, options, progress)
-    facts = {"command": "export", "format": format, **exported.facts, "out": str(out)}
-    return output.print_answer(args.json, facts, exported.text, sys.stderr)
 
 
 def _choose_format(
@@ -164,16 +179,17 @@ def _write_table(args: argparse.Namespace, out: Path | None, by_name: str) -> in
             f"{folder}: is a study, whose rows are those of its parts; "
             f"export one of {parts}"
         )
-    # for a terminal the table goes through `print`, which escapes what would steer it
-    on_screen = io.BytesIO() if out is None and sys.stdout.isatty() else None
+    # For a terminal the table goes through `print`, which escapes what would steer it;
+    # else it is written as it is.
+    is_for_terminal = out is None and sys.stdout.isatty()
+    buffer = io.BytesIO()
+    stream = buffer if is_for_terminal else sys.stdout.buffer
     with Store(folder / NAME, read_only=True) as store, output_errors():
-        count = write_rows(
-            store, format, out, on_screen or sys.stdout.buffer, args.kind
-        )
-    if on_screen is not None:
-        print(on_screen.getvalue().decode("utf-8", "replace"), end="")
+        count = write_rows(store, format, out, stream, args.kind)
+    if is_for_terminal:
+        print(buffer.getvalue().decode("utf-8", "replace"), end="")
     if out is None:
-        return 0
+        return output.OK
     text = f"{count} rows in {out}" + ("" if by_name == format else f", as {format}")
     facts = {"command": "export", "rows": count, "format": format, "out": str(out)}
     return output.print_answer(args.json, facts, text, sys.stderr)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -60,7 +60,7 @@ def add_settings(
             continue
         if setting.group not in headings:
             headings[setting.group] = parser.add_argument_group(setting.group)
-        # flags that were not given are absent from the arguments
+        # SUPPRESS: a flag that was not given is absent from the arguments
         add = partial(headings[setting.group].add_argument, default=argparse.SUPPRESS)
         if setting.field == "object":
             add("--scene", metavar="FILE", help=SCENE)
@@ -74,24 +74,24 @@ def add_settings(
 
 
 def make_config(
-    args: argparse.Namespace, config: type[AnyConfig], **otherwise: Any
+    args: argparse.Namespace, config_type: type[AnyConfig], **defaults: Any
 ) -> AnyConfig:
     """Return the configuration that flags describe.
 
     Args:
-        args: arguments of the command line.
-        config: the class of the configuration.
-        otherwise: values that settings without a flag on the command line have.
+        args: arguments of the command line; a flag that was not given is absent.
+        config_type: the class of the configuration.
+        defaults: values of settings whose flags were not given.
 
     Raises:
         InputError: a value is not allowed.
     """
     typed = {
         setting.field: getattr(args, setting.field)
-        for setting in settings(config)
+        for setting in settings(config_type)
         if setting.field in args
     }
-    data = {**otherwise, **typed}  # a flag wins
+    data = {**defaults, **typed}
     if "scene" in args and data.get("object") is None:
         raise InputError(
             f"object: expected something in {args.scene}, got nothing; "
@@ -102,10 +102,10 @@ def make_config(
         data["object"] = ",".join(
             f"{args.scene}#{name}" for name in split_names(data["object"])
         )
-    read = config(**data)
+    config = config_type(**data)
     # code that a person typed may run; what a file named needs --code
-    allow_named({name: getattr(read, name) for name in typed})
-    return read
+    allow_named({name: getattr(config, name) for name in typed})
+    return config
 
 
 def read_command(file: str | Path) -> str:
@@ -141,26 +141,23 @@ def _format_inside(scene: str) -> str:
     """
     # late, so that --help answers at once
     from advsearch.scene.importing.files import format_name
-
-    # late, so that --help answers at once
     from advsearch.scene.importing.scenes import MITSUBA_SUFFIX, list_node_names
     from advsearch.scene.mitsuba_backend.scene_files import read_contents
 
     path = Path(scene)
-    names = (
-        read_contents(path).objects
-        if path.suffix.lower() == MITSUBA_SUFFIX
-        else list_node_names(path)
-    )
+    names: Sequence[str]
+    if path.suffix.lower() == MITSUBA_SUFFIX:
+        names = read_contents(path).objects
+    else:
+        names = list_node_names(path)
     if not names:
         raise InputError(
             f"--scene: {path} has nothing that can be the object; "
             "expected a shape or a node with a mesh"
         )
-    more = f" or {len(names) - MOST_NAMES:,} more" if len(names) > MOST_NAMES else ""
-    return (
-        ", ".join(format_name(name, quoted=False) for name in names[:MOST_NAMES]) + more
-    )
+    text = ", ".join(format_name(name, quoted=False) for name in names[:MOST_NAMES])
+    n_omitted = len(names) - MOST_NAMES
+    return f"{text} or {n_omitted:,} more" if n_omitted > 0 else text
 
 
 def format_as_flags(message: str) -> str:
@@ -175,6 +172,7 @@ def format_as_flags(message: str) -> str:
     switches = {setting.name for setting in known if setting.is_switch}
 
     def write_flag(match: re.Match[str]) -> str:
+        """Return the flag of a setting, with its value if it takes one."""
         name = match["name"]
         value = match["value"]
         if value is None or name in switches:  # a switch takes no value
@@ -195,7 +193,7 @@ def format_as_flags(message: str) -> str:
 
 def format_help(setting: Setting) -> str:
     """Return what the help says of a setting; of a switch, what its flag does."""
-    text = (
-        setting.switched or setting.description if setting.is_switch else setting.text
-    )
-    return text.replace("%", "%%")
+    text = setting.text
+    if setting.is_switch:
+        text = setting.switched or setting.description
+    return text.replace("%", "%%")  # argparse takes a single one for a field

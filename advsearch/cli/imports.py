@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import advsearch
 from advsearch.cli import output
 from advsearch.cli.main import argument, command
-from advsearch.cli.output import open_command_progress
+from advsearch.cli.output import open_answer_progress
 from advsearch.errors import InputError
 from advsearch.files import MESHES, either
 from advsearch.runs.summary import read_result
@@ -50,63 +50,59 @@ def file(args: argparse.Namespace) -> int:
     out = None if args.out is None else Path(args.out)
     if out is not None and out.suffix.lower() != ".png":
         raise InputError(f"--out: expected the name of a .png file, got {args.out}")
-    with open_command_progress(as_json=True, quiet=False):
+    with open_answer_progress():
         # late, so that --help answers at once
         from advsearch.scene.importing.scenes import MITSUBA_SUFFIX, list_contents
 
         if Path(args.file).suffix.lower() == MITSUBA_SUFFIX:
             facts, lines = _describe_mitsuba_file(args.file, out)
         else:
-            inside = list_contents(Path(args.file))
-            facts, lines = _describe_mesh_file(args.file, inside)
+            contents = list_contents(Path(args.file))
+            facts, lines = _describe_mesh_file(args.file, contents)
             if out is not None:
-                advsearch.render(
-                    advsearch.load_scene(inside.object), around=VIEWS, resolution=SIDE
-                ).save(out)
+                scene = advsearch.load_scene(contents.object)
+                advsearch.render(scene, around=VIEWS, resolution=SIDE).save(out)
     facts = {"command": "import", "file": args.file, **facts, "out": args.out}
     return output.print_answer(args.json, facts, "\n".join(lines))
 
 
-def _describe_mesh_file(file: str, inside: Contents) -> Understood:
-    """Return what the file of a mesh contains: facts for JSON, and the lines of the
-    text.
-    """
-    material_sizes = {
-        name: len(faces) for name, faces in inside.object.mesh.materials.items()
-    }
-    clips, joints, targets = _list_motions(inside.object.mesh.rig)
-    slow = _explain_slow_features(inside.object)
+def _describe_mesh_file(file: str, contents: Contents) -> Understood:
+    """Return what the file of a mesh contains: facts for JSON, and lines of text."""
+    mesh_object = contents.object
+    materials = mesh_object.mesh.materials  # indices of faces by name
+    clips, joints, targets = _list_motions(mesh_object.mesh.rig)
+    slow = _explain_slow_features(mesh_object)
     facts = {
-        **_describe_object(inside.object),
+        **_describe_object(mesh_object),
         "materials": [
-            {"name": name, "triangles": count} for name, count in material_sizes.items()
+            {"name": name, "triangles": len(faces)} for name, faces in materials.items()
         ],
-        "nodes": list(map(_describe_node, inside.nodes)),
-        "lights": list(inside.lights),
-        "cameras": list(inside.cameras),
+        "nodes": list(map(_describe_node, contents.nodes)),
+        "lights": list(contents.lights),
+        "cameras": list(contents.cameras),
         "clips": clips,
         "joints": joints,
         "targets": targets,
         "slow": slow,
-        "warnings": list(inside.object.warnings),
+        "warnings": list(mesh_object.warnings),
     }
     width, height = facts["texture"]
     lines = [
         f"{file}: {facts['triangles']:,} triangles, a texture of {width} x {height}, "
         f"{facts['up']} up, front {facts['front']}"
     ]
-    if inside.nodes:
-        lines += _format_nodes(file, inside.nodes)
+    if contents.nodes:
+        lines += _format_nodes(file, contents.nodes)
     names_by_kind = {
-        "materials (--control 'texture={materials: [NAME]}')": material_sizes,
-        "lights": inside.lights,
-        "cameras (--camera NAME)": inside.cameras,
+        "materials (--control 'texture={materials: [NAME]}')": materials,
+        "lights": contents.lights,
+        "cameras (--camera NAME)": contents.cameras,
         "clips (--control 'body={clip: NAME, time: [0, 1]}')": clips,
         "joints (--control 'body={NAME.x: [-30, 30]}')": joints,
         "morph targets (--control 'body={NAME.weight: [0, 1]}')": targets,
     }
     lines += _format_names(names_by_kind)
-    lines += [f"Note: {note}" for note in (*inside.object.warnings, *slow)]
+    lines += [f"Note: {note}" for note in (*mesh_object.warnings, *slow)]
     return facts, lines
 
 
@@ -209,13 +205,12 @@ def _describe_mitsuba_file(file: str, out: Path | None) -> Understood:
     # late, so that --help answers at once
     from advsearch.scene.mitsuba_backend.scene_files import read_contents
 
-    inside = read_contents(Path(file))
+    contents = read_contents(Path(file))
     warnings: tuple[str, ...] = ()
-    if inside.objects:
-        # a shape that is no light, or else the first one
+    if contents.objects:
         object_name = next(
-            (name for name in inside.objects if name not in inside.lights),
-            inside.objects[0],
+            (name for name in contents.objects if name not in contents.lights),
+            contents.objects[0],  # if all are lights
         )
         scene = advsearch.load_scene(object_name, scene=file)
         warnings = scene.description.object.warnings
@@ -227,20 +222,19 @@ def _describe_mitsuba_file(file: str, out: Path | None) -> Understood:
             f"{file}: no shape of it can be the object, so that it cannot "
             "be pictured; leave --out out"
         )
-    unchanged_shapes = dict(inside.unchanged)
+    # what is rendered as the file has it, with the reason by the name of the shape
+    unchanged_shapes = dict(contents.unchanged)
     names_by_kind = {
-        "objects": list(inside.objects),
-        "kept": [f"{name} ({why})" for name, why in unchanged_shapes.items()],
+        "objects": list(contents.objects),
+        "kept": [f"{name} ({reason})" for name, reason in unchanged_shapes.items()],
+        "lights": list(contents.lights),
+        "cameras": list(contents.cameras),
     }
-    names_by_kind |= {"lights": list(inside.lights), "cameras": list(inside.cameras)}
-    lines = [f"{file}: a Mitsuba scene"]
-    lines += [
-        f"{what}: {', '.join(names)}" for what, names in names_by_kind.items() if names
-    ]
-    if inside.objects:
+    lines = [f"{file}: a Mitsuba scene", *_format_names(names_by_kind)]
+    if contents.objects:
         lines.append(
             f"One of them as the object, the rest around it: --scene {file} "
-            f"--object {inside.objects[-1]}"
+            f"--object {contents.objects[-1]}"
         )
     lines += [f"Note: {warning}" for warning in warnings]
     return {

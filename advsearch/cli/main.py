@@ -85,14 +85,20 @@ class PlainCommand:
 def command(
     *arguments: Argument, more: str = "", examples: tuple[str, ...] = ()
 ) -> Callable[[Callable[[argparse.Namespace], int]], PlainCommand]:
-    """Make a `PlainCommand` of a function; its module and name stand in `GROUPS`."""
+    """Return a decorator that makes a `PlainCommand` of a function.
+
+    The module and the name of the function stand in `GROUPS`.
+    """
     return lambda run: PlainCommand(run, arguments, more, examples)
 
 
 @dataclass(frozen=True)
 class ExperimentCommand:
-    """The command of an experiment. `--code` allows Python code that the run or file
-    which it is about names.
+    """The command of an experiment.
+
+    An experiment may be about runs, files or names: its subject, which is the setting
+    `Experiment.about` (empty without a subject). `--code` allows the Python code that
+    such a run or file names.
     """
 
     experiment: Experiment[Any]
@@ -110,8 +116,9 @@ class ExperimentCommand:
         return self.experiment.examples
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        """Add the flags of the experiment's settings, and what it is about as words
-        without a flag, if it takes that.
+        """Add the flags of the experiment's settings, and the words without a flag.
+
+        Such words name the subject, of experiments that take it so.
         """
         # late, so that --help answers at once
         from advsearch.cli.flags import add_settings
@@ -119,7 +126,8 @@ class ExperimentCommand:
         add_settings(parser, self.experiment.settings)
         output.add_quiet_flags(parser)
         about = self.experiment.about
-        if positional := self.experiment.positional:
+        positional = self.experiment.positional
+        if positional:
             parser.add_argument(
                 about,
                 metavar=positional.metavar,
@@ -131,22 +139,18 @@ class ExperimentCommand:
             output.add_code_flag(parser)
 
     def run(self, args: argparse.Namespace) -> int:
-        """Run the experiment that the arguments describe, or list what it can be about;
-        return the exit status.
+        """Run the experiment that the arguments describe, and return the exit status.
+
+        If the experiment chooses its subject from a list, as `recipe` does, the word
+        "list" in place of the subject prints that list.
 
         Raises:
-            InputError: what it is about is missing.
+            InputError: the subject is missing.
         """
         about = self.experiment.about
         subject = getattr(args, about, None)
         if self.experiment.choices and subject == "list":
-            lines = load_attribute(self.experiment.choices)()
-            listed = [{"name": name, "title": text} for name, text in lines.items()]
-            return output.print_answer(
-                args.json,
-                {f"{self.name}s": listed},
-                output.align_columns([*lines.items()]),
-            )
+            return self._print_choices(as_json=args.json)
         is_missing = subject in (None, [])
         if self.experiment.positional and is_missing:
             command = f"advsearch {self.name}"
@@ -154,18 +158,30 @@ class ExperimentCommand:
                 f"{command}: expected {self.experiment.positional.expected}; see "
                 f"{command} --help"
             )
-        # a setting has several names in one text
+        # several words on the command line are one setting, with commas
         if isinstance(subject, list):
             setattr(args, about, ",".join(subject))
         return self.run_config(
             self.read_config(args), as_json=args.json, quiet=args.quiet
         )
 
+    def _print_choices(self, *, as_json: bool) -> int:
+        """Print the names that can be the subject, and return the exit status."""
+        title_by_name = load_attribute(self.experiment.choices)()
+        entries = [
+            {"name": name, "title": title} for name, title in title_by_name.items()
+        ]
+        return output.print_answer(
+            as_json,
+            {f"{self.name}s": entries},
+            output.align_columns([*title_by_name.items()]),
+        )
+
     def read_config(self, args: argparse.Namespace) -> Config:
         """Return the settings that the arguments describe.
 
-        Settings that were not given come from the run that the experiment is about, the
-        first one of several, if it takes its settings from runs.
+        Some experiments take the settings that were not given from the run that they
+        are about; from the first one if there are several.
         """
         # late, so that --help answers at once
         from advsearch.cli.flags import make_config
@@ -179,14 +195,11 @@ class ExperimentCommand:
             return make_config(args, config_type)
         if about in args:
             run_name = getattr(args, about)
-            # of several runs the first
-            if self.experiment.positional and self.experiment.positional.is_repeatable:
+            positional = self.experiment.positional
+            if positional and positional.is_repeatable:
                 run_name = next(iter(split_names(run_name)), run_name)
-            return make_config(
-                args,
-                config_type,
-                **read_defaults(find_run(run_name) / CONFIG, vars(args)),
-            )
+            defaults = read_defaults(find_run(run_name) / CONFIG, vars(args))
+            return make_config(args, config_type, **defaults)
         missing = [
             setting.flag
             for setting in settings(config_type)
@@ -218,9 +231,10 @@ class ExperimentCommand:
             result = experiment.run_experiment(
                 config, progress=progress, resumed=resumed
             )
-        return output.print_result(
-            result, as_json=as_json
-        ) or self.experiment.exit_status(result)
+        status = output.print_result(result, as_json=as_json)
+        if status != OK:  # the run was interrupted
+            return status
+        return self.experiment.exit_status(result)
 
 
 GROUPS = {
@@ -286,8 +300,8 @@ def list_commands() -> list[str]:
 def group_commands() -> dict[str, list[str]]:
     """Return the names of the commands by the heading that the help has for them.
 
-    Commands whose modules are missing are left out; experiments that no group names, as
-    those of other packages, are added to the first.
+    Commands whose modules are missing are left out. Experiments of other packages,
+    which no group names, are added to the first group.
     """
     groups = {
         title: [name for name, target in group.items() if _is_available(name, target)]
@@ -300,25 +314,35 @@ def group_commands() -> dict[str, list[str]]:
 
 
 def _is_available(name: str, target: str) -> bool:
-    """Return whether the module of a command is there; `target` as in `GROUPS`."""
-    return (
-        is_present(f"advsearch.cli.{target.partition(':')[0]}")
-        if target
-        else name in EXPERIMENTS
-    )
+    """Return whether a command can be used.
+
+    Args:
+        name: name of the command.
+        target: its entry in `GROUPS`, "MODULE:FUNCTION what it does"; empty for an
+            experiment.
+    """
+    if not target:
+        return name in EXPERIMENTS
+    module = target.partition(":")[0]
+    return is_present(f"advsearch.cli.{module}")
 
 
 def get_command(name: str) -> ExperimentCommand | PlainCommand:
+    """Return the command of a name; its module is imported."""
     target = COMMANDS_OF_THIS_PACKAGE.get(name)
     if target is None:
         return ExperimentCommand(get_experiment(name))
-    command: PlainCommand = load_attribute(f"advsearch.cli.{target.partition(' ')[0]}")
+    location = target.partition(" ")[0]
+    command: PlainCommand = load_attribute(f"advsearch.cli.{location}")
     return command
 
 
 def get_command_help(name: str) -> str:
+    """Return what a command does, in a clause."""
     target = COMMANDS_OF_THIS_PACKAGE.get(name)
-    return get_experiment_help(name) if target is None else target.partition(" ")[2]
+    if target is None:
+        return get_experiment_help(name)
+    return target.partition(" ")[2]
 
 
 _EXAMPLES = """examples:
@@ -339,55 +363,69 @@ class Parser(argparse.ArgumentParser):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status. An exception that is a bug of ours
     passes through.
+
+    Args:
+        argv: words of the command line. None takes those of this process, which is then
+            the command's alone: standard streams and Ctrl-C are set up for it.
     """
-    if argv is None:  # this process is ours
+    owns_process = argv is None
+    if owns_process:
         open_descriptors()
     with escape_output(), restrict_allowed_code():
-        status = _interruptible(sys.argv[1:]) if argv is None else _status(list(argv))
-        if argv is None:  # too late to interrupt: native code knows no handler of ours
+        if argv is None:
+            status = _run_interruptibly(sys.argv[1:])
+            # From here on Ctrl-C is ignored: the interpreter ends, and native code that
+            # runs then knows no handler of ours.
             signal.signal(signal.SIGINT, signal.SIG_IGN)
+        else:
+            status = _status(list(argv))
         end_output()
     return status
 
 
-def _interruptible(words: list[str]) -> int:
-    """Run a command as `_status` does, and let Ctrl-C interrupt it as long as there is
-    something to interrupt, without any traceback.
+def _run_interruptibly(words: list[str]) -> int:
+    """Run a command and return its exit status, as `_status` does; Ctrl-C interrupts it.
+
+    An interrupt leaves no traceback. Once the command has ended, nothing is left to
+    interrupt.
     """
     sys.unraisablehook = unless_interrupted
     try:
         signal.signal(signal.SIGINT, INTERRUPTS)
-        end_at_the_second()
+        end_at_the_second()  # a second Ctrl-C ends the process at once
         status = _status(words)
         INTERRUPTS.ended = True
         return status
-    except KeyboardInterrupt:  # while `_status` told of another
+    except KeyboardInterrupt:  # another one, while `_status` handled the first
         INTERRUPTS.ended = True
         return INTERRUPTED
 
 
 def _status(words: list[str]) -> int:
-    """Run a command and return its exit status, which is `INTERRUPTED` after any
-    interrupt, whatever error or result came of it.
+    """Run a command and return its exit status.
+
+    After any interrupt the status is `INTERRUPTED`, whatever error or result came of
+    it.
     """
     try:
-        status = _run_and_tell(words)
-        # some code has swallowed the interrupt: the command was asked to stop all the
-        # same
+        status = _run_and_report_errors(words)
+        # Some code has swallowed the interrupt: it ends the command all the same, in
+        # the branch below.
         if status != INTERRUPTED and INTERRUPTS.count:
             raise KeyboardInterrupt
         return status
     except BaseException as error:
-        # Modules that are being imported, and native code, make other errors of an
-        # interrupt.
-        if not INTERRUPTS.count and not isinstance(error, KeyboardInterrupt):
+        # Modules that are being imported, and native code, turn an interrupt into other
+        # errors. So any error after an interrupt is taken for one.
+        is_interrupt = isinstance(error, KeyboardInterrupt) or INTERRUPTS.count > 0
+        if not is_interrupt:
             raise
         print("advsearch: interrupted", file=sys.stderr)
         return INTERRUPTED
 
 
-def _run_and_tell(words: list[str]) -> int:
-    """Run a command and return its exit status; one of our errors is printed as a
+def _run_and_report_errors(words: list[str]) -> int:
+    """Run a command and return its exit status; an `AdvsearchError` is printed as a
     message.
     """
     try:
@@ -398,12 +436,12 @@ def _run_and_tell(words: list[str]) -> int:
         # late, so that --help answers at once
         from advsearch.cli.flags import format_as_flags
 
-        # settings are named as in the file where they come from one, else as flags; but
-        # some advice is a flag always, such as --code, since no file may allow its own
-        # code
-        asks_for_flag = isinstance(error, (UnknownNameError, CodeNotAllowedError))
-        in_a_file = words[0] in ("run", "resume") and not asks_for_flag
-        text = str(error) if in_a_file else format_as_flags(str(error))
+        # A message names settings as a file does where they come from a file, else as
+        # flags. Some advice is always a flag, such as --code: no file may allow its own
+        # code.
+        advises_flag = isinstance(error, (UnknownNameError, CodeNotAllowedError))
+        is_about_file = words[0] in ("run", "resume") and not advises_flag
+        text = str(error) if is_about_file else format_as_flags(str(error))
         print(f"advsearch: error: {shorten_words(text)}", file=sys.stderr)
         return BAD_INPUT
     except BrokenPipeError:
@@ -440,7 +478,7 @@ def _parse(words: list[str], command: str | None) -> argparse.Namespace:
     Only the flags of `command` are made, since making all of them takes half a second.
     Without a command the help is printed and the process ends.
     """
-    parser, subparsers = without_commands()
+    parser, subparsers = make_parser_without_commands()
     for name in list_commands():
         add_command(subparsers, name, with_arguments=name == command)
     args, unknown = parser.parse_known_args(_join_negative_axis(words))
@@ -466,34 +504,20 @@ def _join_negative_axis(words: list[str]) -> list[str]:
     return joined
 
 
-def without_commands() -> tuple[
+def make_parser_without_commands() -> tuple[
     argparse.ArgumentParser, argparse._SubParsersAction[Any]
 ]:
-    """Return the parser of the command line, without commands yet, and what
-    `add_command` adds them to.
+    """Make the parser of the command line, to which commands are still to be added.
 
-    The help of the parser lists all commands.
+    Its help lists all commands already.
+
+    Returns:
+        The parser, and the parsers of its commands, to which `add_command` adds.
     """
-    groups = group_commands()
-    # width of the column of names, with two spaces on each side
-    column = 4 + max(len(name) for group in groups.values() for name in group)
-    # wide enough for the texts beside the column of names
-    width = max(shutil.get_terminal_size().columns - 2, 2 * column)
-    lines = []
-    for title, names in groups.items():
-        texts = [f"  {name}".ljust(column) + get_command_help(name) for name in names]
-        lines += [
-            title,
-            *(
-                textwrap.fill(text, width, subsequent_indent=" " * column)
-                for text in texts
-            ),
-            "",
-        ]
     parser = Parser(
         prog="advsearch",
         description="Find the scene that a vision model gets wrong most badly.",
-        epilog="\n".join([*lines, _EXAMPLES]),
+        epilog="\n".join([*_list_commands_with_help(), _EXAMPLES]),
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
@@ -510,6 +534,27 @@ def without_commands() -> tuple[
     return parser, subparsers
 
 
+def _list_commands_with_help() -> list[str]:
+    """Return the lines of the help that list the commands in their groups.
+
+    Names are in a column, with the text of each command beside its name.
+    """
+    groups = group_commands()
+    longest_name = max(len(name) for group in groups.values() for name in group)
+    text_begin = longest_name + 4  # two spaces on each side of the names
+    # in a narrow terminal too, texts get as much width as names
+    line_width = max(shutil.get_terminal_size().columns - 2, 2 * text_begin)
+    lines = []
+    for title, names in groups.items():
+        lines.append(title)
+        for name in names:
+            text = f"  {name}".ljust(text_begin) + get_command_help(name)
+            indent = " " * text_begin
+            lines.append(textwrap.fill(text, line_width, subsequent_indent=indent))
+        lines.append("")
+    return lines
+
+
 def add_command(
     subparsers: argparse._SubParsersAction[Any],
     name: str,
@@ -519,7 +564,8 @@ def add_command(
     """Add a command to the parsers, and return its parser.
 
     Args:
-        subparsers: what `without_commands` returns.
+        subparsers: the second value that `make_parser_without_commands`
+            returns.
         name: name of the command.
         with_arguments: make its arguments and help; without, it only has a name.
     """

@@ -16,8 +16,14 @@ import json
 import os
 import shlex
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, redirect_stdout, suppress
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import (
+    AbstractContextManager,
+    contextmanager,
+    nullcontext,
+    redirect_stdout,
+    suppress,
+)
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, TextIO, cast
 
@@ -26,6 +32,7 @@ from advsearch.interrupts import INTERRUPTS
 from advsearch.progress import Progress, escape_text, open_progress
 
 if TYPE_CHECKING:
+    from advsearch.report.views import ResultPart
     from advsearch.runs.results import Result
 
 
@@ -51,21 +58,23 @@ def shorten_words(text: str) -> str:
 
 
 class Screen:
-    """A text stream that prints text `escape_text`. All but writing is the stream's own.
-    Unless it is `needed`, what cannot be written is dropped.
+    """A text stream that writes text through `escape_text` to another stream.
+
+    All else is the other stream's own. Where writing fails, it raises an error if
+    `raises_errors`, else the text is dropped.
     """
 
-    def __init__(self, stream: TextIO, *, needed: bool) -> None:
+    def __init__(self, stream: TextIO, *, raises_errors: bool) -> None:
         self.stream = stream
-        self._needed = needed
+        self._raises_errors = raises_errors
 
     def write(self, text: str) -> int:
-        with output_errors() if self._needed else suppress(OSError):
+        with output_errors() if self._raises_errors else suppress(OSError):
             self.stream.write(escape_text(text, self.stream.encoding or "utf-8"))
         return len(text)
 
     def flush(self) -> None:
-        with output_errors() if self._needed else suppress(OSError):
+        with output_errors() if self._raises_errors else suppress(OSError):
             self.stream.flush()
 
     def __getattr__(self, name: str) -> Any:
@@ -74,7 +83,7 @@ class Screen:
 
 @contextmanager
 def output_errors() -> Iterator[None]:
-    """Turn what goes wrong with standard output inside the block into a message.
+    """Turn errors of standard output inside the block into errors with a message.
 
     Raises:
         BrokenPipeError: nobody reads it any more, which is no failure.
@@ -97,8 +106,9 @@ def escape_output() -> Iterator[None]:
     """
     stdout = sys.stdout
     stderr = sys.stderr
-    sys.stdout = _screen(stdout, needed=True)
-    sys.stderr = _screen(stderr, needed=False)
+    sys.stdout = _screen(stdout, raises_errors=True)
+    # a command does its work even where its messages cannot be written
+    sys.stderr = _screen(stderr, raises_errors=False)
     try:
         yield
     finally:
@@ -137,17 +147,17 @@ def end_output() -> None:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _screen(stream: Any, *, needed: bool) -> TextIO:
-    """Return a `Screen` of a stream, which may be one already; without a stream, one
-    that drops everything.
+def _screen(stream: Any, *, raises_errors: bool) -> TextIO:
+    """Return a `Screen` that writes to a stream; the stream itself if it is one.
+
+    Without a stream, everything is dropped: Python has none where the descriptor was
+    closed.
     """
-    # Python has none where the descriptor was closed
-    if not isinstance(stream, Screen):
-        stream = Screen(
-            open(os.devnull, "w", encoding="utf-8") if stream is None else stream,
-            needed=needed,
-        )
-    return cast(TextIO, stream)
+    if isinstance(stream, Screen):
+        return cast(TextIO, stream)
+    if stream is None:
+        stream = open(os.devnull, "w", encoding="utf-8")
+    return cast(TextIO, Screen(stream, raises_errors=raises_errors))
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -204,7 +214,8 @@ def print_json(value: Any) -> None:
     text = json.dumps(
         to_json_value(value), indent=2, allow_nan=False, ensure_ascii=False
     )
-    # letters of other languages stay, invisible ones become escapes of JSON
+    # Letters of other languages stay; invisible ones become escapes of JSON. [1:-1]
+    # takes off the quotes that `json.dumps` adds.
     text = "".join(
         sign if sign.isprintable() or sign == "\n" else json.dumps(sign)[1:-1]
         for sign in text
@@ -224,14 +235,17 @@ def print_result(result: Result, *, as_json: bool) -> int:
 
 
 def explain_resume(result: Result) -> str:
-    """Return how to go on with a run that was stopped, as the end of a text; "" for a
-    run that ended or is kept nowhere.
+    """Return how to go on with a run that was stopped, as the last paragraph of a text.
+
+    Empty for a run that ended, that another process still works on, or that has no
+    folder.
     """
     run: Any = getattr(result, "run", None)
-    stopped = (
-        run and result.is_unfinished and getattr(result, "ending", None) != "running"
-    )
-    return f"\n\nGo on with: {make_resume_command(run)}" if stopped else ""
+    if not run or not result.is_unfinished:
+        return ""
+    if getattr(result, "ending", None) == "running":
+        return ""
+    return f"\n\nGo on with: {make_resume_command(run)}"
 
 
 def make_resume_command(run: str | Path) -> str:
@@ -250,12 +264,13 @@ def make_resume_command(run: str | Path) -> str:
     # where the file cannot be read, the printed command will say so when it is run
     with suppress(AdvsearchError):
         config = read_file_config(read_command(file), file, {})
+        if not isinstance(config, SceneConfig):
+            return shlex.join(words)
         metrics = getattr(config, "metrics", {}).values()
+        all_names = "".join([config.model, *config.control_kinds, *metrics])
         # Names of code are "module:name". The exact list takes seconds, so it is made
         # only where there is a colon anywhere.
-        if isinstance(config, SceneConfig) and ":" in "".join(
-            [config.model, *config.control_kinds, *metrics]
-        ):
+        if ":" in all_names:
             from advsearch.engine.naming import list_imported_code  # takes seconds
 
             names = list_imported_code(
@@ -291,8 +306,9 @@ def redirect_output() -> Iterator[None]:
 
 
 def format_result(result: Result) -> str:
-    """Return a result as text for a person: its statement, its parts, how it was made,
-    and notes.
+    """Return a result as text for a person.
+
+    Its paragraphs are its statement, its parts, how it was made, and notes.
     """
     # late, so that --help answers at once
     from advsearch.cli.flags import format_as_flags
@@ -300,54 +316,54 @@ def format_result(result: Result) -> str:
     from advsearch.runs.directory import REPORT
 
     view = get_view(result)
-    run = getattr(result, "run", None)
-    parts = [view.statement]
+    paragraphs = [view.statement]
     for part in view.sections:
-        if part.only not in ("", "text") or part.is_empty:
-            continue
-        table = align_columns([part.heads, *part.rows] if part.heads else part.rows)
-        pictures = [
-            [picture.file, picture.caption]
-            for group in part.pictures
-            for picture in group
-        ]
-        part_texts = [
-            *map(format_as_flags, part.text),
-            "\n".join(filter(None, [table, align_columns(pictures)])),
-        ]
-        parts.append(
-            "\n".join(filter(None, [part.title, "\n\n".join(filter(None, part_texts))]))
-        )
+        if part.is_visible_in("text"):
+            paragraphs.append(_format_part(part))
     facts = [[name.lower(), text] for name, text in collect_facts(result, view).items()]
-    parts.append(
-        align_columns([*facts, *([["page", f"{run}/{REPORT}"]] if run else [])])
-    )
-    return "\n\n".join(
-        [
-            *filter(None, parts),
-            *(f"Note: {format_as_flags(text)}" for text in list_remarks(result, view)),
-        ]
-    )
+    run = getattr(result, "run", None)
+    if run:
+        facts.append(["page", f"{run}/{REPORT}"])
+    paragraphs.append(align_columns(facts))
+    notes = [f"Note: {format_as_flags(text)}" for text in list_remarks(result, view)]
+    return _join_nonempty("\n\n", [*paragraphs, *notes])
+
+
+def _format_part(part: ResultPart) -> str:
+    """Return a part of a result as text: its title, paragraphs, table and pictures."""
+    # late, so that --help answers at once
+    from advsearch.cli.flags import format_as_flags
+
+    table = align_columns([part.heads, *part.rows] if part.heads else part.rows)
+    picture_rows = [
+        [picture.file, picture.caption] for group in part.pictures for picture in group
+    ]
+    tables = _join_nonempty("\n", [table, align_columns(picture_rows)])
+    body = _join_nonempty("\n\n", [*map(format_as_flags, part.text), tables])
+    return _join_nonempty("\n", [part.title, body])
+
+
+def _join_nonempty(separator: str, texts: Iterable[str]) -> str:
+    """Join texts, without those that are empty."""
+    return separator.join(filter(None, texts))
 
 
 def align_columns(rows: Sequence[Sequence[str]]) -> str:
-    """Return lines with the cells of `rows` in aligned columns; rows may have fewer
-    cells than others.
+    """Return lines with the cells of `rows` in aligned columns.
+
+    Rows may have fewer cells than others.
     """
     n_columns = max(map(len, rows), default=0)
     widths = [
         max(len(row[column]) for row in rows if column < len(row))
         for column in range(n_columns)
     ]
-    return "\n".join(
-        (
-            "  "
-            + "   ".join(
-                cell.ljust(width) for cell, width in zip(row, widths, strict=False)
-            )
-        ).rstrip()
-        for row in rows
-    )
+    lines = []
+    for row in rows:
+        # not strict: a row may have fewer cells than there are columns
+        cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=False)]
+        lines.append(f"  {'   '.join(cells)}".rstrip())
+    return "\n".join(lines)
 
 
 @contextmanager
@@ -369,14 +385,24 @@ def open_command_progress(*, as_json: bool, quiet: bool) -> Iterator[Progress]:
         progress = InterruptCheckingProgress(watcher)
         progress.stage("starting: loading PyTorch and Mitsuba")
         yield progress
-        # raises where one came that nobody has handled
+        # raises KeyboardInterrupt if some code has swallowed one
         INTERRUPTS.look()
 
 
+def open_answer_progress() -> AbstractContextManager[Progress]:
+    """Show progress inside the block, for a command that prints its answer after it.
+
+    Nothing else reaches standard output, whether the answer is text or JSON.
+    """
+    return open_command_progress(as_json=True, quiet=False)
+
+
 class InterruptCheckingProgress:
-    """A watcher that raises an interrupt which was lost where it struck, when a step or
-    a stage ends: modules that are being imported, destructors and native code make
-    other errors of one, or none. All is told to `progress`.
+    """A progress that passes everything on to another one, and looks for interrupts.
+
+    Modules that are being imported, destructors and native code may swallow an
+    interrupt or turn it into another error. It is raised again at the next stage or
+    step.
     """
 
     def __init__(self, progress: Progress) -> None:

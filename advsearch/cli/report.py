@@ -7,7 +7,7 @@ import csv
 import math
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -158,16 +158,17 @@ def _add_photographs(folder: str, name: str) -> None:
     """Let the model of a run judge photographs, and add them to the run.
 
     Args:
-        folder: folder with photographs; their names, or the file `POSES` beside them,
-            say which rendering of the run each one shows.
+        folder: folder with photographs. Which rendering of the run a photograph shows
+            is in its name, or in the file `POSES` beside it.
         name: name of the run.
 
     Raises:
-        InputError: there are none, or they do not say it.
+        InputError: there are none, or one does not name its rendering.
     """
     from advsearch.extend import directory, settings, workbench  # the last brings torch
 
     run = directory.find_run(name)
+    # the task decides which files can be photographs
     task: Any = (
         settings.read_yaml(run / directory.CONFIG).get("task") or "classification"
     )
@@ -179,29 +180,39 @@ def _add_photographs(folder: str, name: str) -> None:
             )
         photographs = workbench.load_photographs()
         files = photographs.list_files(photograph_folder, task)
-        if unnumbered_files := [
-            file.name for file in files if not file.stem.startswith("rendering-")
-        ]:
-            raise InputError(
-                f"photographs: {unnumbered_files[0]}: expected the number of a "
-                "rendering in its "
-                "name, such as rendering-12.jpg, "
-                f"or {POSES} beside it; advsearch dashboard aligns photographs by phone"
-            )
-        if not files:
-            raise InputError(
-                f"photographs: {folder}: expected a folder with "
-                "photographs, got none in it"
-            )
+        _check_photographs(files, folder)
         photographs.add_files(run, files)
 
 
+def _check_photographs(files: Sequence[Path], folder: str) -> None:
+    """Check that there are photographs, and that each names its rendering.
+
+    Raises:
+        InputError: there are none, or one does not.
+    """
+    unnumbered_files = [
+        file.name for file in files if not file.stem.startswith("rendering-")
+    ]
+    if unnumbered_files:
+        raise InputError(
+            f"photographs: {unnumbered_files[0]}: expected the number of a "
+            "rendering in its "
+            "name, such as rendering-12.jpg, "
+            f"or {POSES} beside it; advsearch dashboard aligns photographs by phone"
+        )
+    if not files:
+        raise InputError(
+            f"photographs: {folder}: expected a folder with photographs, got none in it"
+        )
+
+
 def _copy_named_by_pose(folder: Path, run: Path, out: Path) -> Path:
-    """Copy the photographs that the table `POSES` lists, each under the name of the
-    rendering that has its pose, and return `out`.
+    """Copy photographs, each under the name of the rendering that has its pose.
+
+    Returns `out`.
 
     Args:
-        folder: has the table and the photographs.
+        folder: has the photographs, and the table `POSES` of their poses.
         run: a sweep, of which exactly one rendering has each pose.
         out: an empty folder.
 
@@ -217,13 +228,9 @@ def _copy_named_by_pose(folder: Path, run: Path, out: Path) -> Path:
             (row.step, {name: value["value"] for name, value in row.values.items()})
             for row in store.rows("sweep")
         ]
+    table = stored_files.read_text(folder / POSES, "poses", LARGEST_POSES)
     # line 1 has the heads, so that poses begin on line 2
-    for line, pose in enumerate(
-        csv.DictReader(
-            stored_files.read_text(folder / POSES, "poses", LARGEST_POSES).splitlines()
-        ),
-        2,
-    ):
+    for line, pose in enumerate(csv.DictReader(table.splitlines()), 2):
         location = f"photographs: {folder / POSES}, line {line}"
         # the name alone: no photograph outside of the folder
         file = folder / Path(str(pose.pop("file", ""))).name
@@ -232,26 +239,40 @@ def _copy_named_by_pose(folder: Path, run: Path, out: Path) -> Path:
                 f"{location}: expected the name of a photograph beside it "
                 f"under `file`, got {file.name!r}"
             )
-        steps = [
-            step
-            for step, values in rows
-            if all(
-                _is_equal_value(values.get(name), text) for name, text in pose.items()
-            )
-        ]
-        if len(steps) != 1:
-            pose_text = ", ".join(f"{name} {text}" for name, text in pose.items())
-            raise InputError(
-                f"{location}: expected a pose that one rendering of {run.name} has, "
-                "got "
-                f"{pose_text}, which {len(steps)} have; "
-                "sweep a grid of the poses"
-            )
+        steps = [step for step, values in rows if _has_pose(values, pose)]
+        _check_single_rendering(steps, location, run, pose)
         shutil.copyfile(file, out / f"rendering-{steps[0]}-{file.name}")
     return out
 
 
+def _check_single_rendering(
+    steps: Sequence[int], location: str, run: Path, pose: Mapping[str, str | None]
+) -> None:
+    """Raise an error unless a single rendering of a run has a pose.
+
+    Args:
+        steps: numbers of the renderings that have it.
+        location: file and line of the pose, for the message.
+        run: the run directory.
+        pose: texts of the values by name.
+    """
+    if len(steps) != 1:
+        pose_text = ", ".join(f"{name} {text}" for name, text in pose.items())
+        raise InputError(
+            f"{location}: expected a pose that one rendering of {run.name} has, "
+            "got "
+            f"{pose_text}, which {len(steps)} have; "
+            "sweep a grid of the poses"
+        )
+
+
+def _has_pose(values: Mapping[str, object], pose: Mapping[str, str | None]) -> bool:
+    """Return whether a rendering has all values of a pose, whose values are texts."""
+    return all(_is_equal_value(values.get(name), text) for name, text in pose.items())
+
+
 def _is_equal_value(value: object, text: str | None) -> bool:
+    """Return whether a text writes a value: the same name, or nearly the same number."""
     if text is None or value is None or isinstance(value, str):
         return text is not None and value == text.strip()
     try:

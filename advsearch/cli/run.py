@@ -85,12 +85,15 @@ def run_file(
 
     Raises:
         UnknownNameError: there is no such command.
-        InputError: the file asks for what only a person may ask for.
+        InputError: the file has a setting that counts only when a person types it, such
+            as one that connects to other machines.
     """
     config = read_file_config(read_command(file), file, changes)
+    # Such settings count as not set. A run is continued without one that decides none
+    # of its numbers.
     for setting in config.left_out:
-        # in a run of ours it may be left out, as long as it does not decide the numbers
-        if resumed is None or setting.name not in config.free:
+        decides_numbers = setting.name not in config.free
+        if resumed is None or decides_numbers:
             raise InputError(
                 f"{file}: {setting.name}: {setting.effect}, which a file "
                 f"can't ask for; type {setting.how_to_set}"
@@ -147,9 +150,10 @@ def resume(args: argparse.Namespace) -> int:
         if not (path / REPORT).is_file():
             write_page(path)
         return show_run(str(path), args.json)
-    if only := [part.text for part in read_python_only(path)]:
+    missing = [part.text for part in read_python_only(path)]
+    if missing:
         raise InputError(
-            f"{path}: cannot resume from here: {', '.join(only)} existed only in the "
+            f"{path}: cannot resume from here: {', '.join(missing)} existed only in the "
             "Python session of the run; call the same function with the same arguments "
             "again, an attack with `resume=True`"
         )
@@ -175,9 +179,9 @@ def runs(args: argparse.Namespace) -> int:
     rows = [["run", "command", "object", "controls", "rows", "state", "result"]]
     for run in listed_runs:
         names = ",".join(run.controls)
-        more = len(run.controls) - MOST_NAMES
-        if more > 1:  # the last name is as short as "1 more"
-            names = f"{','.join(run.controls[:MOST_NAMES])} and {more} more"
+        n_omitted = len(run.controls) - MOST_NAMES
+        if n_omitted > 1:  # a single name is as short as "1 more"
+            names = f"{','.join(run.controls[:MOST_NAMES])} and {n_omitted} more"
         rows.append(
             [
                 run.name,

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +18,7 @@ from advsearch.catalog import is_present
 from advsearch.cli import output
 from advsearch.cli.flags import add_settings
 from advsearch.cli.main import argument, command
-from advsearch.cli.output import get_raw_stream, open_command_progress
+from advsearch.cli.output import get_raw_stream, open_answer_progress
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonValue
 from advsearch.options import get_option_default, get_option_type, list_declared_options
@@ -73,11 +73,9 @@ def show(args: argparse.Namespace) -> int:
     match args.what:
         case ["control" | "policy" | "task" as kind, name]:
             return _show_declared(kind, name, args.json)
-        # a word of an experiment, such as recipe, that can describe its choices
-        case [command, name] if command in EXPERIMENTS and (
-            target := get_experiment(command).choice_description
-        ):
-            text, facts = load_attribute(target)(name)
+        case [command, name] if _find_choice_description(command) is not None:
+            describe = load_attribute(_find_choice_description(command))
+            text, facts = describe(name)
             return output.print_answer(args.json, {command: name, **facts}, text)
         case [name]:
             try:
@@ -93,9 +91,21 @@ def show(args: argparse.Namespace) -> int:
     )
 
 
+def _find_choice_description(command: str) -> Any:
+    """Return where the function is that describes a choice of an experiment.
+
+    The choices of `recipe` are recipes. None if there is no such experiment, or its
+    choices have no description.
+    """
+    if command not in EXPERIMENTS:
+        return None
+    return get_experiment(command).choice_description or None
+
+
 def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
-    """Print the result of a run, or how far it has come if it has none yet; return the
-    exit status.
+    """Print the result of a run, or how far it has come if it has none yet.
+
+    Returns the exit status.
 
     Args:
         name: name of the run, or its path.
@@ -108,25 +118,14 @@ def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
         return _show_unfinished(read_listed_run(path), as_json)
     result = read_result(path)
     photos = find_photographs(path)
-    if as_json:
-        output.print_json(
-            {**result.to_dict(), "photos": photos.to_dict()} if photos else result
-        )
-    else:
+    if not as_json:
         print(output.format_result(result) + output.explain_resume(result))
-    if photos and photos.interval is not None and not as_json:
-        agreeing = photos.right_right + photos.wrong_wrong
-        total = format_count(photos.photos, "photograph")
-        interval_text = f"95 % interval {format_interval(photos.interval)}"
-        table = [
-            ["", "photograph right", "photograph wrong"],
-            ["rendering right", str(photos.right_right), str(photos.right_wrong)],
-            ["rendering wrong", str(photos.wrong_right), str(photos.wrong_wrong)],
-        ]
-        print(
-            f"\nRenderings and reality agree in {agreeing} of {total}, "
-            f"{interval_text}:\n{output.align_columns(table)}"
-        )
+        if photos and photos.interval is not None:
+            _print_agreement(photos)
+    elif photos:
+        output.print_json({**result.to_dict(), "photos": photos.to_dict()})
+    else:
+        output.print_json(result)
     if picture:
         show_pictures(find_best_images(path))
     return 0
@@ -141,6 +140,28 @@ def find_photographs(run: Path) -> Any:
     from advsearch import photo_agreement  # takes seconds
 
     return photo_agreement(run)
+
+
+def _print_agreement(photos: Any) -> None:
+    """Print how often renderings and photographs agree: a sentence and a table.
+
+    Args:
+        photos: counts of pairs of a rendering and a photograph: `right_wrong` is the
+            number of those whose rendering is predicted right and whose photograph is
+            predicted wrong, and so on.
+    """
+    agreeing = photos.right_right + photos.wrong_wrong
+    total = format_count(photos.photos, "photograph")
+    interval_text = f"95 % interval {format_interval(photos.interval)}"
+    table = [
+        ["", "photograph right", "photograph wrong"],
+        ["rendering right", str(photos.right_right), str(photos.right_wrong)],
+        ["rendering wrong", str(photos.wrong_right), str(photos.wrong_wrong)],
+    ]
+    print(
+        f"\nRenderings and reality agree in {agreeing} of {total}, "
+        f"{interval_text}:\n{output.align_columns(table)}"
+    )
 
 
 def _show_unfinished(run: ListedRun, as_json: bool) -> int:
@@ -176,8 +197,9 @@ PLURALS = {"control": "controls", "policy": "policies", "task": "tasks"}
 
 def _show_declared(kind: str, name: str, as_json: bool) -> int:
     """Show the parameters and options of a control, policy or task."""
-    with open_command_progress(as_json=True, quiet=False):
+    with open_answer_progress():
         registry = _registry(PLURALS[kind])  # takes seconds
+    # a control may be named as "module:name", code that a person typed and that may run
     allow_named({"controls": name} if kind == "control" else {})
     if name not in registry:
         raise UnknownNameError(kind, name, registry)
@@ -268,12 +290,12 @@ def _format_searched(parameter: Parameter) -> str:
 
 def _make_choice_row(choice: Choice) -> dict[str, str]:
     """Return the row of a table for a setting of a control, with its allowed values."""
-    allowed = ", ".join(choice.options)
-    if choice.whole:
+    allowed = ", ".join(choice.options)  # empty if it is a number
+    if choice.whole:  # a whole number between two bounds
         allowed = f"{choice.whole[0]} to {choice.whole[1]}"
-    elif choice.most and choice.signed:
+    elif choice.most and choice.signed:  # a number of either sign
         allowed = f"{-choice.most:g} to {choice.most:g}"
-    elif choice.most:
+    elif choice.most:  # a positive number
         allowed = f"over 0 to {choice.most:g}"
     default = _format_cell(choice.default)
     return {
@@ -320,7 +342,7 @@ def show_pictures(files: Sequence[Path]) -> None:
     if not files:
         print("\nThis run has no pictures.")
         return
-    draw, why = _drawing()
+    draw, drawing_refusal = _find_drawing()
     print()
     for file in files:
         if draw is not None:
@@ -329,20 +351,21 @@ def show_pictures(files: Sequence[Path]) -> None:
             # whatever a terminal answers, the paths of the pictures are printed
             except Exception as error:
                 draw = None
-                why = (
+                drawing_refusal = (
                     f"The pictures could not be drawn here: {type(error).__name__}: "
                     f"{error}"
                 )
         print(f"  picture   {file}")
-    if why:
-        print(f"\n{why}")
+    if drawing_refusal:
+        print(f"\n{drawing_refusal}")
 
 
-def _drawing() -> tuple[Callable[[Path], None] | None, str]:
-    """Return what draws a picture in this terminal, and why there is none.
+def _find_drawing() -> tuple[Callable[[Path], None] | None, str]:
+    """Find the function that draws a picture in this terminal.
 
     Returns:
-        A function of a picture's path, or None; and a sentence for the user, or "".
+        The function of a picture's path, None if nothing can be drawn; and a sentence
+        about why not, empty if there is nothing to say.
     """
     if not sys.stdout.isatty():
         return None, ""
@@ -426,17 +449,18 @@ def list_all(args: argparse.Namespace) -> int:
     if args.kind == "all":
         # cases are listed only by their own kind
         kinds = [kind for kind in REGISTRIES if kind != CASES]
-    with open_command_progress(as_json=True, quiet=False):
+    with open_answer_progress():
         names = {kind: list_names(kind) for kind in kinds}
     tables = {
         kind: output.align_columns([*entries.items()])
         for kind, entries in names.items()
     }
-    text = "\n\n".join(f"{kind}:\n{table}" for kind, table in tables.items())
+    if args.kind == "all":
+        text = "\n\n".join(f"{kind}:\n{table}" for kind, table in tables.items())
+    else:
+        text = tables[args.kind]
     facts = {kind: list(entries) for kind, entries in names.items()}
-    return output.print_answer(
-        args.json, facts, text if args.kind == "all" else tables[args.kind]
-    )
+    return output.print_answer(args.json, facts, text)
 
 
 @command(
@@ -457,38 +481,14 @@ def list_all(args: argparse.Namespace) -> int:
     ),
 )
 def labels(args: argparse.Namespace) -> int:
-    """Print index and name of the classes, best first. Raises InputError where no class
-    is like the word, or the model has no names for its classes.
-    """
-    with open_command_progress(as_json=True, quiet=False):
-        # late, so that --help answers at once
-        from advsearch.models import load_model, read_labels
-        from advsearch.models.labels import find_similar_labels, is_nothing_name
+    """Print index and name of the classes that are like a word, the most similar first.
 
-        if "labels" in args and args.labels is not None:
-            names = read_labels(args.labels)
-        else:
-            model = getattr(args, "model", "reference")
-            allow_named({"model": model})
-            loaded = load_model(model)
-            if not loaded.named:
-                problem = (
-                    f"model {loaded.name} has {loaded.classes} classes without names"
-                )
-                raise InputError(f"{problem}; give a file with `labels`")
-            names = loaded.labels
-        similar_indices = (
-            range(len(names))
-            if args.word is None
-            else [index for index, _ in find_similar_labels(args.word, names)]
-        )
-        # labels that name nothing, such as a background, are shown only where asked for
-        is_nothing_requested = args.word is not None and is_nothing_name(args.word)
-        classes = {
-            index: names[index]
-            for index in similar_indices
-            if is_nothing_requested or not is_nothing_name(names[index])
-        }
+    Raises:
+        InputError: no class is like the word, or the model has no names for its classes.
+    """
+    with open_answer_progress():
+        names = _load_labels(args)
+        classes = _select_labels(names, args.word)
     if not classes:
         raise InputError(
             f"none of the {len(names)} labels is like {args.word!r}; "
@@ -501,3 +501,46 @@ def labels(args: argparse.Namespace) -> int:
     return output.print_answer(
         args.json, {"command": "labels", "word": args.word, "labels": entries}, text
     )
+
+
+def _load_labels(args: argparse.Namespace) -> Sequence[str]:
+    """Return the class names in the file of ``--labels``, or else those of the model.
+
+    Raises:
+        InputError: the model has no names for its classes.
+    """
+    # late, so that --help answers at once
+    from advsearch.models import load_model, read_labels
+
+    if "labels" in args and args.labels is not None:
+        return read_labels(args.labels)
+    model = getattr(args, "model", "reference")
+    allow_named({"model": model})
+    loaded = load_model(model)
+    if not loaded.named:
+        problem = f"model {loaded.name} has {loaded.classes} classes without names"
+        raise InputError(f"{problem}; give a file with `labels`")
+    return loaded.labels
+
+
+def _select_labels(names: Sequence[str], word: str | None) -> dict[int, str]:
+    """Return the class names that are like a word by their index, the best first.
+
+    Names of no thing, such as a background, are left out unless the word is one.
+
+    Args:
+        names: all class names.
+        word: what the names should be like; None for all.
+    """
+    # late, so that --help answers at once
+    from advsearch.models.labels import find_similar_labels, is_nothing_name
+
+    indices: Iterable[int] = range(len(names))
+    if word is not None:
+        indices = [index for index, _ in find_similar_labels(word, names)]
+    is_nothing_requested = word is not None and is_nothing_name(word)
+    return {
+        index: names[index]
+        for index in indices
+        if is_nothing_requested or not is_nothing_name(names[index])
+    }

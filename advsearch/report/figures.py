@@ -433,6 +433,9 @@ def _to_pixel_corners(
     return left, top, max(left, right), max(top, bottom)
 
 
+LABEL_MARGIN = 3  # pixels of background on each side of a text
+
+
 def _write_label(
     draw: ImageDraw.ImageDraw,
     shape: Shape,
@@ -458,29 +461,51 @@ def _write_label(
     """
     text = f"true: {shape.text}" if shape.true else shape.text
     left, top, right, bottom = map(round, draw.textbbox((0, 0), text, font=font))
-    # 3 pixels of background on each side
-    width = right - left + 6
-    height = bottom - top + 6
+    width = right - left + 2 * LABEL_MARGIN
+    height = bottom - top + 2 * LABEL_MARGIN
     x = max(0, min(corners[0], size[0] - width))
+    max_y = max(size[1] - height, 0)
     preferred_y = corners[3] if shape.true else corners[1] - height
     preferred_y = max(0, min(preferred_y, size[1] - height))
+    y = _find_free_height(x, preferred_y, max_y, (width, height), text_boxes)
+    background = TRUE_COLOR if shape.true else PREDICTED_COLOR
+    draw.rectangle((x, y, x + width, y + height), fill=background)
+    # A font may begin a little right of and below the position that it is drawn at.
+    position = (x + LABEL_MARGIN - left, y + LABEL_MARGIN - top)
+    draw.text(position, text, fill=(0, 0, 0), font=font)
+    return x, y, x + width, y + height
+
+
+def _find_free_height(
+    x: int,
+    preferred_y: int,
+    max_y: int,
+    size: tuple[int, int],
+    text_boxes: Sequence[tuple[int, int, int, int]],
+) -> int:
+    """Return the height nearest to a preferred one at which a text covers no other one.
+
+    If there is none, it is the preferred one.
+
+    Args:
+        x: left side of the text.
+        preferred_y: preferred upper side.
+        max_y: largest upper side.
+        size: (width, height) of the text.
+        text_boxes: (x0, y0, x1, y1) of the other texts.
+    """
+    width, height = size
 
     def is_free(y: int) -> bool:
         """Return whether the text would cover no other one at this height."""
+        # it lies to the right or left of each, or below or above it
         return all(
             x > x1 or x0 > x + width or y > y1 or y0 > y + height
             for x0, y0, x1, y1 in text_boxes
         )
 
-    candidates = range(max(size[1] - height, 0) + 1)
-    nearest_first = sorted(candidates, key=lambda y: (abs(y - preferred_y), y))
-    # Where no height is free, texts overlap.
-    y = next(filter(is_free, nearest_first), preferred_y)
-    background = TRUE_COLOR if shape.true else PREDICTED_COLOR
-    draw.rectangle((x, y, x + width, y + height), fill=background)
-    # a font may begin a little right of and below the place it is given
-    draw.text((x + 3 - left, y + 3 - top), text, fill=(0, 0, 0), font=font)
-    return x, y, x + width, y + height
+    nearest_first = sorted(range(max_y + 1), key=lambda y: (abs(y - preferred_y), y))
+    return next(filter(is_free, nearest_first), preferred_y)
 
 
 GAP = 8  # Pixels between tiles, and of a line of text

@@ -259,7 +259,8 @@ def _cut_piece(piece: Piece, width: float, height: float) -> Iterator[PlacedPart
     """
     left, top = piece.bleed
     n_rows, n_columns = piece.picture.shape[:2]
-    # the length is in pixels without bleed, the room is that beside the marks
+    # The first argument is a length in pixels without bleed. The second one is the page
+    # in pixels, without the frame of a part, which is its bleed and its marks.
     columns = _cut_evenly(
         n_columns - 2 * left, (width - 2 * piece.frame[0]) / piece.pixel[0]
     )
@@ -388,8 +389,8 @@ def _draw_part(axes: Axes, part: PlacedPart, convert: Any) -> None:
     picture = piece.picture[y0 - bleed_y : y1 + bleed_y, x0 - bleed_x : x1 + bleed_x]
     if convert is not None:
         picture = np.asarray(ImageCms.applyTransform(Image.fromarray(picture), convert))
-    # left and right, top and bottom edge in millimetres: trim is without bleed, outer
-    # with it
+    # Left and right, top and bottom edge in millimetres: `trim` of the part without its
+    # bleed, `outer` with it.
     trim_x = part.x, part.x + (x1 - x0) * pixel_width
     trim_y = part.y, part.y + (y1 - y0) * pixel_height
     outer_x = trim_x[0] - bleed_x * pixel_width, trim_x[1] + bleed_x * pixel_width

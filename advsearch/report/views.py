@@ -121,7 +121,8 @@ class ResultPart:
         live: name of what a script of the page fills; without the script the part is
             hidden.
         folded: whether a page shows it only when asked to.
-        only: `page`, `text` or `notebook`, where nobody else is shown it.
+        only: `page`, `text` or `notebook`, the only one that shows it; empty if all
+            three do.
     """
 
     title: str = ""
@@ -169,6 +170,10 @@ class ResultPart:
         return not (
             any(self.text) or self.rows or self.pictures or self.draw or self.live
         )
+
+    def is_visible_in(self, medium: str) -> bool:
+        """Return whether a `page`, `text` or `notebook` shows the part."""
+        return self.only in ("", medium) and not self.is_empty
 
 
 @dataclass(frozen=True)
@@ -266,15 +271,15 @@ def make_default_view(result: Result) -> ShownResult:
     tables = {name: value for name, value in values.items() if _is_table(value)}
     facts = _find_plain_facts(result, values, tables)
     # objects with fields, each with the names of those that are on the page
-    described: list[tuple[Fields, set[str]]] = [
+    objects_with_words: list[tuple[Fields, set[str]]] = [
         (result, {name for name, text in facts.items() if text})
     ]
     sections = []
     for name, rows in tables.items():
         table = _make_table(name, rows)
         sections.append(table)
-        described.append((rows[0], set(table.heads)))
-    sections.append(_explain_words(described))
+        objects_with_words.append((rows[0], set(table.heads)))
+    sections.append(_explain_words(objects_with_words))
     brief = result.brief or str(values.get("ending", "done"))
     statement = f"{brief[:1].upper()}{brief[1:]}."
     return ShownResult(statement, sections, facts)
@@ -293,13 +298,13 @@ def _find_plain_facts(
     """Return, as texts by name, those fields of a result that no table and no other
     part of the page shows.
     """
-    # facts are called as a page shows them, fields as Python does
+    # facts are named as a page shows them, fields as Python does
     fact_names = [name.replace(" ", "_") for name in result.facts()]
-    elsewhere = {*_FIELDS_ELSEWHERE, *tables, *fact_names}
+    excluded = {*_FIELDS_ELSEWHERE, *tables, *fact_names}
     return {
         _format_name(name): _format_value(value)
         for name, value in values.items()
-        if name not in elsewhere
+        if name not in excluded
     }
 
 
@@ -324,22 +329,23 @@ def _make_table(name: str, rows: Sequence[Fields]) -> ResultPart:
     )
 
 
-def _explain_words(described: Iterable[tuple[Fields, set[str]]]) -> ResultPart:
-    """Return a table that explains the names on the page by the descriptions of the
-    fields.
+def _explain_words(
+    objects_with_words: Iterable[tuple[Fields, set[str]]],
+) -> ResultPart:
+    """Return a table that explains the names on a page by the descriptions of fields.
+
+    Where two fields have one name, the first one's description is taken.
 
     Args:
-        described: objects with fields, each with the names of its fields that are on
-            the page. Where two fields have one name, the first one's description is
-            taken.
+        objects_with_words: objects with fields, each with the names of its fields that
+            are on the page.
     """
     meanings = dict[str, str]()
-    for fields, words in described:
+    for fields, words in objects_with_words:
         for name, about in type(fields).described().items():
-            if about.description and _format_name(name) in words:
-                meanings.setdefault(
-                    _format_name(name), about.description.replace("`", "")
-                )
+            word = _format_name(name)
+            if about.description and word in words:
+                meanings.setdefault(word, about.description.replace("`", ""))
     rows = [[word, meaning] for word, meaning in meanings.items()]
     return ResultPart("What these words mean", rows=rows, folded=True, only="page")
 
@@ -437,35 +443,26 @@ def make_case_claim(
             only tried again.
     """
     extent = make_rate_extent("fresh renders that count as a success", rate)
+    reason = REASON_OF_ENDING.get(ending, f"it ended as {ending!r}")
+    no_claim = make_no_claim(reason, f"This is about {name}.")
+    if rate is None:
+        return no_claim
+    rate_text = wording.format_rate(rate)
+    if ending == "found" and rate.successes:
+        statement = f"{name}: an adversarial scene holds in {rate_text}."
+        return claim("found", statement, extent)
+    found_nothing = ending in FAILED_SEARCH_ENDINGS
     is_only_tried_again = spent is None
-    has_failed = ending in FAILED_SEARCH_ENDINGS
-    if ending == "found" and rate is not None and rate.successes:
-        return claim(
-            "found",
-            f"{name}: an adversarial scene holds in {wording.format_rate(rate)}.",
-            extent,
-        )
-    if (
-        rate is not None
-        and is_only_tried_again
-        and (has_failed or ending == "not verified")
-    ):
-        return claim(
-            "measured",
-            f"{name}: the adversarial scene is not confirmed, in "
-            f"{wording.format_rate(rate)}.",
-            extent,
-        )
-    if rate is not None and has_failed:
+    if is_only_tried_again and (found_nothing or ending == "not verified"):
+        statement = f"{name}: the adversarial scene is not confirmed, in {rate_text}."
+        return claim("measured", statement, extent)
+    if found_nothing:
         text = (
             f"{name}: no failure was found; the best configuration counts in "
-            f"{wording.format_rate(rate)}."
+            f"{rate_text}."
         )
         return claim("not found", f"{text} Searched were {spent}. {NO_PROOF}", extent)
-    return make_no_claim(
-        REASON_OF_ENDING.get(ending, f"it ended as {ending!r}"),
-        f"This is about {name}.",
-    )
+    return no_claim
 
 
 def make_average_claim(case: AverageCase, name: str) -> Claim:
@@ -634,7 +631,7 @@ def make_notebook_html(
     sections = [
         _make_section_html(part)
         for part in view.sections
-        if part.only in ("", "notebook") and not part.is_empty
+        if part.is_visible_in("notebook")
     ]
     return make_element(
         "div", make_element("p", view.statement), *figures, chart, *sections
@@ -643,9 +640,9 @@ def make_notebook_html(
 
 def _make_section_html(part: ResultPart) -> Html:
     """Return the texts and the table of a part of a result as HTML."""
-    children = [
-        make_element("p", text) for text in part.text if text and part.draw is None
-    ]
+    # the texts of a chart say what is on it, and the chart itself is not here
+    texts = part.text if part.draw is None else ()
+    children = [make_element("p", text) for text in texts if text]
     if part.rows:
         heads = make_element("tr", *(make_element("th", cell) for cell in part.heads))
         head = make_element("thead", heads) if part.heads else None

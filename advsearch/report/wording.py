@@ -35,6 +35,9 @@ SIMILARITY = "similarity"
 COMMAND = "command"
 """Tasks whose predictions have words of their own; others are quoted."""
 
+PLAIN_UNITS = ("", "1")
+"""Units that are not written after a value: of what has no unit, and of a plain number."""
+
 _MARGINS = {
     CLASSIFICATION: "how far the right prediction leads the wrong one, in logits",
     DETECTION: "how far the best right box is over the score that counts, in log-odds; "
@@ -119,16 +122,16 @@ def format_percent_number(fraction: float, max_decimals: int = MAX_DECIMALS) -> 
     """Return ``83`` for 0.83, ``4.6`` for 0.0459, ``0.02`` for 0.000211 and ``99.98``
     for 0.99979.
 
-    Within five percent of 0 or 100 there is at least one decimal, and nearer to them so
-    many that the first digit of the distance shows, up to `max_decimals`. What would
-    still be rounded to 0 or 100 becomes ``under 0.01`` or ``over 99.99``.
+    Within five percent of 0 or 100 there is at least one decimal. Nearer to them there
+    are so many that the distance from 0 or 100 has a digit that is not 0, up to
+    `max_decimals`. What would still be rounded to 0 or 100 becomes ``under 0.01`` or
+    ``over 99.99``.
     """
     # in percent, as all below
     value = 100.0 * fraction
-    distance = min(value, 100.0 - value)
+    distance = min(value, 100.0 - value)  # from 0 or 100
     if distance >= 5.0 or distance <= 0.0:
         return f"{value:.0f}"
-    # up to the first digit of the distance that is not 0
     decimals = min(max(1, -math.floor(math.log10(distance))), max_decimals)
     text = f"{value:.{decimals}f}".rstrip("0").rstrip(".")
     if text not in ("0", "100"):
@@ -514,10 +517,12 @@ def format_rate(rated: VerifiedRate) -> str:
 
 
 def format_rate_cells(rated: VerifiedRate | ControlGroup) -> list[str]:
-    """Return a rate and its interval, for a table: ``["20/20", "83-100 %"]``; of
-    outputs that are not numbers, how many.
+    """Return a rate and its interval, as cells of a table: ``["20/20", "83-100 %"]``.
+
+    Outputs that are not numbers are counted after the rate. The trials of an
+    adversarial scene count successes, those of the clean scene right predictions.
     """
-    # of adversarial trials the successes count, of clean ones the right predictions
+    # a `VerifiedRate` has successes, a `ControlGroup` right predictions
     count = rated.successes if hasattr(rated, "successes") else rated.correct
     nan_text = f", {rated.not_a_number} not a number" if rated.not_a_number else ""
     return [f"{count}/{rated.trials}{nan_text}", format_interval(rated.interval)]

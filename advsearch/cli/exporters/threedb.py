@@ -29,58 +29,74 @@ PLACED = ("environment", "object")  # values that have a place of their own in a
 
 
 def write_threedb(
-    rows: Callable[[], Iterable[Any]], out: Path, picture: Callable[[int], bytes | None]
+    iterate_rows: Callable[[], Iterable[Any]],
+    out: Path,
+    read_picture: Callable[[int], bytes | None],
 ) -> int:
-    """Write the rows of a sweep as a folder of 3DB, with the PNG of each where one was
-    kept, and return how many there were.
+    """Write the rows of a sweep as a folder of 3DB, and return how many there were.
 
     Args:
-        rows: returns the rows; it is called twice, since all names have to be known
-            first.
+        iterate_rows: returns the rows. It is called twice: every line has the names of
+            all parameters, which are known after all rows.
         out: the folder, which is made, or empty.
-        picture: returns the PNG of a row by its step, None if none was kept.
+        read_picture: returns the PNG of a row by its step; None if it has none.
 
     Raises:
         InputError: there are no rows, or the folder is not empty.
     """
     writing.check_free_folder(out, "out")
-    # parameters, in the order in which rows have them; a dict is an ordered set
+    # the parameters in the order in which rows have them; a dict is an ordered set
     names = dict[str, None]()
-    # index of each predicted class by its label; None where the model has no index
-    classes = dict[str, int | None]()
-    for row in rows():
+    # index of each predicted label; None where the model has no index for it
+    index_of_label = dict[str, int | None]()
+    for row in iterate_rows():
         names |= dict.fromkeys(name for name in row.values if name not in PLACED)
-        classes.setdefault(row.label or Store.NOT_A_NUMBER, row.label_index)
-    if not classes:
+        index_of_label.setdefault(_get_label(row), row.label_index)
+    if not index_of_label:
         raise InputError("format 3db: needs the rows of a sweep, and this run has none")
-    class_index = {name: index for name, index in classes.items() if index is not None}
-    for name in classes:  # those without an index come behind the others
-        if name not in class_index:
-            class_index[name] = max(class_index.values(), default=-1) + 1
-    class_by_index = {index: name for name, index in class_index.items()}
+    class_index = _complete_indices(index_of_label)
+    n_rows = 0
     with writing.name_setting_in_errors("out"):
-        n_rows = 0
         with (
             writing.replace_file(out / DETAILS) as part,
             part.open("w", encoding="utf-8") as file,
         ):
-            for row in rows():
-                prediction = class_index[row.label or Store.NOT_A_NUMBER]
-                line = make_line(row, names, prediction)
+            for row in iterate_rows():
+                line = make_line(row, names, class_index[_get_label(row)])
                 file.write(json.dumps(line, allow_nan=False) + "\n")
-                data = picture(row.step)
-                if data is not None:
-                    writing.write_bytes(
-                        out / IMAGES / f"{line['id']}_rgb.png", data, durable=False
-                    )
+                png = read_picture(row.step)
+                if png is not None:
+                    image_path = out / IMAGES / f"{line['id']}_rgb.png"
+                    writing.write_bytes(image_path, png, durable=False)
                 n_rows += 1
-        # a list by index, in which gaps get a name
-        class_names = [
-            class_by_index.get(index, f"class {index}")
-            for index in range(max(class_by_index) + 1)
-        ]
+        class_names = _list_class_names(class_index)
         writing.write_text(out / CLASSES, json.dumps(class_names))
     return n_rows
+
+
+def _get_label(row: Any) -> str:
+    """Return the predicted label of a row, also of an output that is not a number."""
+    return row.label or Store.NOT_A_NUMBER
+
+
+def _complete_indices(index_of_label: Mapping[str, int | None]) -> dict[str, int]:
+    """Return the index of each label; those without one come behind all others."""
+    class_index = {
+        label: index for label, index in index_of_label.items() if index is not None
+    }
+    for label in index_of_label:
+        if label not in class_index:
+            class_index[label] = max(class_index.values(), default=-1) + 1
+    return class_index
+
+
+def _list_class_names(class_index: Mapping[str, int]) -> list[str]:
+    """Return the class names by index; an index that no label has gets a name too."""
+    label_of_index = {index: label for label, index in class_index.items()}
+    return [
+        label_of_index.get(index, f"class {index}")
+        for index in range(max(label_of_index) + 1)
+    ]
 
 
 def make_line(row: Any, names: Iterable[str], prediction: int) -> dict[str, Any]:
@@ -100,13 +116,12 @@ def make_line(row: Any, names: Iterable[str], prediction: int) -> dict[str, Any]
         "network" if name == "model" else name: value_of.get(name, "none")
         for name in names
     }
-    environment, model = (str(value_of.get(name, "none")) for name in PLACED)
     return {
         "id": f"{row.step}",
-        "environment": environment,
-        "model": model,
+        "environment": str(value_of.get("environment", "none")),
+        "model": str(value_of.get("object", "none")),
         "is_correct": str(bool(row.correct)),
-        # 0.0 minus the margin, since -0.0 would be written as such
+        # 0.0 minus the margin: the negative of 0.0 would be written as -0.0
         "loss": None if row.margin is None else 0.0 - row.margin,
         "prediction": [prediction],
         "output_type": "classes",

@@ -9,7 +9,7 @@ from functools import lru_cache
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.attacks import Ending, verify
+from advsearch.attacks import Ending, Verification, verify
 from advsearch.engine.journal import ParallelEvaluator, ProblemKey
 from advsearch.engine.problem import Problem
 from advsearch.engine.verifier import Verifier
@@ -24,10 +24,11 @@ does not: they end at a factor of 1.19.
 def find_ambient(verifier: Verifier, u: Tensor) -> None:
     """Find the ambient light in which a verified configuration no longer holds.
 
-    It is tried in twice the ambient light of the scene, and twice that, and so on.
-    Nothing else changes: exposure follows the ambient light, so that the projector is
-    the darker one. All points have the same seeds, which nothing else has. The results
-    are in `verifier.state.ambient_verifications`, by lux.
+    It is tried in twice the ambient light of the scene, and twice that, and so on, up
+    to the first in which it fails; then between the last two. Nothing else changes: as
+    exposure follows the ambient light, the projector's light gets darker in the image.
+    All points have the same seeds, which nothing else has. The results are in
+    `verifier.state.ambient_verifications`, by lux.
 
     Args:
         verifier: verifier of the attack.
@@ -42,31 +43,7 @@ def find_ambient(verifier: Verifier, u: Tensor) -> None:
 
     def holds(lux: float) -> bool:
         """Verify the configuration in an ambient light, and store the result."""
-        title = f"trying it in ambient light of {lux:.3g} lux"
-        n_renders = (
-            2 * verifier.n_trials
-        )  # of the clean scene, and of the configuration
-        verifier.begin_stage(title, n_renders, name="ambient", at_most=True)
-        factor = lux / scene_lux
-        # The factor is the key by which workers find the problem in that light.
-        evaluator = ParallelEvaluator(
-            with_ambient_light(problem, factor),
-            verifier.journal.evaluator.executor,
-            factor,
-        )
-        journal = replace(verifier.journal, evaluator=evaluator)
-        verification = verify(
-            replace(verifier, journal=journal).evaluate_all,
-            problem.domain,
-            u,
-            claim=Ending.FOUND,
-            spp=findings.spp,
-            seed=seeds.stream(problem.seed, "ambient"),
-            trials=verifier.looks,
-            rule=problem.rule,
-            kind=f"ambient {lux:.6g} lux",
-            control_kind=f"control {lux:.6g} lux",
-        )
+        verification = _verify_in_light(verifier, u, lux, lux / scene_lux)
         findings.ambient_verifications[lux] = verification
         return verification.ending is Ending.FOUND
 
@@ -75,8 +52,8 @@ def find_ambient(verifier: Verifier, u: Tensor) -> None:
     while failing_lux <= MAX_LUX and holds(failing_lux):
         holding_lux = failing_lux
         failing_lux = 2.0 * failing_lux
-    was_tried = failing_lux in findings.ambient_verifications
-    if not was_tried:  # beyond `MAX_LUX`: it holds in direct sun
+    holds_in_direct_sun = failing_lux not in findings.ambient_verifications
+    if holds_in_direct_sun:  # the next light is beyond `MAX_LUX`, and was not tried
         return
     for _ in range(N_BISECTIONS):
         # halfway on a logarithmic scale
@@ -87,6 +64,42 @@ def find_ambient(verifier: Verifier, u: Tensor) -> None:
             failing_lux = middle_lux
 
 
+def _verify_in_light(
+    verifier: Verifier, u: Tensor, lux: float, factor: float
+) -> Verification:
+    """Verify a configuration in another ambient light.
+
+    Args:
+        verifier: verifier of the attack.
+        u: (d,) the configuration.
+        lux: the ambient light.
+        factor: the ambient light as a multiple of the scene's.
+    """
+    problem = verifier.problem
+    n_renders = 2 * verifier.n_trials  # of the clean scene, and of the configuration
+    title = f"trying it in ambient light of {lux:.3g} lux"
+    verifier.begin_stage(title, n_renders, name="ambient", at_most=True)
+    # The factor is the key by which workers find the problem in that light.
+    evaluator = ParallelEvaluator(
+        with_ambient_light(problem, factor),
+        verifier.journal.evaluator.executor,
+        factor,
+    )
+    journal = replace(verifier.journal, evaluator=evaluator)
+    return verify(
+        replace(verifier, journal=journal).evaluate_all,
+        problem.domain,
+        u,
+        claim=Ending.FOUND,
+        spp=verifier.state.spp,
+        seed=seeds.stream(problem.seed, "ambient"),
+        trials=verifier.looks,
+        rule=problem.rule,
+        kind=f"ambient {lux:.6g} lux",
+        control_kind=f"control {lux:.6g} lux",
+    )
+
+
 def _find_scene_lux(problem: Problem) -> float | None:
     """Return the ambient light in lux that a searched control competes with.
 
@@ -94,7 +107,7 @@ def _find_scene_lux(problem: Problem) -> float | None:
     """
     for control in problem.searched_space.controls:
         if control.competes_with_ambient:
-            return control.ambient
+            return control.ambient  # None if the control searches it
     return None
 
 

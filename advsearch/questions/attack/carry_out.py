@@ -158,7 +158,9 @@ def load_parts(
 
 
 def load_parts_of_run(run: Path) -> AttackParts:
-    """Load what the run of an attack used, as its result is evaluated.
+    """Load what is needed to evaluate the result of an attack's run.
+
+    Parts that only the search used are not needed.
 
     Raises:
         InputError: some of that exists only in the Python session of the run.
@@ -194,48 +196,49 @@ def move_to_photographs(
         FileFormatError: the folder cannot be used.
         InputError: the scene cannot be rendered into it.
     """
-    config = _put_config_into_folder(parts.config, folder)
+    config = _set_photograph_folder(parts.config, folder)
     scene = naming.load_configured_scene(config)
     photographs = scene.description.photographs
     if photographs is None:
         raise InputError(
             f"{parts.config.object}: only the Python session that asked has the scene"
         )
-    used = list_used_photographs(parts.scene.description)
+    used_photographs = list_used_photographs(parts.scene.description)
     random_controls = tuple(
         control
         for control in parts.random_controls
         if not control.photograph_refusal and control.kind != "backdrop"
     )
-    others: dict[str, AttackParts] = {}
-    used_parts: dict[str, AttackParts] = {}
+    parts_in_unused: dict[str, AttackParts] = {}
+    parts_in_used: dict[str, AttackParts] = {}
     for name, description in photographs.scenes.items():
-        is_used = bool(used & list_used_photographs(description))
-        moved = used_parts if is_used else others
-        moved[name] = replace(
+        is_used = bool(used_photographs & list_used_photographs(description))
+        parts_by_name = parts_in_used if is_used else parts_in_unused
+        parts_by_name[name] = replace(
             parts,
             config=config,
             scene=replace(scene, description=description),
             random_controls=random_controls,
             clean_matrix=CleanMatrix(),
         )
-    return others, used_parts
+    return parts_in_unused, parts_in_used
 
 
-def _put_config_into_folder(config: AttackConfig, folder: str) -> AttackConfig:
-    """Return settings whose scene is rendered into the photographs of a folder.
+def _set_photograph_folder(config: AttackConfig, folder: str) -> AttackConfig:
+    """Return settings with which the scene is rendered into the photographs of a folder.
 
-    What the camera files state is left out of the settings.
+    Settings that the camera files beside the photographs replace are left out.
 
     Raises:
         FileFormatError: the folder cannot be used.
-        InputError: it is none.
+        InputError: it is no such folder.
     """
     if not is_photograph_folder(folder):
         raise InputError(
             f"backdrop: expected a folder of photographs with their camera files, got "
             f"{folder}"
         )
+    # all photographs of a folder have the same kinds of camera files
     view = next(iter(read_photograph_folder(folder).values()))
     other_settings = {
         name: value
@@ -330,8 +333,10 @@ def check_from_config(config: AttackConfig) -> None:
             give a result that cannot be evaluated.
     """
     parts = load_parts(config)
-    _bind_task(parts, shows=False)
-    size = config.resolution or parts.model_and_warnings[0].input_size
+    model, _ = parts.model_and_warnings
+    # Both raise errors for what does not fit.
+    _bind_task(parts, renders_clean_image=False)
+    size = config.resolution or model.input_size
     make_space(
         (*parts.controls, *parts.random_controls),
         fit_camera(parts.scene.description, size),
@@ -365,13 +370,13 @@ def make_problem_with_warnings(
     """
     config = parts.config.model_copy(update=changes)
     model, warnings = parts.model_and_warnings
+    warnings = [*warnings]  # a copy: `make_problem` adds to it
     if "model" in changes:
-        loaded = load_ensemble(config.model, config, parts.task)
-    else:
-        loaded = (model, [*warnings])
-    problem = make_problem(replace(parts, config=config, model_and_warnings=loaded))
+        model, warnings = load_ensemble(config.model, config, parts.task)
+    changed_parts = replace(parts, config=config, model_and_warnings=(model, warnings))
+    problem = make_problem(changed_parts)
     return problem, [
-        *loaded[1],
+        *warnings,
         *describe_adjusted_defaults(problem.space.adjusted_defaults),
     ]
 
@@ -448,26 +453,27 @@ def make_problem(parts: AttackParts, *, differentiated: bool = True) -> Problem:
 def _check_printable(
     parts: AttackParts, config: AttackConfig, description: Any
 ) -> None:
-    """Raise an error if colors are to be printed and nothing can be."""
-    if config.printable:
-        # without the photographs, among which only another control chooses
-        scene = replace(description, photographs=None)
-        searched_space = make_space(parts.controls, scene)
-        # raises where nothing can be printed
-        judging.measure_print_terms(searched_space, searched_space.start)
+    """Raise an error if colors are to be printed and no searched control prints any."""
+    if not config.printable:
+        return
+    # Without the photographs: the control that chooses among them varies by chance, and
+    # is not searched.
+    scene = replace(description, photographs=None)
+    searched_space = make_space(parts.controls, scene)
+    # only a check: raises where nothing can be printed
+    judging.measure_print_terms(searched_space, searched_space.start)
 
 
 def _check_objective_inputs(parts: AttackParts, problem: Problem) -> None:
-    """Raise an error if the objective requests what the problem does not have."""
+    """Raise an error if the objective requests an input that the problem lacks."""
     for name in list_requested_inputs(parts.objective):
-        # raises where the objective needs what there is not
-        problem.make_objective_inputs(problem.add_conditions(problem.domain.start))(
-            name
-        )
+        start = problem.add_conditions(problem.domain.start)
+        get_input = problem.make_objective_inputs(start)
+        get_input(name)  # only a check: raises where there is no such input
 
 
 def _bind_task(
-    parts: AttackParts, *, shows: bool = True
+    parts: AttackParts, *, renders_clean_image: bool = True
 ) -> tuple[Task, Callable[[DescribeConfiguration, RenderSurfaces], Facts]]:
     """Bind the task of an attack to its model.
 
@@ -476,7 +482,8 @@ def _bind_task(
 
     Args:
         parts: the parts of the attack.
-        shows: whether a clean image is rendered for a task that needs one.
+        renders_clean_image: whether tasks are calibrated, for which a clean image may be
+            rendered.
 
     Returns:
         The task, and the function that gives it the ground truth of a configuration.
@@ -507,11 +514,11 @@ def _bind_task(
         member_facts = scene_facts
         if ensemble is not None:
             member_facts = ensemble.select_facts(member, scene_facts)
-        member = _prepare_task(
-            parts, member, network, member_facts, is_calibrated=shows
+        prepared = _prepare_task(
+            parts, member, network, member_facts, is_calibrated=renders_clean_image
         )
-        member_tasks.append(member)
-        warnings += [remark for remark in member.remarks if remark not in warnings]
+        member_tasks.append(prepared)
+        warnings += [remark for remark in prepared.remarks if remark not in warnings]
     if ensemble is None:
         task = member_tasks[0]
     else:
@@ -522,22 +529,26 @@ def _bind_task(
 
 
 def choose_search_size(config: AttackConfig, problem: Problem) -> tuple[int, int]:
-    """Return the steps of a search, and the conditions that each evaluates.
+    """Return the steps of a search, and how many conditions each evaluates.
 
-    The settings decide. Defaults over conditions depend on how many numbers vary by
-    chance, and whether their images can be predicted.
+    The settings decide. Where they do not, the defaults over conditions depend on how
+    many numbers vary by chance, and on whether the images can be predicted.
     """
     if problem.conditions is None:
         return config.steps or STEPS, 1
-    default_size = SIZE_OVER_PREDICTED
+    default_steps, default_draws = SIZE_OVER_PREDICTED
     if problem.conditions.dim == 1:
-        default_size = SIZE_OVER_SINGLE_PARAMETER
-    steps_if_predicted = config.steps or default_size[0]
-    refusal = find_matrix_refusal(problem, steps_if_predicted, config.specialise)
-    if refusal is not None:  # conditions are rendered
-        is_box = all(block.norm == "box" for block in problem.domain.blocks)
-        default_size = SIZE_OVER_NUMBERS if is_box else SIZE_OVER_RENDERED
-    default_steps, default_draws = default_size
+        default_steps, default_draws = SIZE_OVER_SINGLE_PARAMETER
+    # whether images can be predicted depends on the number of steps
+    refusal = find_matrix_refusal(
+        problem, config.steps or default_steps, config.specialise
+    )
+    are_images_rendered = refusal is not None
+    if are_images_rendered:
+        has_only_ranges = all(block.norm == "box" for block in problem.domain.blocks)
+        default_steps, default_draws = (
+            SIZE_OVER_NUMBERS if has_only_ranges else SIZE_OVER_RENDERED
+        )
     return config.steps or default_steps, config.draws or default_draws
 
 
@@ -616,7 +627,8 @@ def open_executor(
         progress: reports what the workers do.
 
     Raises:
-        InputError: the model is behind an address, which one process asks.
+        InputError: the model is behind an address; a single process asks it, which
+            counts the calls.
     """
     in_process = {"workers": None, "cluster": None}
     worker_settings = config.make_repeatable().model_copy(update=in_process).to_json()
@@ -624,8 +636,9 @@ def open_executor(
     workers = getattr(config, "workers", None)
     cluster = getattr(config, "cluster", None)
     if (workers or cluster) and has_address(config.model):
+        setting = "workers" if workers else "cluster"
         raise InputError(
-            f"{'workers' if workers else 'cluster'}: a model behind an address is "
+            f"{setting}: a model behind an address is "
             "asked by one process, which counts "
             "its calls; leave it out"
         )

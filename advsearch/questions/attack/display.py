@@ -73,7 +73,7 @@ def _matrix_claims(result: MatrixResult) -> Iterator[Claim]:
     """Yield what each scene of a matrix does to each model."""
     for row in result.table:
         for cell in row.tested:
-            searches = None
+            searches = None  # on another model the scene was only tried
             if cell.model == row.attacked:
                 searches = views.format_searches(row.renders, result.policy, False)
             name = f"searched on {row.attacked}, tried on {cell.model}"
@@ -104,7 +104,8 @@ def _view_attack(summary: AttackSummary) -> ShownResult:
         "failures": failures_text(summary.failures) if summary.failures else "",
         "search": f"{summary.policy}, {steps}: {summary.ending}",
         "renders": wording.renders_text(summary),
-        "environment": "",  # the page has it, and the seed
+        # empty facts are left out; a page adds these two, and a text lacks them
+        "environment": "",
         "seed": "",
     }
     return ShownResult(
@@ -189,7 +190,7 @@ def make_ambient_parts(summary: AttackSummary) -> list[ResultPart]:
 def failures_text(failures: DifferentFailures) -> str:
     """Return where different failures were found, and how many hold."""
     where = f"{failures.found} of {words.format_count(failures.seen, 'draw')}"
-    if failures.places is not None:
+    if failures.places is not None:  # the space was divided into cells
         where = (
             f"{failures.found} of {failures.places} cells over "
             f"{' and '.join(failures.over)} ({failures.seen} were seen)"
@@ -212,7 +213,7 @@ def failures_text(failures: DifferentFailures) -> str:
 
 
 def make_failures_part(known: DifferentFailures, *, tried: bool = False) -> ResultPart:
-    """Return the table of different failures; with `tried` only of those in trials."""
+    """Return the table of different failures; with `tried` only those with trials."""
     columns: Mapping[str, Column] = {
         "failures": range_text,
         "most often predicted": most_frequent_label,
@@ -226,11 +227,13 @@ def make_failures_part(known: DifferentFailures, *, tried: bool = False) -> Resu
 
 
 def _holds_text(failure: DifferentFailure) -> str:
+    """Return whether a failure holds, and in how many fresh renders."""
     rate = failure.verified
     if rate is None:
         return "not tried"
     renders = words.format_count(rate.trials, "render")
-    return f"{'yes' if failure.holds else 'no'}, {rate.successes} of {renders}"
+    answer = "yes" if failure.holds else "no"
+    return f"{answer}, {rate.successes} of {renders}"
 
 
 def range_text(failure: DifferentFailure) -> str:
@@ -244,7 +247,8 @@ def range_text(failure: DifferentFailure) -> str:
             texts.append(f"{name} {bounds}")
             continue
         value = failure.configuration.get(name)
-        unit = "" if value is None or value.unit in ("", "1") else f" {value.unit}"
+        has_unit = value is not None and value.unit not in words.PLAIN_UNITS
+        unit = f" {value.unit}" if value and has_unit else ""
         low, high = map(words.format_number, bounds)
         texts.append(f"{name} {low} to {high}{unit}")
     return ", ".join(texts) or "anywhere"
@@ -264,8 +268,12 @@ CURVE_NOTE = (
 
 
 def _view_curve(result: CurveResult) -> ShownResult:
-    """Return the view of robust accuracy against epsilon."""
+    """Return the view of robust accuracy against epsilon.
+
+    A page has a chart if there are several epsilons; of a single one a notebook has it.
+    """
     known = [point for point in result.curve if point.accuracy is not None]
+    # without the controls' own epsilons, which have no place on an axis
     points = [point for point in known if point.epsilon is not None]
     has_chart = len(points) > 1
     points_text = "; ".join(
@@ -349,6 +357,7 @@ def _curve_text(result: CurveResult, known: Sequence[CurvePoint]) -> str:
     """
 
     def at(epsilon: float | None) -> str:
+        """Return the end of a clause; empty for the controls' own epsilons."""
         return "" if epsilon is None else f" at epsilon {epsilon:g}"
 
     if not known or not result.table:
@@ -446,6 +455,14 @@ def _view_matrix(result: MatrixResult) -> ShownResult:
     return ShownResult(_matrix_text(result), sections, facts)
 
 
+def _clean_rate_cells(result: MatrixResult) -> list[str]:
+    """Return how often each model of a matrix is right about the clean scene."""
+    return [
+        f"right {', '.join(words.format_rate_cells(tested.clean))}"
+        for tested in result.tested
+    ]
+
+
 def _matrix_part(result: MatrixResult) -> ResultPart:
     """Return the table of a matrix, with a row for the clean scene.
 
@@ -456,13 +473,9 @@ def _matrix_part(result: MatrixResult) -> ResultPart:
         f"tested on {words.shorten_name(tested.model)}" for tested in result.tested
     ]
     rows = list[list[str]]()
-    runs = list[str | None]()
+    runs = list[str | None]()  # run of each row
     if result.tested:
-        clean_rates = [
-            f"right {', '.join(words.format_rate_cells(tested.clean))}"
-            for tested in result.tested
-        ]
-        rows.append(["clean scene", "", *clean_rates])
+        rows.append(["clean scene", "", *_clean_rate_cells(result)])
         runs.append(None)
     rate_of_cell = dict[tuple[int, int], float]()
     for row in result.table:

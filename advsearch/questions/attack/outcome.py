@@ -67,7 +67,9 @@ from advsearch.runs.results import (
     MovedValue,
     PrintTerms,
     SharedWork,
+    TwinEvidence,
     VariedValue,
+    VerifiedRate,
 )
 from advsearch.runs.summary import write_configuration
 from advsearch.runs.twins import find_twin_evidence
@@ -119,7 +121,7 @@ def make_result(
     u = problem.domain.start  # without a search, both scenes are the clean one
     if search is not None:
         u = problem.domain.project(search.best_u)
-    # After Ctrl-C no more images are rendered than needed.
+    # After Ctrl-C no images are rendered but those of the two scenes.
     trial = None if findings.interrupted else choose_stored_trial(findings)
     clean = StoredImage.render(problem, findings, problem.domain.start, trial)
     adversarial = StoredImage.render(problem, findings, u, trial)
@@ -142,23 +144,16 @@ def make_result(
         policy=policy,
         objective=name_objective(problem.task, objective),
         drive=drive,
-        printability=_printability(problem, findings) if printable else None,
-        warnings=[*warnings, *_remarks(findings, problem, journal)],
+        printability=_summarize_printability(problem, findings) if printable else None,
+        warnings=[*warnings, *_make_remarks(findings, problem, journal)],
         seconds={**stages.seconds, "total": stages.total},
         command_line=command_line,
         python_only=python_only,
-        twins=find_twin_evidence(
-            twins,
-            model=problem.model.name,
-            task=problem.task.title,
-            object_name=object_name,
-            environment=problem.environment,
-            in_photograph=is_in_photograph(problem),
-        ),
+        twins=_find_twins(twins, problem, object_name),
     )
     if run is not None:
         write_result(run, summary)
-        if not findings.interrupted:
+        if not findings.interrupted:  # else the run may be continued, and needs them
             run.store.delete_cached()
     return AttackResult(
         summary,
@@ -169,6 +164,26 @@ def make_result(
         artifacts,
         search,
         in_memory=tuple(journal.rows),
+    )
+
+
+def _find_twins(
+    twins: str | None, problem: Problem, object_name: str
+) -> TwinEvidence | None:
+    """Return how far the verdict holds for photographs, by a run of twins, if any.
+
+    Args:
+        twins: the run, which compared renderings with photographs of the same scene.
+        problem: problem of the attack.
+        object_name: name of the object under attack.
+    """
+    return find_twin_evidence(
+        twins,
+        model=problem.model.name,
+        task=problem.task.title,
+        object_name=object_name,
+        environment=problem.environment,
+        in_photograph=is_in_photograph(problem),
     )
 
 
@@ -199,9 +214,8 @@ def _write_files(
     save_images(run, problem, findings, images)
     for number, verification in enumerate(findings.failure_verifications):
         trial = (f"failure {number}", 0)
-        save_trial(
-            run, problem, findings, trial, _failure_image(number), verification.u
-        )
+        name = _name_failure_image(number)
+        save_trial(run, problem, findings, trial, name, verification.u)
     # an 8-bit PNG, and the same display-referred values in float32
     for name, image in artifacts.items():
         run.save_image(name, image, folder="artifacts")
@@ -230,81 +244,118 @@ def _summarize(
     """
     problem = journal.problem
     task = problem.task
-    search = findings.search
-    verification = findings.verification
-    controls = problem.searched_space.controls
-    # The space has the searched controls first, then those that conditions vary.
-    random_controls = problem.space.controls[len(controls) :]
     max_depth = problem.renderer.scene.max_depth
     return AttackSummary(
         **fields,
+        **_summarize_controls(problem),
+        **_summarize_verification(problem, findings),
+        **_summarize_search(problem, findings.search),
         model=problem.model.name,
         task=task.title,
         environment=problem.environment,
-        controls=[control.name for control in controls],
-        epsilon=_unwrap_single(
-            {control.name: control.budget.epsilon for control in controls}
-        ),
-        norm=_unwrap_single(
-            {control.name: control.budget.norm for control in controls}
-        ),
         label_set=list(task.truth_names(problem.find_truth())),
         goal=task.goal,
         target=list(task.target_names) or None,
-        over=[control.name for control in random_controls],
-        conditions=_conditions(problem),
         image_formation=Formation.of(problem.renderer.formation),
         gradient_plan=problem.summarize_plan(problem.plan),
         light_path_segments=PathSegments(
             search=problem.search_depth or max_depth, verification=max_depth
         ),
-        ending=_ending(problem, findings).value,
-        clean=_clean_prediction(problem, findings, clean),
+        ending=_find_ending(problem, findings).value,
+        clean=_make_clean_prediction(problem, findings, clean),
         adversarial=None
-        if search is None
-        else _prediction(adversarial.judgement, adversarial.trial),
-        verified=verification and make_verified_rate(verification),
-        tried_objective=TriedObjective(
-            clean=_objective_over(findings.clean_trials),
-            answer=_objective_over(
-                verification.adversarial_trials if verification else ()
-            ),
-        ),
-        baseline=_baseline(problem, findings),
-        # The random search may have found a worse configuration than the policy, whose
-        # verification is then `outdone_verification`.
-        answer_from="random" if findings.outdone_verification is not None else None,
-        policy_verified=findings.outdone_verification
-        and make_verified_rate(findings.outdone_verification),
-        ambient=_ambient_light(findings),
-        average=_average_case(findings),
-        smallest=_smallest_epsilon(problem, findings),
-        distribution=None if search is None else _distribution(problem, search),
+        if findings.search is None
+        else _make_prediction(adversarial.judgement, adversarial.trial),
+        ambient=_summarize_ambient(findings),
+        average=_summarize_average(findings),
+        smallest=_summarize_bracket(problem, findings),
         failures=describe_failures(problem, findings),
-        sample_count=findings.sample_count
-        and VerificationSamples.of(findings.sample_count),
         transport=findings.transport_summary,
-        claimed=None if search is None else _claim(search),
-        gradients=None if search is None else _gradients(search),
-        configuration=None if search is None else _found_values(problem, search.best_u),
         shared=SharedWork.of_facts(journal.evaluator.worker_stats, journal.machines),
-        renders=_renders(findings, problem),
-        steps=0 if search is None else len(search.history),
-        non_finite=NotFinite(
-            objectives=0 if search is None else search.non_finite_objectives,
-            gradient_elements=0 if search is None else search.non_finite_elements,
-        ),
+        renders=_count_renders(findings, problem),
         seed=problem.seed,
     )
 
 
+def _summarize_controls(problem: Problem) -> dict[str, Any]:
+    """Return the fields of a summary about what is searched and what varies by chance."""
+    controls = problem.searched_space.controls
+    # The space has the searched controls first, then those that conditions vary.
+    random_controls = problem.space.controls[len(controls) :]
+    return {
+        "controls": [control.name for control in controls],
+        "epsilon": _unwrap_single(
+            {control.name: control.budget.epsilon for control in controls}
+        ),
+        "norm": _unwrap_single(
+            {control.name: control.budget.norm for control in controls}
+        ),
+        "over": [control.name for control in random_controls],
+        "conditions": _describe_conditions(problem),
+    }
+
+
+def _summarize_verification(problem: Problem, findings: RunState) -> dict[str, Any]:
+    """Return the fields of a summary about the trials of the configurations."""
+    verification = findings.verification
+    adversarial_trials = verification.adversarial_trials if verification else ()
+    samples = findings.sample_count
+    # If the random search found a worse configuration than the policy, `verification`
+    # is that of its configuration, and this one is the policy's.
+    outdone = findings.outdone_verification
+    return {
+        "verified": _make_rate(verification),
+        "tried_objective": TriedObjective(
+            clean=_compute_objective_values(findings.clean_trials),
+            answer=_compute_objective_values(adversarial_trials),
+        ),
+        "baseline": _summarize_baseline(problem, findings),
+        "answer_from": None if outdone is None else "random",
+        "policy_verified": _make_rate(outdone),
+        "sample_count": samples and VerificationSamples.of(samples),
+    }
+
+
+def _make_rate(verification: Verification | None) -> VerifiedRate | None:
+    """Return the rate of a verification; None without one."""
+    return None if verification is None else make_verified_rate(verification)
+
+
+def _summarize_search(problem: Problem, search: SearchResult | None) -> dict[str, Any]:
+    """Return the fields of a summary about the search; empty ones without a search."""
+    if search is None:
+        return {
+            "distribution": None,
+            "claimed": None,
+            "gradients": None,
+            "configuration": None,
+            "steps": 0,
+            "non_finite": NotFinite(objectives=0, gradient_elements=0),
+        }
+    return {
+        "distribution": _summarize_distribution(problem, search),
+        "claimed": _make_search_claim(search),
+        "gradients": _summarize_gradients(search),
+        "configuration": _describe_configuration(problem, search.best_u),
+        "steps": len(search.history),
+        "non_finite": NotFinite(
+            objectives=search.non_finite_objectives,
+            gradient_elements=search.non_finite_elements,
+        ),
+    }
+
+
 def _unwrap_single(values: dict[str, T]) -> T | dict[str, T]:
-    """Return the value of a single control, or all by control."""
+    """Return the value of the only control, or else all values by control."""
     return next(iter(values.values())) if len(values) == 1 else values
 
 
-def _ending(problem: Problem, findings: RunState) -> Ending:
-    """Return how the attack ended."""
+def _find_ending(problem: Problem, findings: RunState) -> Ending:
+    """Return how the attack ended.
+
+    Without a verification it ended before one: the clean scene is wrong already, or
+    there was an interrupt.
+    """
     if findings.interrupted:
         return Ending.INTERRUPTED
     if findings.verification is not None:
@@ -316,8 +367,13 @@ def _ending(problem: Problem, findings: RunState) -> Ending:
     return Ending.INTERRUPTED
 
 
-def _prediction(judgement: Judgement, trial: int | None) -> PicturedPrediction:
-    """Return the prediction of a stored image, which is that of a trial, if any."""
+def _make_prediction(judgement: Judgement, trial: int | None) -> PicturedPrediction:
+    """Return the prediction of a stored image.
+
+    Args:
+        judgement: judgement of the image.
+        trial: the trial that has the image; None if no trial has it.
+    """
     prediction = judgement.prediction
     return PicturedPrediction(
         label=prediction.label,
@@ -328,7 +384,7 @@ def _prediction(judgement: Judgement, trial: int | None) -> PicturedPrediction:
     )
 
 
-def _clean_prediction(
+def _make_clean_prediction(
     problem: Problem, findings: RunState, picture: StoredImage
 ) -> CleanPrediction:
     """Return the prediction of the clean scene, with its trials if there are any."""
@@ -336,27 +392,29 @@ def _clean_prediction(
     if findings.clean_trials:
         control = make_control_group(findings.clean_trials, findings.spp)
     return CleanPrediction(
-        **vars(_prediction(picture.judgement, picture.trial)),
+        **vars(_make_prediction(picture.judgement, picture.trial)),
         correct=picture.judgement.right,
         moved=[MovedValue.of(value) for value in problem.space.adjusted_defaults],
         control=control,
     )
 
 
-def _baseline(problem: Problem, findings: RunState) -> BaselineSearch | None:
-    """Return the random search; None if there was none."""
+def _summarize_baseline(problem: Problem, findings: RunState) -> BaselineSearch | None:
+    """Return the summary of the random search; None if there was none."""
     if findings.baseline is None:
         return None
-    verification = findings.baseline_verification
     return BaselineSearch(
         policy="random",
         renders=findings.baseline.renders * problem.n_draws,
-        verified=verification and make_verified_rate(verification),
+        verified=_make_rate(findings.baseline_verification),
     )
 
 
-def _ambient_light(findings: RunState) -> AmbientLight | None:
-    """Return in which ambient light the adversarial scene holds, if that was tried."""
+def _summarize_ambient(findings: RunState) -> AmbientLight | None:
+    """Return up to which ambient light the adversarial scene holds.
+
+    None if that was not tried.
+    """
     if not findings.ambient_verifications:
         return None
     points = [
@@ -380,10 +438,10 @@ def _ambient_light(findings: RunState) -> AmbientLight | None:
     )
 
 
-def _average_case(findings: RunState) -> AverageCase | None:
-    """Return the rate over random configurations, if there are any.
+def _summarize_average(findings: RunState) -> AverageCase | None:
+    """Return how often the model is right in random configurations; None without any.
 
-    Those without the object count only if there are no others.
+    Configurations without the object in view count only if there are no others.
     """
     if not findings.random_trials:
         return None
@@ -396,7 +454,7 @@ def _average_case(findings: RunState) -> AverageCase | None:
     right = count_right(trials, findings.spp)
     scores = [trial.score for trial in trials]
     known_scores = [score for score in scores if not math.isnan(score)]
-    # A score is the negative of a margin. 0.0 - x and not -x, so that 0 has no sign.
+    # A score is the negative of a margin. 0.0 - x, since -x may be -0.0.
     return AverageCase(
         configurations=right.trials,
         correct=right.successes,
@@ -407,21 +465,28 @@ def _average_case(findings: RunState) -> AverageCase | None:
     )
 
 
-def _smallest_epsilon(problem: Problem, findings: RunState) -> SmallestEpsilon | None:
-    """Return the bracket of the smallest epsilon, by control; None if not searched."""
+def _summarize_bracket(problem: Problem, findings: RunState) -> SmallestEpsilon | None:
+    """Return the bracket of the smallest epsilon, by control; None if not searched.
+
+    Its ends are factors of the budgets: the smallest at which a wrong prediction was
+    found, and the largest at which none was found.
+    """
     bracket = findings.bracket
     if bracket is None:
         return None
 
     def scale_budgets(factor: float) -> dict[str, float]:
+        """Return the epsilon of each control times a factor."""
         return {
             control.name: factor * float(control.budget.epsilon or 0.0)
             for control in problem.searched_space.controls
         }
 
+    has_found = bracket.u is not None
+    has_failed = bracket.low > 0.0  # 0 until a search fails
     return SmallestEpsilon(
-        epsilon=None if bracket.u is None else scale_budgets(bracket.high),
-        not_found_at=scale_budgets(bracket.low) if bracket.low else None,
+        epsilon=scale_budgets(bracket.high) if has_found else None,
+        not_found_at=scale_budgets(bracket.low) if has_failed else None,
         closed=bracket.is_closed,
         confirmed=bracket.confirmed,
         searches=bracket.searches,
@@ -429,8 +494,8 @@ def _smallest_epsilon(problem: Problem, findings: RunState) -> SmallestEpsilon |
     )
 
 
-def _claim(search: SearchResult) -> SearchClaim:
-    """Return what the search itself claims."""
+def _make_search_claim(search: SearchResult) -> SearchClaim:
+    """Return what the search itself claims, before any verification."""
     return SearchClaim(
         objective=search.claimed_objective,
         re_evaluated=search.best_objective,
@@ -438,7 +503,7 @@ def _claim(search: SearchResult) -> SearchClaim:
     )
 
 
-def _gradients(search: SearchResult) -> SearchGradients:
+def _summarize_gradients(search: SearchResult) -> SearchGradients:
     """Return the statistics of the gradients of a search."""
     norms = [
         record.gradient_norm
@@ -458,8 +523,13 @@ def _gradients(search: SearchResult) -> SearchGradients:
     )
 
 
-def _distribution(problem: Problem, search: SearchResult) -> SearchDistribution | None:
-    """Return the distribution that a policy ended with; None if it has none."""
+def _summarize_distribution(
+    problem: Problem, search: SearchResult
+) -> SearchDistribution | None:
+    """Return the distribution that a policy ended with.
+
+    None if it has none, or one of more numbers than a summary lists.
+    """
     distribution = search.distribution
     if distribution is None or distribution.mean.numel() > MAX_LISTED_NUMBERS:
         return None
@@ -473,21 +543,22 @@ def _distribution(problem: Problem, search: SearchResult) -> SearchDistribution 
 def name_objective(task: Task, objective: str | None) -> str:
     """Return the name of what a search maximised.
 
-    A task's own score has the name of the goal that the task seeks. "vanish" is what
-    "score" means to a detector without a goal, so it stays "score".
+    "score" is the task's own score. If the task seeks a goal, as a detector may, the
+    score is named after that. The goal "vanish" is a detector's default, and changes
+    nothing: the name stays "score".
 
     Args:
         task: task of the search.
-        objective: None for the task's own.
+        objective: the requested objective; None for the task's own.
     """
     name = objective or task.objective
+    is_score = name == Task.objective
     goal = getattr(task, "seek", "")
-    if name == Task.objective and goal not in ("", Detection.seek):
-        return str(goal)
-    return name
+    has_special_goal = goal not in ("", Detection.seek)
+    return str(goal) if is_score and has_special_goal else name
 
 
-def _objective_over(trials: Sequence[Judgement]) -> ObjectiveValues | None:
+def _compute_objective_values(trials: Sequence[Judgement]) -> ObjectiveValues | None:
     """Return mean, deviation and range of the objective over trials, if it is known."""
     values = [trial.objective for trial in trials if trial.objective is not None]
     if not values:
@@ -499,22 +570,24 @@ def _objective_over(trials: Sequence[Judgement]) -> ObjectiveValues | None:
     )
 
 
-def _printability(problem: Problem, findings: RunState) -> Printability:
-    """Return how printable the scenes are, and what that costs in margin."""
+def _summarize_printability(problem: Problem, findings: RunState) -> Printability:
+    """Return how printable the scenes are, and what that costs in margin.
 
-    def terms_of(search: SearchResult | None) -> PrintTerms | None:
+    The cost is known if a search without print terms was verified, too.
+    """
+
+    def measure_terms(search: SearchResult | None) -> PrintTerms | None:
         """Measure the print terms of what a search found; None without a search."""
         if search is None:
             return None
         u = problem.domain.project(search.best_u)
         return measure_print_terms(problem.searched_space, u)
 
-    # What printability costs is known if a search without print terms was verified.
     cost = None
     verification = findings.verification
     unprinted = findings.unprinted
     unprinted_verification = findings.unprinted_verification
-    unprinted_terms = terms_of(unprinted)
+    unprinted_terms = measure_terms(unprinted)
     if verification and unprinted_verification and unprinted and unprinted_terms:
         margin = make_verified_rate(verification).margin
         unprinted_rate = make_verified_rate(unprinted_verification)
@@ -527,69 +600,78 @@ def _printability(problem: Problem, findings: RunState) -> Printability:
             terms=unprinted_terms,
         )
     clean = measure_print_terms(problem.searched_space, problem.domain.start)
-    return Printability(clean=clean, answer=terms_of(findings.search), cost=cost)
+    return Printability(clean=clean, answer=measure_terms(findings.search), cost=cost)
 
 
-def _found_values(problem: Problem, u: Tensor) -> dict[str, FoundValue]:
+def _describe_configuration(problem: Problem, u: Tensor) -> dict[str, FoundValue]:
     """Return the adversarial configuration, with clean values and ranges.
-
-    Only a parameter that is a single number has a range: from its value where its
-    coordinate in u is 0 to that where it is 1.
 
     Args:
         problem: problem of the attack.
         u: (d,) the configuration.
     """
+    clean_values = problem.describe(problem.domain.start)
+    ranges = _describe_ranges(problem)
+    described_values = dict[str, FoundValue]()
+    for name, described in problem.describe(problem.domain.project(u)).items():
+        clean = _get_value(clean_values, name)
+        low, high = ranges.get(name, (None, None))
+        described_values[name] = FoundValue(
+            value=described["value"],
+            unit=described["unit"],
+            clean=clean if isinstance(clean, (int, float, str)) else None,
+            low=low,
+            high=high,
+        )
+    return described_values
+
+
+def _describe_ranges(problem: Problem) -> dict[str, tuple[float, float]]:
+    """Return the range of each searched parameter that is a single number.
+
+    It goes from the value where the parameter's coordinate is 0 to that where it is 1;
+    parameters for which that is no range of numbers are left out.
+    """
     start = problem.domain.start
-    # Of the searched parameters that are single numbers. The searched ones come first
-    # in the space, and the start has their coordinates only.
+    # The searched parameters come first in the space, and the start has their
+    # coordinates only.
     column_of_number = {
         group.name: group.begin
         for group in problem.space.groups
         if group.size == 1 and group.begin < len(start)
     }
     columns = [*column_of_number.values()]
-    values_at_low = _describe_with(problem, start, columns, 0.0)
-    values_at_high = _describe_with(problem, start, columns, 1.0)
-    clean_values = problem.describe(start)
-    found_values = dict[str, FoundValue]()
-    for name, described in problem.describe(problem.domain.project(u)).items():
-        clean = _value_of(clean_values, name)
-        low = _value_of(values_at_low, name)
-        high = _value_of(values_at_high, name)
-        has_range = (
-            name in column_of_number
-            and isinstance(low, float)
-            and isinstance(high, float)
-            and low < high
-        )
-        found_values[name] = FoundValue(
-            value=described["value"],
-            unit=described["unit"],
-            clean=clean if isinstance(clean, (int, float, str)) else None,
-            low=low if has_range else None,
-            high=high if has_range else None,
-        )
-    return found_values
+    values_at_0 = _describe_with(problem, start, columns, 0.0)
+    values_at_1 = _describe_with(problem, start, columns, 1.0)
+    ranges = dict[str, tuple[float, float]]()
+    for name in column_of_number:
+        low = _get_value(values_at_0, name)
+        high = _get_value(values_at_1, name)
+        are_numbers = isinstance(low, float) and isinstance(high, float)
+        if are_numbers and low < high:
+            ranges[name] = (low, high)
+    return ranges
 
 
 def _describe_with(
     problem: Problem, u: Tensor, columns: list[int], coordinate: float
 ) -> dict[str, Value]:
-    """Return the values of a configuration with some coordinates set."""
+    """Return the values of a configuration with some coordinates set to `coordinate`."""
     changed = u.clone()
     changed[columns] = coordinate
     return problem.describe(changed)
 
 
-def _value_of(values: Mapping[str, Value], name: str) -> Any:
+def _get_value(values: Mapping[str, Value], name: str) -> Any:
+    """Return the value of a parameter, without its unit; None if it is missing."""
     return values[name]["value"] if name in values else None
 
 
-def _conditions(problem: Problem) -> dict[str, VariedValue]:
-    """Return the ranges of the single numbers that vary by chance, by name.
+def _describe_conditions(problem: Problem) -> dict[str, VariedValue]:
+    """Return the ranges of the parameters that vary by chance, by name.
 
-    Each is described at the ends of its range, and a choice at each of its options.
+    These are only parameters that are a single number or a choice: a number has its
+    smallest and largest value, and a choice its options.
     """
     ranges: dict[str, VariedValue] = {}
     if problem.conditions is None:
@@ -603,14 +685,8 @@ def _conditions(problem: Problem) -> dict[str, VariedValue]:
         is_random = group.begin >= len(problem.domain.start)
         if group.size != 1 or not is_random:
             continue
-        coordinates = [0.0, 1.0]
-        if block.options:
-            # each option has an equal part of [0, 1]: the centers of these
-            coordinates = [
-                (option + 0.5) / block.options for option in range(block.options)
-            ]
         described = list[Value]()
-        for coordinate in coordinates:
+        for coordinate in _list_described_coordinates(block.options):
             u = start.clone()
             u[group.begin] = coordinate
             value = problem.space.describe(u).get(group.name)
@@ -619,6 +695,17 @@ def _conditions(problem: Problem) -> dict[str, VariedValue]:
         if described:
             ranges[group.name] = _to_range(described, is_choice=bool(block.options))
     return ranges
+
+
+def _list_described_coordinates(n_options: int) -> list[float]:
+    """Return the coordinates at which a parameter is described.
+
+    Those of a choice are the centers of equal parts of [0, 1], one for each option. A
+    number has no options, and is described at both ends of [0, 1].
+    """
+    if not n_options:
+        return [0.0, 1.0]
+    return [(option + 0.5) / n_options for option in range(n_options)]
 
 
 def _to_range(described: Sequence[Value], *, is_choice: bool) -> VariedValue:
@@ -632,20 +719,21 @@ def _to_range(described: Sequence[Value], *, is_choice: bool) -> VariedValue:
     return VariedValue(unit=unit, names=names)
 
 
-def _renders(findings: RunState, problem: Problem) -> dict[str, int]:
+def _count_renders(findings: RunState, problem: Problem) -> dict[str, int]:
     """Count the images of an attack by what they were rendered for.
 
-    An evaluation of a search takes an image for each of the `n_draws` conditions.
-    Images that were predicted instead of rendered are "products"; what was rendered for
-    the predictor counts for the search.
+    An evaluation of a search takes an image for each of the `n_draws` conditions, and
+    so does a gradient. Images that were traced to prepare a predictor count for the
+    search.
 
     Args:
         findings: findings of the attack.
         problem: problem of the attack.
 
     Returns:
-        Numbers of images by "search", "gradient", "baseline", "verification",
-        "products" and, if there was such a search, "unprinted".
+        Numbers of images by "search", "gradient", "baseline" (the random search),
+        "verification", "products" (images that were predicted instead of rendered) and,
+        if there was a search without print terms, "unprinted".
     """
     predictor = findings.predictor
     counts = dict.fromkeys(
@@ -672,35 +760,23 @@ def _renders(findings: RunState, problem: Problem) -> dict[str, int]:
             counts["unprinted"] = n_rendered + n_gradients
         else:
             counts[kind] = n_rendered
-            if kind == "search":
+            if kind == "search":  # the random search has no gradients
                 counts["gradient"] += n_gradients
     if predictor:
         counts["search"] += predictor.n_traced
     return counts
 
 
-def _remarks(findings: RunState, problem: Problem, journal: Journal) -> list[str]:
-    """Return what a reader of the result has to know."""
+def _make_remarks(findings: RunState, problem: Problem, journal: Journal) -> list[str]:
+    """Return sentences about doubts in the result, and about what was not finite."""
     remarks = list[str]()
     rendering_remark = make_rendering_remark(findings.predictor_refusal)
     if rendering_remark:
         remarks.append(rendering_remark)
     samples = findings.sample_count
     if samples is not None and samples.table and not samples.converged:
-        text = f"It is not shown that more than {samples.spp} samples a pixel"
-        if problem.conditions is None:
-            text += (
-                ", the most that a check takes, would leave the margin on its "
-                "side: noise may decide the verdict."
-            )
-        else:
-            text += (
-                f" would leave the rate within {100 * MAX_MOVED_FRACTION:.0f} points. "
-                "A check takes no more than "
-                f"{OVER_LADDER[-1]}, and {MAX_SAMPLE_RATIO} times the samples of the "
-                "searches; `verify_spp` asks for more."
-            )
-        remarks.append(text)
+        has_conditions = problem.conditions is not None
+        remarks.append(_make_samples_remark(samples.spp, has_conditions=has_conditions))
     n_in_searches = sum(
         search.non_finite_elements
         for search in (findings.search, findings.baseline)
@@ -716,18 +792,43 @@ def _remarks(findings: RunState, problem: Problem, journal: Journal) -> list[str
     return [*remarks, *make_lost_remarks(journal.n_lost), *journal.remarks]
 
 
+def _make_samples_remark(spp: int, *, has_conditions: bool) -> str:
+    """Return a sentence about a sample count of which it is not shown that it suffices.
+
+    Args:
+        spp: samples per pixel of the verification.
+        has_conditions: whether conditions vary by chance.
+    """
+    text = f"It is not shown that more than {spp} samples a pixel"
+    if not has_conditions:
+        return (
+            f"{text}, the most that a check takes, would leave the margin on its "
+            "side: noise may decide the verdict."
+        )
+    return (
+        f"{text} would leave the rate within {100 * MAX_MOVED_FRACTION:.0f} points. "
+        "A check takes no more than "
+        f"{OVER_LADDER[-1]}, and {MAX_SAMPLE_RATIO} times the samples of the "
+        "searches; `verify_spp` asks for more."
+    )
+
+
 def describe_failures(problem: Problem, findings: RunState) -> DifferentFailures | None:
-    """Return the different failures of a policy that looks for them; else None."""
+    """Return the failures that a search found which differ from each other.
+
+    None if the policy does not look for several failures.
+    """
     known = findings.search.failures if findings.search else None
     if known is None:
         return None
-    n_verified = len(findings.failure_verifications)
+    verifications = findings.failure_verifications
+    n_verified = len(verifications)  # only the first failures are verified
     listed = [
         _describe_failure(
             problem,
             failure,
             number,
-            findings.failure_verifications[number] if number < n_verified else None,
+            verifications[number] if number < n_verified else None,
         )
         for number, failure in enumerate(known.examples)
     ]
@@ -738,10 +839,7 @@ def describe_failures(problem: Problem, findings: RunState) -> DifferentFailures
         places=known.n_cells,
         share=known.failure_rate and FailingShare.of(known.failure_rate),
         tried=n_verified,
-        held=sum(
-            verification.ending is Ending.FOUND
-            for verification in findings.failure_verifications
-        ),
+        held=sum(verification.ending is Ending.FOUND for verification in verifications),
         listed=listed,
     )
 
@@ -764,7 +862,7 @@ def _describe_failure(
         name: DescribedValue.of(value)
         for name, value in problem.describe(failure.u).items()
     }
-    ranges = _ranges_of(problem, failure)
+    ranges = _describe_failure_ranges(problem, failure)
     if verification is None:
         return DifferentFailure(
             ranges=ranges,
@@ -781,18 +879,18 @@ def _describe_failure(
         objective=failure.objective,
         holds=verification.ending is Ending.FOUND,
         verified=make_verified_rate(verification),
-        picture=f"images/{_failure_image(number)}.png",
-        pictured=_prediction(verification.adversarial_trials[0], 0),
+        picture=f"images/{_name_failure_image(number)}.png",
+        pictured=_make_prediction(verification.adversarial_trials[0], 0),
     )
 
 
-def _ranges_of(
+def _describe_failure_ranges(
     problem: Problem, failure: FoundFailure
 ) -> dict[str, tuple[float, float] | str]:
     """Return the ranges of a failure and of those that it stands for, by coordinate.
 
-    A range is in the parameter's unit if the problem describes the coordinate by one
-    number, else in u. A discrete choice has the name of its option instead.
+    A range is in the parameter's unit if the parameter is a single number, else in u. A
+    discrete choice has the name of its option instead.
 
     Args:
         problem: problem of the attack.
@@ -801,24 +899,26 @@ def _ranges_of(
     ranges: dict[str, tuple[float, float] | str] = {}
     for column, bounds in failure.ranges.items():
         block = problem.domain.find_block(column)
+        # the parameter's value at each bound
         values = list[Any]()
         for bound in bounds:
             u = failure.u.clone()
-            # A choice stays as the failure has it.
-            if not block.options:
+            is_choice = bool(block.options)
+            if not is_choice:  # a choice stays as the failure has it
                 u[column] = bound
             described = problem.describe(u).get(block.name)
             values.append(bound if described is None else described["value"])
-        options = [value for value in values if isinstance(value, str)]
+        option_names = [value for value in values if isinstance(value, str)]
         name = problem.domain.names[column]
-        if options:
-            ranges[name] = options[0]
-        else:
-            # A vector is described as a whole, so that its components stay in u.
-            numbers = values if block.size == 1 else bounds
-            ranges[name] = (min(numbers), max(numbers))
+        if option_names:
+            ranges[name] = option_names[0]
+        elif block.size == 1:
+            ranges[name] = (min(values), max(values))
+        else:  # the values are those of the full vector, not of this component
+            ranges[name] = (min(bounds), max(bounds))
     return ranges
 
 
-def _failure_image(number: int) -> str:
+def _name_failure_image(number: int) -> str:
+    """Return the name of the image of a failure, by its number in the list."""
     return f"failure-{number:02d}"

@@ -62,16 +62,15 @@ def make_page(run: Path, result: Result) -> str | None:
     turned_object = read_object(run)
     frames = _read_frames(run / directory.IMAGES / "search.gif")
     objectives = _read_objectives(run)
-    method_rows = [
-        [name, text] for name, text in wording.method_texts(result).items() if text
-    ]
+    method_rows = [[name, text] for name, text in wording.method_texts(result).items()]
+    rates_table = view.sections[0]
     sections = [
         *_image_parts(run, result, animated=bool(frames)),
         make_object_part(turned_object),
         _changes_part(result),
         _textures_part(run),
         *_failures_parts(result),
-        _rates_part(result, view.sections[0]),
+        _rates_part(result, rates_table),
         *display.make_ambient_parts(result),
         _search_part(result, objectives),
         ResultPart("How the search worked", rows=method_rows, folded=True),
@@ -84,20 +83,21 @@ def make_page(run: Path, result: Result) -> str | None:
         "environment": result.environment,
         "seed": str(result.seed),
     }
+    # what the result is about, in a few names
     about = [
         wording.budget_text(result),
         result.object,
         result.environment,
         result.model,
     ]
+    view = replace(view, sections=sections, facts=facts, about=about)
+    # what the scripts of the page read
     data = make_object_data(turned_object)
     if frames:
         data = [_frames_data(frames, objectives.get("search", [])), *data]
     scripts = ["make.js", "attack.js"]
     if turned_object:
         scripts.append("object.js")
-    # `about` is what the result is of, in a few names
-    view = replace(view, sections=sections, facts=facts, about=about)
     return make_view_page(run, result, view, data=data, scripts=scripts)
 
 
@@ -132,6 +132,7 @@ def _frames_data(frames: list[str], objectives: Sequence[float | None]) -> Html:
     """
     last_step = max(len(objectives) - 1, 0)
     steps = [round(step) for step in np.linspace(0, last_step, len(frames) - 1)]
+    # an interrupted search may have no objective yet
     frame_objectives = [
         objectives[step] if step < len(objectives) else None for step in steps
     ]
@@ -150,8 +151,8 @@ def _image_parts(
         animated: whether there are frames of the search.
     """
     images = run / directory.IMAGES
-    gain = f"{files.DIFFERENCE_GAIN:g} times magnified, grey where nothing changed"
-    difference = Picture("images/difference.png", gain, "Difference")
+    caption = f"{files.DIFFERENCE_GAIN:g} times magnified, grey where nothing changed"
+    difference = Picture("images/difference.png", caption, "Difference")
     yield ResultPart(
         "What the model sees",
         pictures=[[*_clean_and_adversarial(summary, ".png"), difference]],
@@ -200,7 +201,10 @@ def _clean_and_adversarial(summary: AttackSummary, suffix: str) -> list[Picture]
 
 
 def _trial_note(summary: AttackSummary) -> str:
-    """Return which conditions the images have, of an attack over conditions."""
+    """Return which conditions the images of both scenes have.
+
+    Empty if no conditions vary by chance.
+    """
     conditions = " and ".join(summary.over)
     trial = summary.clean.trial
     if not conditions:
@@ -234,7 +238,9 @@ def _changes_part(summary: AttackSummary) -> ResultPart:
     for name, changed in (summary.configuration or {}).items():
         clean = "" if changed.clean is None else format_number(changed.clean)
         values = changed.value if isinstance(changed.value, list) else [changed.value]
-        unit = "" if changed.unit in ("", "1", "name") else f" {changed.unit}"
+        # the unit of a discrete choice is "name"
+        has_unit = changed.unit not in (*words.PLAIN_UNITS, "name")
+        unit = f" {changed.unit}" if has_unit else ""
         adversarial = ", ".join(map(format_number, values)) + unit
         rows.append([name, clean, adversarial, _range_text(changed)])
         bars.append(_range_bar(changed))
@@ -322,14 +328,16 @@ def _failures_parts(summary: AttackSummary) -> Iterator[ResultPart]:
 def _rates_part(summary: AttackSummary, table: ResultPart) -> ResultPart:
     """Return the table of rates with bars; empty if there are no rates.
 
-    The rates and all that follows come before the two columns after the name, because a
-    phone cuts what is on the right.
+    Its columns are in another order than in `table`: the rates and all that follows
+    them come right after the name, because a phone cuts what is on the right.
 
     Args:
         summary: summary of the attack.
-        table: the same without bars.
+        table: the same without bars, with the columns name, prediction, number, rate
+            and interval.
     """
     average = summary.average
+    # in the order of the table's rows
     rates: list[ControlGroup | VerifiedRate | None] = [summary.clean.control]
     if summary.adversarial:
         rates.append(summary.verified)
@@ -342,8 +350,10 @@ def _rates_part(summary: AttackSummary, table: ResultPart) -> ResultPart:
         return ResultPart()
     spp = f", {summary.verified.spp} samples per pixel" if summary.verified else ""
     note = f"Fresh seeds, pictures rounded to 8 bits, Clopper-Pearson intervals{spp}."
-    # the name first, then the columns from the fourth on, then the second and third
-    heads, *rows = ([row[0], *row[3:], *row[1:3]] for row in (table.heads, *table.rows))
+    heads, *rows = (
+        [name, *rate_and_interval, prediction, number]
+        for name, prediction, number, *rate_and_interval in (table.heads, *table.rows)
+    )
     return replace(
         table, title="Verified rates", heads=heads, rows=rows, bars=bars, note=note
     )
@@ -356,22 +366,20 @@ def _search_part(
 
     Args:
         summary: summary of the attack.
-        objectives: objectives of the search and of the baseline.
+        objectives: objective of each evaluation, None if it was not a number, of the
+            "search" and of the "baseline", the random search.
     """
-    curves = {
-        name: values
-        for name, values in (
-            (summary.policy, objectives.get("search", [])),
-            ("random search", objectives.get("baseline", [])),
-        )
-        if any(value is not None for value in values)
-    }
+    curves = dict[str, list[float | None]]()
+    ranges = []
+    for kind, name in (("search", summary.policy), ("baseline", "random search")):
+        values = objectives.get(kind, [])
+        known = [value for value in values if value is not None]
+        if known:
+            curves[name] = values
+            ranges.append(f"{name}: from {known[0]:.3g} to {max(known):.3g}")
     if not curves:
         return ResultPart()
-    ranges = []
-    for name, values in curves.items():
-        known = [value for value in values if value is not None]
-        ranges.append(f"{name}: from {known[0]:.3g} to {max(known):.3g}")
+    # the text at the zero line, above which the search has what it seeks
     zero_means = ""
     if summary.objective in words.SUCCESS_ABOVE_ZERO:
         above = "right" if summary.minimises else wording.success_name(summary)
@@ -413,7 +421,7 @@ def _step_text(group: GroupDerivative) -> str:
         return ""
     step = f"{group.step:.3g} of its range"
     if group.step_in_unit is not None:
-        unit = "" if group.unit in ("", "1") else f" {group.unit}"
+        unit = "" if group.unit in words.PLAIN_UNITS else f" {group.unit}"
         step = f"{group.step_in_unit:.3g}{unit}"
     return f"{step}: {group.step_reason}"
 

@@ -112,11 +112,7 @@ def attack(
     options = _drop_unset(settings)
     if callable(task):
         task = make_task(task)
-    if not isinstance(policy, (str, Mapping, Policy)) or not policy:
-        raise InputError(
-            "policy: expected a name, a mapping with a `name` and options, or an "
-            f"instance, got {describe_value(policy)}"
-        )
+    _check_policy(policy)
     session_controls = [
         *loading.list_session_only_controls(controls),
         *loading.list_session_only_controls(over),
@@ -162,6 +158,19 @@ def attack(
         return run_attack(parts, as_progress(progress), directory)
 
 
+def _check_policy(policy: object) -> None:
+    """Check that a policy is named, described or made.
+
+    Raises:
+        InputError: it is not.
+    """
+    if not isinstance(policy, (str, Mapping, Policy)) or not policy:
+        raise InputError(
+            "policy: expected a name, a mapping with a `name` and options, or an "
+            f"instance, got {describe_value(policy)}"
+        )
+
+
 def _drop_unset(settings: Mapping[str, object]) -> dict[str, Any]:
     """Return the settings that are not None."""
     return {name: value for name, value in settings.items() if value is not None}
@@ -179,16 +188,17 @@ def _check_can_use_workers(
 
     Workers are other processes. They load everything by its name, and do not have the
     objects of this session.
+
+    Raises:
+        InputError: such a setting is among `options`.
     """
-    are_named = all(
-        isinstance(value, (str, Path)) for value in (scene, *list_models(model))
-    )
-    if (
-        not are_named
-        or callable(objective)
-        or session_controls
-        or isinstance(task, FunctionTask)
-    ):
+    objects = [
+        value
+        for value in (scene, *list_models(model))
+        if not isinstance(value, (str, Path))
+    ]
+    has_functions = callable(objective) or isinstance(task, FunctionTask)
+    if objects or has_functions or session_controls:
         naming.check_no_worker_settings(options)
 
 
@@ -226,9 +236,14 @@ def _make_config(
 
 
 def _open_run(run: str | Path | None, resume: bool, config: AttackConfig) -> Any:
-    """Return a context with the run directory, or None.
+    """Return a context with the run directory of an attack; None without one.
 
-    It is that of a stopped run or a new one.
+    It is that of a run that is continued, or a new one.
+
+    Args:
+        run: name or folder of the run; None keeps none.
+        resume: whether a run that is there is continued.
+        config: the settings.
     """
     resumed = None
     if resume and run is not None and is_run(locate_run(run)):

@@ -65,7 +65,11 @@ class RenderKeywords(TypedDict, total=False):
 
 
 def _check_render_keywords(options: Mapping[str, Any]) -> None:
-    """Check that `render` has these keywords. Raises TypeError: it has not."""
+    """Check that `render` has all these keywords.
+
+    Raises:
+        TypeError: it lacks one.
+    """
     unknown = sorted(options.keys() - RenderKeywords.__annotations__)
     if unknown:
         known = ["model", "scene", "camera", "settings"]
@@ -231,13 +235,14 @@ class AttackResult:
                 "settings: the adversarial configuration says what "
                 f"{min(clashes)} is; leave it out"
             )
-        attacked_model = parts.model_and_warnings[0]
+        task = parts.task
+        if model is None:
+            model, _ = parts.model_and_warnings
+            task = make_ensemble_task(task, model)
         return render(
             _change_view(_resolve_scene(scene, parts.scene), camera_name, settings),
-            attacked_model if model is None else model,
-            task=make_ensemble_task(parts.task, attacked_model)
-            if model is None
-            else parts.task,
+            model,
+            task=task,
             label=parts.config.label,
             controls=parts.controls,
             at=self.u,
@@ -357,39 +362,42 @@ class StoredImage:
 
 
 def choose_stored_trial(findings: RunState) -> int | None:
-    """Return the trial whose images of both scenes are stored.
+    """Return the number of the trial whose images of both scenes are stored.
 
-    Both scenes have the same conditions in it. It is the first with the most frequent
-    prediction among the successes (else among the trials that count), if possible one
-    in which the clean scene has its own most frequent prediction. None if there were no
-    trials.
+    Both scenes have the same conditions in it. It is a typical one: the first with the
+    most frequent prediction among the successes (among the trials that count, if there
+    are no successes), if possible one in which the clean scene has its own most
+    frequent prediction. None if there were no trials.
     """
     verification = findings.verification
     if verification is None:
-        clean_labels = _labels(findings.clean_trials)
+        clean_labels = _list_labels(findings.clean_trials)
         return clean_labels.index(mode(clean_labels)) if clean_labels else None
-    clean_labels = _labels(verification.clean_trials)
+    clean_labels = _list_labels(verification.clean_trials)
     has_successes = bool(verification.successful_trials)
-    usual_label = mode(
-        _labels(verification.successful_trials or verification.valid_trials)
-    )
+    typical_trials = verification.successful_trials or verification.valid_trials
+    usual_label = mode(_list_labels(typical_trials))
     usual_clean_label = mode(clean_labels)
-    ranks = []
-    for label, is_success, clean_label in zip(
-        _labels(verification.adversarial_trials),
+    # of each trial what speaks for it, the most important first
+    ranks = list[tuple[bool, bool, bool]]()
+    for label, outcome, clean_label in zip(
+        _list_labels(verification.adversarial_trials),
         verification.outcomes,
         clean_labels,
         strict=False,  # trials of one scene may have ended earlier
     ):
-        is_usual = label == usual_label
-        # a success, if there are any; else a trial that counts and fails
-        is_counted = is_usual and is_success is has_successes
-        ranks.append((is_counted, is_usual, clean_label == usual_clean_label))
-    # the first of the trials that rank highest
-    return verification.first_index + ranks.index(max(ranks))
+        has_usual_label = label == usual_label
+        # The outcome is None for a trial that does not count. It has to be a success if
+        # there are any, else a failure.
+        is_typical = has_usual_label and outcome is has_successes
+        has_usual_clean_label = clean_label == usual_clean_label
+        ranks.append((is_typical, has_usual_label, has_usual_clean_label))
+    first_best = ranks.index(max(ranks))
+    return verification.first_index + first_best
 
 
-def _labels(trials: Sequence[Judgement]) -> list[str]:
+def _list_labels(trials: Sequence[Judgement]) -> list[str]:
+    """Return the predicted label of each trial."""
     return [trial.prediction.label for trial in trials]
 
 
@@ -417,11 +425,10 @@ def save_images(
     )
     run.save_image("difference", difference)
     verification = findings.verification
-    kind = (
-        "verification"
-        if findings.outdone_verification is None
-        else "baseline verification"
-    )
+    kind = "verification"
+    if findings.outdone_verification is not None:
+        # the random search's configuration was worse, and became the adversarial one
+        kind = "baseline verification"
     if verification is not None:
         end = verification.first_index + len(verification.adversarial_trials)
         for number in range(verification.first_index, end)[:MAX_STORED_IMAGES]:
@@ -557,7 +564,7 @@ def _describe_simplified(meshes: Sequence[Any], simplify: Mapping[str, object]) 
 
 
 def _assemble(problem: Problem, u: Tensor) -> Mapping[str, Tensor]:
-    """Return what the scene takes for a configuration (d,)."""
+    """Return the tensors that the scene takes for a configuration (d,), by name."""
     with torch.no_grad():
         inputs = problem.space.inputs(problem.add_conditions(u))
         return problem.renderer.scene.assembly(inputs)
@@ -612,7 +619,7 @@ def evaluate_drive(
     total_seconds = seconds * max(1, len(paths))
     right_counts: dict[str, int] = {}
     for name, configuration in (("drive-clean", problem.domain.start), ("drive", u)):
-        if configuration is None:
+        if configuration is None:  # nothing was searched
             continue
         # The searched coordinates come first, then those that conditions vary.
         frames[:, : len(configuration)] = configuration
@@ -630,10 +637,11 @@ def evaluate_drive(
 
 
 def _find_path(problem: Problem) -> tuple[Any, int]:
-    """Return the control that travels at random times, and the column of its time.
+    """Find the control that travels at random times.
 
-    Time is its first coordinate in a full configuration. None if there is no such
-    control.
+    Returns:
+        The control, None if there is no such one; and the column of its time in a full
+        configuration, which is the control's first coordinate.
     """
     n_searched = len(problem.searched_space.controls)
     column = len(problem.domain.start)
@@ -659,24 +667,30 @@ def _make_frames(
         time_column: index of its time among the coordinates.
 
     Returns:
-        Names, none of a single path; and (paths * FRAMES, d) of the full space.
+        The names, empty if there is a single path; and (paths * FRAMES, d), the frames
+        of one path after those of the other.
     """
     start = problem.add_conditions(problem.domain.start)
-    specs = [
-        slot.spec
-        for slot in path.slots
-        if slot.parameter.name == Control.PATH_PARAMETER
-    ]
-    # A path with a weight comes several times.
-    choices = next((spec.values for spec in specs if isinstance(spec, OneOf)), ())
+    # A path with a weight comes several times among the choices.
+    choices = _list_path_choices(path)
     names = list(dict.fromkeys(choices))
-    frames = start.repeat(max(1, len(names)), FRAMES, 1)
+    frames = start.repeat(max(1, len(names)), FRAMES, 1)  # (paths, FRAMES, d)
     frames[..., time_column] = torch.linspace(0.0, 1.0, FRAMES)
-    # The coordinate after the time selects the path: the center of its part of [0, 1].
+    path_column = time_column + 1
     for index, name in enumerate(names):
+        # Each choice has an equal part of [0, 1]: the center of the path's first one.
         coordinate = (choices.index(name) + 0.5) / len(choices)
-        frames[index, :, time_column + 1] = coordinate
+        frames[index, :, path_column] = coordinate
     return names, frames.flatten(0, 1)
+
+
+def _list_path_choices(path: Any) -> Sequence[Any]:
+    """Return the paths among which a control chooses; none if it has a single one."""
+    for slot in path.slots:
+        is_path = slot.parameter.name == Control.PATH_PARAMETER
+        if is_path and isinstance(slot.spec, OneOf):
+            return slot.spec.values
+    return ()
 
 
 def _read_time(problem: Problem, path: Any, u: Tensor) -> float:

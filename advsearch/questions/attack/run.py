@@ -104,9 +104,8 @@ def run_attack(
         InputError: parts do not fit together, or the run that is continued has others.
     """
     config = parts.config
-    # a check before the work: raises an error if the run of twins cannot be read
     if config.twins is not None:
-        read_twins(config.twins)
+        read_twins(config.twins)  # a check before the work: raises if it is corrupt
     model, loading_notes = parts.model_and_warnings
     with ExitStack() as stack:
         run = None
@@ -116,7 +115,7 @@ def run_attack(
         stages.begin("setup", PREPARING)
         problem = make_problem(parts)
         warnings = _report_warnings(parts, progress, problem, loading_notes)
-        policy = choose_policy(parts.policy, problem, _gradient_setting(config))
+        policy = choose_policy(parts.policy, problem, _find_gradient_setting(config))
         if run is None and parts.is_stored:
             run = stack.enter_context(RunDirectory.open(config))
         if run is not None:
@@ -136,9 +135,7 @@ def run_attack(
             object_name=config.object,
             judge=config.judge,
             policy=config.policy_name,
-            objective=parts.objective
-            if isinstance(parts.objective, str)
-            else config.objective,
+            objective=_find_objective_name(parts),
             printable=config.printable,
             command_line=config.command_line(None if run is None else run.path),
             python_only=config.python_only,
@@ -147,6 +144,13 @@ def run_attack(
         # without the matrix of light transport, which may be large
         stored_parts = replace(parts, clean_matrix=CleanMatrix())
         return replace(result, parts=lambda: stored_parts)
+
+
+def _find_objective_name(parts: AttackParts) -> str | None:
+    """Return the name of the objective; None for the task's own."""
+    if isinstance(parts.objective, str):
+        return parts.objective
+    return parts.config.objective  # the settings name a function
 
 
 def _report_warnings(
@@ -188,6 +192,8 @@ def _search(
     stages: Stages,
 ) -> Any:
     """Search and verify the worst configuration, with the settings of the attack."""
+    # Otherwise there are as many trials as the verdict needs. To bracket the smallest
+    # change takes many verdicts, so that their number of trials is fixed.
     has_trial_count = config.trials is not None or config.smallest
     return search_and_verify(
         policy,
@@ -256,18 +262,15 @@ def search_and_verify(
             search.
     """
     problem = journal.problem
-    first_spp = problem.spp  # a preparation may choose another one for the search
-    # numbers of trials after which a verdict may be reached
-    looks = TRIAL_LOOKS if problem.conditions is None else OVER_LOOKS
+    first_spp = problem.spp  # `plan_renders` may choose another one for the search
     findings = RunState()
-    verifier = Verifier(
-        journal, ladder, stages, findings, looks if trials is None else (trials,)
-    )
+    looks = _choose_looks(problem, trials)
+    verifier = Verifier(journal, ladder, stages, findings, looks)
     searches = Searches(
         journal, stages, findings, printable=printable, close_looks=close_looks
     )
     if smallest:
-        # only a check: raises for what has no budget, before anything is rendered
+        # only a check: raises if there is no budget, before anything is rendered
         scale_domain(problem.domain, 1.0)
     try:
         with interruptible():
@@ -305,10 +308,25 @@ def search_and_verify(
     return findings
 
 
+def _choose_looks(problem: Problem, trials: int | None) -> tuple[int, ...]:
+    """Return the numbers of trials after which a verdict may be reached.
+
+    Args:
+        problem: problem of the attack.
+        trials: the requested number; None for as many as the verdict needs.
+    """
+    if trials is not None:
+        return (trials,)
+    return TRIAL_LOOKS if problem.conditions is None else OVER_LOOKS
+
+
 def search_with_baselines(
     searches: Searches, policy: Policy[Any], *, seconds: float | None, baseline: bool
 ) -> None:
-    """Search with a policy, then without print terms, if any, and at random.
+    """Search with a policy, and for comparison in two other ways.
+
+    These are a search without print terms, if the objective has any, and a random
+    search, if it is requested and the policy is another one.
 
     Args:
         searches: searches of the attack.
@@ -329,8 +347,8 @@ def search_with_baselines(
         "search", policy, steps, problem.seed, frames=findings.frames, seconds=seconds
     )
     if seconds is not None:
-        # The other searches get the renders that fitted into the time, without those of
-        # the ranking at the end.
+        # The other searches get as many renders as fitted into the time. `history` has
+        # those of the steps; those of the ranking at the end come on top.
         history = findings.search.history
         steps = max(1, history[-1].renders) if history else 1
     if searches.printable:
@@ -355,10 +373,11 @@ def search_with_baselines(
 def choose_policy(
     policy: Policy[Any], problem: Problem, gradient_setting: str | None = None
 ) -> Policy[Any]:
-    """Return the policy that searches a problem: the requested one, or what `auto` is.
+    """Return the policy that searches a problem: the requested one, or a special `auto`.
 
-    For a model without a gradient, `auto` ascends by differences; behind an address it
-    does not ascend.
+    `auto` follows the model's gradient. For a model without one it is replaced by
+    "nes", which estimates a gradient from differences. A model behind an address has no
+    gradient either; in ranges alone, `auto` keeps its samples and its surrogate.
 
     Args:
         policy: the requested one.
@@ -369,11 +388,13 @@ def choose_policy(
         InputError: the policy needs the gradient of a model that has none, or does not
             use the derivatives that a setting concerns.
     """
-    # "box" is a range alone; blocks with another norm have a budget epsilon
+    # A block with the norm "box" is a range alone; others have a budget epsilon.
     norms = {block.norm for block in problem.domain.blocks}
+    has_only_ranges = norms == {"box"}
+    has_only_budgets = "box" not in norms
     if isinstance(problem.model.module, RemoteNetwork):
         if policy.name == "auto":
-            policy = WithoutAscent() if norms == {"box"} else make_policy("nes")
+            policy = WithoutAscent() if has_only_ranges else make_policy("nes")
         elif policy.uses_gradient:
             raise InputError(
                 f"policy: {policy.name} follows the model's gradient, and "
@@ -381,9 +402,7 @@ def choose_policy(
                 "none; use auto, cmaes, nes, random, sobol or grid"
             )
     elif (
-        policy.name == "auto"
-        and "box" not in norms
-        and not problem.model.differentiable
+        policy.name == "auto" and has_only_budgets and not problem.model.differentiable
     ):
         return make_policy("nes")
     if gradient_setting and not policy.uses_gradient:
@@ -394,15 +413,18 @@ def choose_policy(
     return policy
 
 
-def _gradient_setting(config: AttackConfig) -> str | None:
-    """Return the setting that concerns derivatives; None if none does."""
+def _find_gradient_setting(config: AttackConfig) -> str | None:
+    """Return the name of a setting that concerns derivatives; None without any."""
     if config.estimators:
         return "estimators"
     return "measure" if config.measure == "full" else None
 
 
 def find_user_functions(parts: AttackParts) -> dict[str, Callable[..., Any] | None]:
-    """Return the caller's functions by their use; a continued run needs the same."""
+    """Return the caller's own functions by what they are used for.
+
+    A run stores their digests, since it can only be continued with the same functions.
+    """
     functions: dict[str, Callable[..., Any] | None] = {
         f"metric {name}": metric for name, metric in parts.metrics.items()
     }

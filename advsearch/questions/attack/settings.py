@@ -371,18 +371,22 @@ class AttackConfig(DerivativeConfig):
 
     @model_validator(mode="before")
     @classmethod
-    def _policy_with_steps(cls, data: Any) -> Any:
-        """Accept a policy with options, and with the steps of the search among them.
+    def _read_policy(cls, data: Any) -> Any:
+        """Accept a policy by its name, or with options, as a mapping or as text.
 
-        ``policy: {name: pgd, steps: 80, momentum: 0.9}`` sets `steps`, too; also
-        ``pgd={momentum: 0.9}`` and a name.
+        The text is ``pgd={momentum: 0.9}``. Options may have the steps of the search
+        among them: ``{name: pgd, steps: 80, momentum: 0.9}`` sets `steps`, too.
         """
         policy = read_named(data.get("policy"), "policy", "auto")
+        if policy is None:
+            return data
         if not isinstance(policy, Mapping):
-            return data if policy is None else {**data, "policy": policy}
+            return {**data, "policy": policy}
         steps = {"steps": policy["steps"]} if "steps" in policy else {}
-        rest = {option: value for option, value in policy.items() if option != "steps"}
-        return {**data, **steps, "policy": read_named(rest, "policy", "auto")}
+        options = {
+            option: value for option, value in policy.items() if option != "steps"
+        }
+        return {**data, **steps, "policy": read_named(options, "policy", "auto")}
 
     @property
     def policy_name(self) -> str:

@@ -66,8 +66,8 @@ UNPRINTED = "search without print terms"
 measures what they cost.
 """
 N_FIRST_LOOKS = 4
-"""Renders of the clean configuration before the search; wrong in all of them, it goes
-through the full trials first.
+"""Renders of the clean configuration before the search. If the model is wrong in all of
+them, the configuration goes through the full trials before anything is searched.
 """
 
 Measure = Literal["no", "quick", "full"]
@@ -88,8 +88,9 @@ def plan_renders(
 ) -> None:
     """Choose light bounces, gradient estimators and samples of a search by measurement.
 
-    The choice is set in the journal's problem, and stored: a run that goes on has the
-    same.
+    The choice is set in the journal's problem, and stored: a run that is continued has
+    the same. Bounces are measured for images that the search renders, and estimators
+    for gradients that it renders; what predicts images needs neither.
 
     Args:
         policy: policy of the search; only for one with gradients they are measured.
@@ -108,16 +109,19 @@ def plan_renders(
         problem.search_depth = stored["search_depth"]
         return
     is_full = measure == "full"
-    if specialise and (is_full or problem.steps >= planning.MIN_RENDERS_FOR_BOUNCES):
-        refusal = surface_light.find_surface_light_refusal(
+    # for few renders the measurement would cost more than it saves
+    has_enough_renders = problem.steps >= planning.MIN_RENDERS_FOR_BOUNCES
+    if specialise and (is_full or has_enough_renders):
+        surface_light_refusal = surface_light.find_surface_light_refusal(
             problem, problem.steps, policy, specialise
         )
-        if refusal is not None:  # else no step will be rendered
+        are_steps_rendered = surface_light_refusal is not None
+        if are_steps_rendered:
             _choose_bounces(problem, stages)
     if policy.uses_gradient and measure != "no":
-        refusal = find_matrix_refusal(problem, problem.steps, specialise)
-        # Without a refusal, derivatives come from what predicts the images.
-        if is_full or refusal is not None:
+        matrix_refusal = find_matrix_refusal(problem, problem.steps, specialise)
+        are_gradients_rendered = matrix_refusal is not None
+        if is_full or are_gradients_rendered:
             _measure_gradients(
                 problem,
                 stages,
@@ -233,6 +237,7 @@ def evaluate_clean_scene(
     stages.begin("setup", "looking at the clean scene", N_FIRST_LOOKS, hint=hint)
 
     def evaluate(query: Query) -> Evaluation:
+        """Evaluate a query, and report it."""
         evaluation = problem.evaluate(query)
         stages.progress.advance(1)
         return evaluation
@@ -278,7 +283,8 @@ def choose_predictor(
     None if there is none: then every step is rendered. Predictors are tried in turn:
     one that turns out to be too inaccurate is followed by the next, one that takes too
     much memory by none. Why images are rendered, or predicted by another predictor, is
-    stored in `findings` and reported.
+    stored in `findings` and reported. A refusal is the reason why a predictor is not
+    used; None if it may be used.
 
     Args:
         policy: policy of the search.
@@ -320,29 +326,53 @@ def choose_predictor(
 
     # No candidate is left, so each has been refused.
     assert matrix_refusal is not None and surface_refusal is not None
-    # The user is told the reason that is easier to change: more steps, if matrices pay
-    # then; or that of matrices where no camera moves.
-    pays_with_more_steps = (
-        not findings.surface_light_refusal
-        and find_matrix_refusal(problem, None, specialise) is None
-    )
-    moves_no_camera = surface_refusal.cause is RefusalCause.NO_CAMERA
-    is_about_matrices = pays_with_more_steps or moves_no_camera
-    refusal = matrix_refusal if is_about_matrices else surface_refusal
+    refusal = surface_refusal
+    if _is_about_matrices(problem, surface_refusal, findings, specialise=specialise):
+        refusal = matrix_refusal
     if not specialise:
         _report_rendering(refusal, stages, findings)
         return None
     return _crop_search(problem, refusal, stages, findings)
 
 
+def _is_about_matrices(
+    problem: Problem, surface_refusal: Refusal, findings: RunState, *, specialise: bool
+) -> bool:
+    """Return whether the user is told why no matrix predicts the images.
+
+    Else it is why light on surfaces does not. It is the reason that is easier to
+    change: more steps, if matrices pay then; or that of matrices where no camera moves.
+
+    Args:
+        problem: problem of the attack.
+        surface_refusal: why light on surfaces does not predict the images.
+        findings: findings of the attack.
+        specialise: whether images may be predicted.
+    """
+    was_inaccurate = findings.surface_light_refusal is not None
+    pays_with_more_steps = (
+        not was_inaccurate and find_matrix_refusal(problem, None, specialise) is None
+    )
+    moves_no_camera = surface_refusal.cause is RefusalCause.NO_CAMERA
+    return pays_with_more_steps or moves_no_camera
+
+
 def _crop_search(
     problem: Problem, refusal: Refusal, stages: Stages, findings: RunState
 ) -> PredictedSearch | None:
-    """Prepare and return the crop of a search whose images are not predicted.
+    """Prepare a search that renders only the part of each image that can change.
 
-    None if whole images are rendered. `refusal` is why nothing predicts them.
+    Args:
+        problem: problem of the attack.
+        refusal: why nothing predicts the images.
+        stages: reports the preparation.
+        findings: gets the refusals.
+
+    Returns:
+        The prepared crop; None if full images are rendered.
     """
-    if find_crop_refusal(problem) is None:
+    can_be_cropped = find_crop_refusal(problem) is None
+    if can_be_cropped:
         crop = CroppedSearch(problem, problem.steps)
         findings.crop_refusal = _prepare(crop, stages)
         if findings.crop_refusal is None:
@@ -383,7 +413,8 @@ class Searches:
         stages: reports the progress.
         findings: findings so far; their `predictor` predicts images.
         printable: whether objectives include print terms.
-        close_looks: further renders of candidates that are close to the best, at most.
+        close_looks: largest number of further renders of candidates that are close to
+            the best.
     """
 
     journal: Journal
@@ -410,7 +441,7 @@ class Searches:
         hint = f"{n_renders} pictures of {samples} a pixel; {shorter}"
         predictor = self.findings.predictor
         if predictor is not None and predictor.count_predicted("search", steps):
-            n_traced = n_renders - steps
+            n_traced = n_renders - steps  # of the ranking, which is always rendered
             hint = f"{steps} pictures predicted and {n_traced} traced; {shorter}"
         self.stages.begin(name, title, n_renders, hint=hint, at_most=True)
 
@@ -445,7 +476,7 @@ class Searches:
         domain: Domain | None = None,
         ranked: bool = True,
     ) -> SearchResult:
-        """Search with one policy, reading back what is stored already.
+        """Search with one policy; stored evaluations are read instead of made again.
 
         Args:
             kind: kind of its rows.
@@ -462,37 +493,8 @@ class Searches:
             KeyboardInterrupt: it was interrupted; the result of an interrupted main
                 search is in `findings` before.
         """
-        renders_before = 0
-        # every so many steps an image is kept
-        frame_interval = max(1, math.ceil(steps / MAX_FRAMES))
-        predictor = self.findings.predictor
-
-        def on_step(record: StepRecord, u: Tensor, evaluation: Evaluation) -> None:
-            """Keep the image of a step, if it has one, and report its renders."""
-            nonlocal renders_before
-            if evaluation.picture is not None and frames is not None:
-                frames.append(evaluation.picture.numpy())
-            new_renders = record.renders - renders_before
-            self.stages.progress.advance(
-                new_renders, best=record.best, **self.journal.evaluator.progress_stats
-            )
-            renders_before = record.renders
-
-        def request_image(query: Query) -> Query:
-            is_due = query.phase == "search" and query.index % frame_interval == 0
-            return replace(query, with_image=is_due)
-
-        def ignore_replay(query: Query) -> None:
-            """Do nothing: rendering has no state that stored evaluations change."""
-
-        def evaluate(queries: Sequence[Query]) -> Iterator[Evaluation]:
-            if frames is not None:
-                queries = [request_image(query) for query in queries]
-            on_replay = ignore_replay if predictor is None else predictor.replay
-            return self.journal.evaluate_all(queries, self._evaluate, on_replay)
-
         result = search(
-            evaluate,
+            self._make_evaluate(steps, has_frames=frames is not None),
             self._mark_domain(domain or self.problem.domain, policy),
             policy,
             steps=steps,
@@ -500,7 +502,7 @@ class Searches:
             candidates=N_RANKED if ranked else 0,
             max_extra_repeats=self.close_looks,
             is_out_of_time=self.journal.make_time_check(kind, seconds),
-            on_step=on_step,
+            on_step=self._make_step_report(frames),
             kind=kind,
             render_seed=self.problem.seed,
         )
@@ -510,14 +512,68 @@ class Searches:
             raise KeyboardInterrupt
         return result
 
+    def _make_evaluate(
+        self, steps: int, *, has_frames: bool
+    ) -> Callable[[Sequence[Query]], Iterator[Evaluation]]:
+        """Return the function that evaluates the queries of a search.
+
+        Args:
+            steps: steps of the search.
+            has_frames: whether evaluations have an image at most `MAX_FRAMES` times, in
+                evenly spaced steps.
+        """
+        frame_interval = max(1, math.ceil(steps / MAX_FRAMES))
+        predictor = self.findings.predictor
+
+        def request_image(query: Query) -> Query:
+            """Return the query, with an image if its step is one of those with it."""
+            is_due = query.phase == "search" and query.index % frame_interval == 0
+            return replace(query, with_image=is_due)
+
+        def ignore_replay(query: Query) -> None:
+            """Do nothing: rendering has no state that stored evaluations change."""
+
+        def evaluate(queries: Sequence[Query]) -> Iterator[Evaluation]:
+            """Evaluate queries, or replay what is stored of them."""
+            if has_frames:
+                queries = [request_image(query) for query in queries]
+            on_replay = ignore_replay if predictor is None else predictor.replay
+            return self.journal.evaluate_all(queries, self._evaluate, on_replay)
+
+        return evaluate
+
+    def _make_step_report(
+        self, frames: list[Any] | None
+    ) -> Callable[[StepRecord, Tensor, Evaluation], None]:
+        """Return the function that reports each step of a search.
+
+        Args:
+            frames: gets the images of steps that have one; None to drop them.
+        """
+        renders_before = 0
+
+        def report_step(record: StepRecord, u: Tensor, evaluation: Evaluation) -> None:
+            """Store the image of a step, if it has one, and report its renders."""
+            nonlocal renders_before
+            if evaluation.picture is not None and frames is not None:
+                frames.append(evaluation.picture.numpy())
+            new_renders = record.renders - renders_before
+            self.stages.progress.advance(
+                new_renders, best=record.best, **self.journal.evaluator.progress_stats
+            )
+            renders_before = record.renders
+
+        return report_step
+
     def _evaluate(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
         """Evaluate queries with predicted or rendered images.
 
-        Only steps of a search are predicted. Its ranking is rendered, in the window of
-        the predictor, and what verifies in full. Print terms are subtracted from the objective.
+        A predictor predicts the steps of a search. The ranking of the best
+        configurations is rendered, but only the window of the image that the predictor
+        covers. Print terms are subtracted from the objective.
 
         Args:
-            queries: all of one phase.
+            queries: all of one phase, "search" or "ranking".
         """
         traced = self.journal.evaluator
         predictor = self.findings.predictor
@@ -529,11 +585,10 @@ class Searches:
             evaluations = predictor.evaluate_all(queries, traced)
         for query, evaluation in zip(queries, evaluations, strict=True):
             has_print_terms = self.printable and query.kind != UNPRINTED
-            yield (
-                subtract_print_penalty(evaluation, self.problem.searched_space, query.u)
-                if has_print_terms
-                else evaluation
-            )
+            if has_print_terms:
+                space = self.problem.searched_space
+                evaluation = subtract_print_penalty(evaluation, space, query.u)
+            yield evaluation
 
 
 def _choose_verification_samples(
@@ -557,11 +612,11 @@ def _choose_verification_samples(
 def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
     """Verify with fresh seeds what the searches claim, paired with the clean scene.
 
-    First the sample count is chosen, except for a search of the smallest change: that
-    lies where the prediction flips, so that no sample count settles the margin, and it
-    keeps the count that was chosen for the clean scene. Then the clean configuration,
-    the adversarial one, that without print terms and the random search's are tried with
-    equal seeds.
+    First the sample count is chosen, so that more samples would leave the margin on its
+    side. A search of the smallest change keeps the count that was chosen for the clean
+    scene: its result lies where the prediction flips, and no count suffices there. Then
+    the clean configuration, the adversarial one, that of the search without print terms
+    and that of the random search are tried with equal seeds.
 
     Args:
         verifier: verifier of the attack, whose state gets the results.
@@ -590,7 +645,8 @@ def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
     verifier.try_clean()
     findings.verification = verifier.verify("verification", candidate)
     if findings.verification.ending is Ending.ALREADY_WRONG:
-        # seen with other samples than before: no change at all flips the prediction
+        # The sample count is another one than in the search, and with it the clean
+        # scene is wrong: the smallest change is none at all.
         findings.bracket = None
     if unprinted is not None:
         findings.unprinted_verification = verifier.verify(
@@ -611,10 +667,11 @@ def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
 def _replace_if_random_is_worse(
     verifier: Verifier, result: SearchResult, baseline: SearchResult
 ) -> None:
-    """Use what the random search found if that is worse for the model.
+    """Replace the result of the policy by that of the random search if that is worse.
 
-    Having been chosen for its trials, it may just be lucky in them. So it is tried
-    again, and has to be worse in the fresh trials, too.
+    "Worse" is worse for the model. The random search's configuration would be chosen
+    for its trials, in which it may just be lucky. So it is tried again, and has to be
+    worse in fresh trials, too.
 
     Args:
         verifier: verifier of the attack, whose state is changed.
@@ -624,11 +681,9 @@ def _replace_if_random_is_worse(
     findings = verifier.state
     policy_verification = findings.verification
     random = findings.baseline_verification
-    if (
-        policy_verification is None
-        or random is None
-        or random.ending is not Ending.FOUND
-    ):
+    if policy_verification is None or random is None:
+        return
+    if random.ending is not Ending.FOUND:
         return
     if _rank(random) <= _rank(policy_verification):
         return
@@ -649,18 +704,20 @@ def _replace_if_random_is_worse(
         )
 
 
-# trials in a row that the upper end of a smallest epsilon has to pass, in as many
-# checks as have them
 MIN_CONFIRMING_TRIALS = 40
+"""Trials that the smallest epsilon has to pass at least, once the searches have ended.
+
+They are made in several checks, each of as many trials as a verification.
+"""
 
 
 def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -> None:
     """Bracket the smallest epsilon at which the model is wrong.
 
     Smaller and smaller budgets are searched. What a search claims is tried in trials
-    with seeds of their own. On the way, the fewest trials that can verify anything are
-    enough if none fails; the upper end of the bracket is tried again in full. The
-    result of the search becomes the configuration there.
+    with seeds of their own. While the bracket gets smaller, the fewest trials that can
+    verify anything are enough if none fails. At the end, the configuration at the upper
+    bound of the bracket is tried again in full; it is the result.
 
     Args:
         searches: searches of the attack.
@@ -670,6 +727,7 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
     problem = searches.problem
     findings = searches.findings
     n_trials = verifier.n_trials
+    max_failures = problem.rule.count_allowed_failures(n_trials)
     results: list[SearchResult] = []
     transport = None
     if isinstance(findings.predictor, Transport):
@@ -677,18 +735,9 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
 
     def search_inside(domain: Domain, number: int) -> Tensor:
         """Search a smaller domain, and return the best configuration (d,)."""
-        title = f"search {number + 1} of at most {MAX_SEARCHES}"
-        searches.start("search", title, problem.steps, "`steps` shortens each search")
-        result = searches.search(
-            f"search {number}" if number else "search",
-            policy,
-            problem.steps,
-            seeds.stream(problem.seed, "smallest", number),
-            domain=domain,
-            ranked=transport is None,  # what is predicted has no noise
-        )
+        result = _search_budget(searches, policy, domain, number)
         results.append(result)
-        # what was found if this is interrupted
+        # If the attack is interrupted before anything passes, this is its result.
         findings.search = findings.search or results[0]
         verifier.begin_stage(
             "trying smaller changes", MAX_CHECKS * n_trials, at_most=True
@@ -698,28 +747,19 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
     def passes(u: Tensor, check: int, min_trials: int = n_trials) -> bool:
         """Return whether a configuration (d,) passes a check.
 
-        It ends when too many trials have failed, or `min_trials` were made and none
-        failed, or after all trials. A configuration that passes becomes the search's
-        result so far.
+        One that passes becomes the search's result so far.
         """
-        max_failures = problem.rule.count_allowed_failures(n_trials)
-        scores = list[float]()
-        n_failures = 0
-        while len(scores) < n_trials and n_failures <= max_failures:
-            if n_failures == 0 and len(scores) >= min_trials:
-                break
-            (trial,) = verifier.try_configurations(f"check {check}", {len(scores): u})
-            scores.append(trial.score)
-            if not trial.success:
-                n_failures += 1
+        scores, has_passed = _try_until_decided(
+            verifier, u, check, min_trials, max_failures
+        )
         if transport is not None:
             transport.update_score_bias(u, scores)
-        has_passed = n_failures <= max_failures
         if has_passed:
             findings.search = replace(results[-1], best_u=u)
         return has_passed
 
     def passes_few(u: Tensor, check: int) -> bool:
+        """Return whether a configuration (d,) passes a check of few trials."""
         return passes(u, check, problem.rule.min_trials)
 
     bracket = find_smallest_change(
@@ -728,24 +768,101 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
         problem.domain,
         likely=None if transport is None else transport.is_likely_success,
     )
-    # `passes` makes `n_trials` trials: so many repeats make enough of them
-    n_repeats = math.ceil(MIN_CONFIRMING_TRIALS / n_trials)
+    bracket = _confirm(bracket, passes, verifier, problem.domain)
+    findings.bracket = bracket
+    findings.search = _combine_results(results, bracket)
+
+
+def _search_budget(
+    searches: Searches, policy: Policy[Any], domain: Domain, number: int
+) -> SearchResult:
+    """Search one of the smaller and smaller budgets.
+
+    Args:
+        searches: searches of the attack.
+        policy: policy that searches.
+        domain: domain with that budget.
+        number: number of the search, from 0.
+    """
+    problem = searches.problem
+    title = f"search {number + 1} of at most {MAX_SEARCHES}"
+    searches.start("search", title, problem.steps, "`steps` shortens each search")
+    # the first has the kind of the only search of another attack
+    kind = f"search {number}" if number else "search"
+    # The ranking renders the best configurations again. A matrix predicts them without
+    # noise, so that their order is known.
+    has_noise = not isinstance(searches.findings.predictor, Transport)
+    return searches.search(
+        kind,
+        policy,
+        problem.steps,
+        seeds.stream(problem.seed, "smallest", number),
+        domain=domain,
+        ranked=has_noise,
+    )
+
+
+def _confirm(
+    bracket: Bracket,
+    passes: Callable[[Tensor, int], bool],
+    verifier: Verifier,
+    domain: Domain,
+) -> Bracket:
+    """Try the configuration at the upper bound of a bracket again, in full checks.
+
+    Args:
+        bracket: the bracket, perhaps without any configuration.
+        passes: whether a configuration (d,) passes the check of a number.
+        verifier: verifier that tries it.
+        domain: domain with the full budget.
+    """
+    # so many full checks have `MIN_CONFIRMING_TRIALS` trials together
+    n_checks = math.ceil(MIN_CONFIRMING_TRIALS / verifier.n_trials)
     if bracket.u is not None:
         verifier.begin_stage(
             "checking the smallest change",
-            MAX_CONFIRMATIONS * n_repeats * n_trials,
+            MAX_CONFIRMATIONS * n_checks * verifier.n_trials,
             at_most=True,
         )
-    bracket = confirm_bracket(bracket, passes, problem.domain, times=n_repeats)
-    findings.bracket = bracket
-    findings.search = _combine_results(results, bracket)
+    return confirm_bracket(bracket, passes, domain, times=n_checks)
+
+
+def _try_until_decided(
+    verifier: Verifier, u: Tensor, check: int, min_trials: int, max_failures: int
+) -> tuple[list[float], bool]:
+    """Try a configuration until it passes a check or fails it.
+
+    The check ends when more than `max_failures` trials have failed, or `min_trials`
+    were made and none failed, or after all trials.
+
+    Args:
+        verifier: verifier that tries it.
+        u: (d,) the configuration.
+        check: number of the check.
+        min_trials: trials that are enough if none fails.
+        max_failures: failed trials with which a configuration still passes.
+
+    Returns:
+        The scores of the trials, and whether the configuration has passed.
+    """
+    n_trials = verifier.n_trials
+    scores = list[float]()
+    n_failures = 0
+    while len(scores) < n_trials and n_failures <= max_failures:
+        if n_failures == 0 and len(scores) >= min_trials:
+            break
+        (trial,) = verifier.try_configurations(f"check {check}", {len(scores): u})
+        scores.append(trial.score)
+        if not trial.success:
+            n_failures += 1
+    return scores, n_failures <= max_failures
 
 
 def _combine_results(results: Sequence[SearchResult], bracket: Bracket) -> SearchResult:
     """Return one result of several searches in smaller and smaller budgets.
 
-    It is that of the search that found the smallest change, or of the first if none
-    did, with the cost of all.
+    It is the result of the search that found the smallest change, or of the first if
+    none found any, but with the renders and gradients of all.
 
     Args:
         results: results of the searches.
@@ -778,15 +895,15 @@ def _rank(verification: Verification) -> tuple[bool, float, float]:
     )
 
 
-MAX_TRIED_FAILURES = 8  # the first of the list
+MAX_TRIED_FAILURES = 8  # of the failures that a search lists, the first
 
 
 def verify_failures(verifier: Verifier, result: SearchResult) -> None:
     """Verify the first of the different failures that a search found, each by itself.
 
-    This takes the trials of the adversarial configuration, with the seeds that the
-    control group had, up to the first that decides against it. Over conditions that
-    vary a failure takes hundreds of trials, and nothing is tried here.
+    The trials have the same seeds as those of the clean scene. They end with the first
+    one after which a failure can no longer be verified. Nothing is tried if conditions
+    vary by chance: a failure would take hundreds of trials.
 
     Args:
         verifier: verifier of the attack.
@@ -798,8 +915,9 @@ def verify_failures(verifier: Verifier, result: SearchResult) -> None:
     rule = problem.rule
     if known is None or not known.examples or rule.is_conditional:
         return
-    # A model that is wrong about the clean scene fails without any change.
-    if rule.is_already_wrong(count_right(findings.clean_trials, 1)):
+    # If the model is wrong about the clean scene, a failure says nothing.
+    clean_counts = count_right(findings.clean_trials, 1)  # at any sample count
+    if rule.is_already_wrong(clean_counts):
         return
     failures = known.examples[:MAX_TRIED_FAILURES]
     verifier.begin_stage(

@@ -61,8 +61,8 @@ from advsearch.statistics.intervals import clopper_pearson
 from advsearch.tasks import make_task
 from advsearch.trust.writing import LOCK, PART, storage_errors, write_bytes
 
-# that one attack may take on a worker before it counts as hanging
 MAX_ATTACK_SECONDS = 6 * 3600.0
+"""Seconds that one attack may take on a worker before it counts as hanging."""
 TEXTS = (".json", ".html", ".yaml")  # files that may have the path of the run
 # Endings after which an object is not attacked with a larger epsilon
 SETTLED = ("found", "already wrong")
@@ -135,10 +135,10 @@ def _curve_chains(config: AttackConfig) -> list[Chain]:
 
 
 def attacks_of(settings: JsonObject) -> BatchFunction:
-    """Return the function by which a worker makes attacks of a study.
+    """Return the function by which a worker makes the attacks of a chain.
 
-    It takes the index of a chain, and returns of each attack the name of its directory,
-    where that was, and its files.
+    It takes a list of one number, the index of the chain. It returns, for each attack,
+    the name of its directory, the path where that was, and its files by relative path.
 
     Args:
         settings: settings of the study.
@@ -146,7 +146,7 @@ def attacks_of(settings: JsonObject) -> BatchFunction:
     chains = make_chains(AttackConfig(**settings))
 
     def make_chain(numbers: Sequence[int]) -> list[tuple[str, str, dict[str, bytes]]]:
-        """Make the attacks of the chain with the only one of these numbers."""
+        """Make the attacks of the chain that the only number is the index of."""
         finished = []
         clean = CleanMatrix()
         with tempfile.TemporaryDirectory(prefix="advsearch-part-") as directory:
@@ -202,26 +202,28 @@ def distribute_attacks(
     )
     with open_workers(
         work,
+        # without work no workers are started
         workers=config.workers if missing else None,
         cluster=config.cluster if missing else None,
         tell=progress.message,
     ) as executor:
-        if executor is None:
+        if executor is None:  # none are requested: this process makes the attacks
             return
         progress.stage("attacks on workers", len(missing))
         for done in executor.compute([index] for index in missing):
             _check_not_lost(chains, done)
             for name, worker_path, files in done.value:
                 _write_part(run, name, worker_path, files)
-            facts = executor.stats
-            values = {} if facts is None else {"workers": facts.workers}
-            progress.advance(1, **values)
+            stats = executor.stats
+            worker_counts = {} if stats is None else {"workers": stats.workers}
+            progress.advance(1, **worker_counts)
 
 
 def _check_not_lost(chains: Sequence[Chain], done: BatchResult) -> None:
     """Raise an error if the worker of an attack died."""
     if done.lost:
-        lost_attack = chains[done.items[0]][0]
+        chain_index = done.items[0]  # the only item of the batch
+        lost_attack = chains[chain_index][0]
         title = lost_attack.config.object
         if lost_attack.subject != title:
             title += f" with {lost_attack.subject}"
@@ -310,6 +312,7 @@ class StudyRun:
         )
 
         def run_attack(part_config: AttackConfig, **options: Any) -> AttackSummary:
+            """Make the attack with the shared matrix, and return its result."""
             return attack_once(part_config, clean=clean, **options).summary
 
         summary = run_part(path, config, self.progress, run_attack)
@@ -482,10 +485,12 @@ def matrix(context: RunContext[AttackConfig]) -> MatrixResult:
         check_from_config(_with_model(config, name))
 
     study = StudyRun(context)
-    summaries = {attack.subject: study.run_attack(attack) for (attack,) in study.chains}
-    attacked = {
-        name: summary for name, summary in summaries.items() if summary is not None
-    }
+    attacked = dict[str, AttackSummary]()
+    for (attack,) in study.chains:  # a chain of a matrix is a single attack
+        summary = study.run_attack(attack)
+        if summary is not None:  # None: not made, after an interrupt
+            attacked[attack.subject] = summary
+    # `_try_on_models` fills these: an interrupt leaves what was done before it
     models: list[MatrixModel] = []
     cells: dict[str, list[MatrixCell]] = {}
     configurations = _read_configurations(attacked)
@@ -572,18 +577,9 @@ def _try_on_models(
         for name, u in configurations.items():
             title = f"trying the scene against {name} on every model"
             study.progress.stage(title, n_predictions, hint=hint)
-            verifications = [
-                retrials.try_adversarial(name, u, condition) for condition in conditions
-            ]
             cells[name] = [
-                MatrixCell(
-                    model=condition.name,
-                    ending=verification.ending.value,
-                    verified=make_verified_rate(verification),
-                )
-                for condition, verification in zip(
-                    conditions, verifications, strict=True
-                )
+                _try_adversarial(retrials, name, u, condition)
+                for condition in conditions
             ]
 
 
@@ -611,6 +607,25 @@ def _try_clean(retrials: Retrials, condition: RetrialCondition) -> MatrixModel:
     )
 
 
+def _try_adversarial(
+    retrials: Retrials, name: str, u: Tensor, condition: RetrialCondition
+) -> MatrixCell:
+    """Return what a model predicts of an adversarial scene.
+
+    Args:
+        retrials: makes the trials.
+        name: the model that was attacked.
+        u: (d,) the configuration of the scene.
+        condition: has the model that is tried.
+    """
+    verification = retrials.try_adversarial(name, u, condition)
+    return MatrixCell(
+        model=condition.name,
+        ending=verification.ending.value,
+        verified=make_verified_rate(verification),
+    )
+
+
 def models_worker(settings: JsonObject) -> BatchFunction:
     """Return the function by which a worker evaluates queries of several models.
 
@@ -620,7 +635,9 @@ def models_worker(settings: JsonObject) -> BatchFunction:
     config = AttackConfig(**settings)
 
     def load_problem(name: str) -> Problem:
-        return problem_from_config(_with_model(config, name))[0]
+        """Return the problem of a model, by which queries name it."""
+        problem, _ = problem_from_config(_with_model(config, name))
+        return problem
 
     return make_worker_call(cache(load_problem))
 

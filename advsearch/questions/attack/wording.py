@@ -26,6 +26,11 @@ _REASONS = {
 }
 """Why a search ended without finding anything, by its ending, unless that says it."""
 
+ITS_OBJECT = ("object", "all")
+"""Values of the setting `judge` with which the object is evaluated: alone, or with all
+things near it. Other values name a single other thing.
+"""
+
 _RENDER_KINDS = {
     "search": "of the search",
     "gradient": "gradients",
@@ -37,7 +42,7 @@ _RENDER_KINDS = {
 
 
 def attack_verdict(summary: AttackSummary) -> str:
-    """Return what the run found, in one sentence that holds on its own."""
+    """Return what the run found, in sentences that need nothing before them."""
     ending = summary.ending
     verified = summary.verified
     thing = _name_thing(summary)
@@ -53,6 +58,7 @@ def attack_verdict(summary: AttackSummary) -> str:
         return _unverified_verdict(summary, thing)
     has_paths = summary.drive is not None and len(summary.drive.paths) > 1
     rate = words.format_rate(verified) + condition_text(summary.over, has_paths)
+    # "the model is wrong about this mug", "makes the model miss this mug"
     claim, goal = _clauses(summary, thing)
     if ending == "found":
         error = _error_clause(summary, verified, thing, claim)
@@ -64,7 +70,7 @@ def attack_verdict(summary: AttackSummary) -> str:
             f"The search claims a wrong prediction that is not confirmed: {claim} "
             f"in {rate}."
         )
-    # the search has ended without finding anything
+    # else the search has found nothing
     reason = _REASONS.get(ending, f"The search ended: {ending}.")
     return (
         f"No change of {budget_text(summary)} was found that {goal}: {claim} in "
@@ -99,20 +105,20 @@ def _name_thing(summary: AttackSummary) -> str:
     It is the object or a thing near it; the object of a file has the file's name.
     """
     name = summary.judge
-    if summary.judge in ("object", "all"):
+    if summary.judge in ITS_OBJECT:
         name = PurePath(summary.object).stem
     thing = "this " + name.replace("-", " ").replace("_", " ")
     return f"{thing} or a thing beside it" if summary.judge == "all" else thing
 
 
 def _random_search_remark(summary: AttackSummary, verified: VerifiedRate) -> str:
-    """Return what the random search says about a found scene; empty if nothing."""
+    """Return a remark on a found scene if the random search did as well; else empty."""
     if summary.answer_from == "random":
         return " Random search found it, and the policy nothing as bad."
     random_rate = summary.baseline.verified if summary.baseline else None
-    if random_rate is not None and random_rate.rate >= verified.rate > 0:
-        return " Random search finds as much."
-    return ""
+    if random_rate is None or verified.rate <= 0:
+        return ""
+    return " Random search finds as much." if random_rate.rate >= verified.rate else ""
 
 
 def condition_text(over: Sequence[str], has_several_paths: bool = False) -> str:
@@ -135,13 +141,17 @@ def condition_text(over: Sequence[str], has_several_paths: bool = False) -> str:
 
 
 def make_remarks(summary: AttackSummary) -> list[str]:
-    """Return what a reader of the result has to know."""
+    """Return the remarks on a result: on the clean scene, on the random search, warnings."""
     texts = [_clean_remark(summary), _baseline_remark(summary)]
     return [text for text in texts if text] + summary.warnings
 
 
 def _clean_remark(summary: AttackSummary) -> str:
-    """Return in how many trials the clean scene fails; empty if in none."""
+    """Return in how many trials the model is wrong about the clean scene.
+
+    Empty if in none, if the verdict is about nothing else, or if the search makes the
+    object easier to recognise, for which a wrong clean scene is no fault.
+    """
     control = summary.clean.control
     if control is None or summary.ending == "already wrong" or summary.minimises:
         return ""
@@ -153,6 +163,7 @@ def _clean_remark(summary: AttackSummary) -> str:
     not_a_number = ""
     if control.not_a_number:
         not_a_number = f"; in {control.not_a_number} the output is not a number"
+    # over conditions, only trials with a right clean scene count
     not_counted = " They do not count." if summary.over else ""
     return (
         f"The clean scene itself fails {n_failures} of its {control.trials} "
@@ -161,8 +172,9 @@ def _clean_remark(summary: AttackSummary) -> str:
 
 
 def _baseline_remark(summary: AttackSummary) -> str:
-    """Return whether the random search did as well as the policy; empty if not."""
+    """Return a remark if the random search did as well as the policy; else empty."""
     verified = summary.verified
+    # the policy's own, if the random search's configuration became the scene
     policy_rate = summary.policy_verified
     random_rate = summary.baseline.verified if summary.baseline else None
     if summary.answer_from == "random" and policy_rate:
@@ -175,13 +187,13 @@ def _baseline_remark(summary: AttackSummary) -> str:
         )
     if verified is None or random_rate is None:
         return ""
-    if random_rate.rate < verified.rate or random_rate.rate <= 0:
-        return ""
     successes = f"{random_rate.successes} of {random_rate.trials}"
-    comparison = f"as well: {successes}. The policy adds nothing here."
+    text = "Random search with as many renders does"
+    if random_rate.rate <= 0 or random_rate.rate < verified.rate:
+        return ""
     if random_rate.rate > verified.rate:
-        comparison = f"better: {successes}."
-    return f"Random search with as many renders does {comparison}"
+        return f"{text} better: {successes}."
+    return f"{text} as well: {successes}. The policy adds nothing here."
 
 
 def success_name(summary: AttackSummary) -> str:
@@ -200,7 +212,11 @@ def goal_text(summary: AttackSummary) -> str:
 
 
 def objective_text(summary: AttackSummary) -> str:
-    """Return the objective in the trials; empty if the success says as much."""
+    """Return the objective in the trials.
+
+    Empty if it is not known, or if a trial is a success exactly where it is over 0: the
+    rate says as much.
+    """
     objective = summary.tried_objective
     if objective is None or summary.objective in words.SUCCESS_ABOVE_ZERO:
         return ""
@@ -227,7 +243,10 @@ def drive_text(summary: AttackSummary) -> str:
 
 
 def smallest_text(summary: AttackSummary) -> str:
-    """Return the smallest epsilon and the largest without success; empty without."""
+    """Return the smallest epsilon with a wrong prediction, and the largest without one.
+
+    Empty if the smallest was not searched.
+    """
     bracket = summary.smallest
     if bracket is None:
         return ""
@@ -266,18 +285,21 @@ def budget_text(summary: AttackSummary) -> str:
     """Return what could change and how far: ``texture within 0.1 (linf)``."""
     epsilon = summary.epsilon
     norm = summary.norm
-    if isinstance(epsilon, dict) or isinstance(norm, dict):
-        epsilons = epsilon if isinstance(epsilon, dict) else {}
-        norms = norm if isinstance(norm, dict) else {}
-        return " and ".join(
-            _within_text(name, epsilons.get(name), norms.get(name))
-            for name in summary.controls
-        )
-    names = " and ".join(summary.controls) or "nothing"
-    return _within_text(names, epsilon, norm)
+    # With several controls both are mappings by control.
+    has_several_budgets = isinstance(epsilon, dict) or isinstance(norm, dict)
+    if not has_several_budgets:
+        names = " and ".join(summary.controls) or "nothing"
+        return _within_text(names, epsilon, norm)
+    epsilons = epsilon if isinstance(epsilon, dict) else {}
+    norms = norm if isinstance(norm, dict) else {}
+    return " and ".join(
+        _within_text(name, epsilons.get(name), norms.get(name))
+        for name in summary.controls
+    )
 
 
 def _within_text(name: str, epsilon: object, norm: object) -> str:
+    """Return a control's name with its budget; without an epsilon, the name alone."""
     if not isinstance(epsilon, (int, float)):
         return name
     text = f"{name} within {format_number(epsilon)}"
@@ -317,11 +339,12 @@ def _error_clause(
 ) -> str:
     """Return what the model gets wrong, as in "The model calls this mug a vase".
 
-    If trials have several predictions, it says "most often" and the most frequent one,
-    or the outcomes of a detector. If their labels are not known, it is the prediction
-    in the stored image, and of other tasks than classification none at all. Of a
-    commanded action, or an easier scene, it is the claim, with the direction of the
-    action.
+    - Of a commanded action, or of a scene that is easier to recognise, it is the claim,
+      with the direction of the action.
+    - If all trials have one prediction, it is that.
+    - If they have several, it is the most frequent one, or the outcomes of a detector.
+    - If the labels of the trials are not known, it is the prediction in the stored
+      image of a classifier; of another task the clause names no prediction.
 
     Args:
         summary: summary of the attack.
@@ -330,17 +353,18 @@ def _error_clause(
         claim: clause for what a trial counts as, "the model is wrong about it" say.
     """
     labels = verified.labels
-    if summary.minimises or summary.task == words.COMMAND:
-        if not summary.minimises and not summary.target and len(labels) == 1:
+    only_label = next(iter(labels)) if len(labels) == 1 else None
+    if summary.minimises:
+        return _begin_upper(claim)
+    if summary.task == words.COMMAND:
+        if only_label is not None and not summary.target:
             # such as "(steering above it)"
-            direction = next(iter(labels)).replace("action outside its envelope ", "")
+            direction = only_label.replace("action outside its envelope ", "")
             claim = f"{claim} {direction}" if direction else claim
-        return claim[:1].upper() + claim[1:]
-    if len(labels) == 1:
+        return _begin_upper(claim)
+    if only_label is not None:
         outcome = words.get_only_outcome(verified.outcomes)
-        predicts = words.format_mistake(
-            summary.task, thing, next(iter(labels)), outcome
-        )
+        predicts = words.format_mistake(summary.task, thing, only_label, outcome)
         return f"The model {predicts}"
     if labels:
         return _mixed_error_clause(summary, verified, thing)
@@ -350,6 +374,11 @@ def _error_clause(
     if summary.adversarial:
         name = words.add_article(summary.adversarial.label)
     return f"The model takes {thing} for something else ({name})"
+
+
+def _begin_upper(clause: str) -> str:
+    """Return a clause as the beginning of a sentence."""
+    return clause[:1].upper() + clause[1:]
 
 
 def _mixed_error_clause(
@@ -381,9 +410,9 @@ def _mixed_error_clause(
 def _clauses(summary: AttackSummary, thing: str) -> tuple[str, str]:
     """Return what a trial counts as, and the goal of the search.
 
-    "the model is wrong about this mug", "makes the model miss this mug". Of a commanded
-    action no more is stated: nothing has moved. The claim is "it is wrong" where the
-    goal comes before it in a sentence.
+    "the model is wrong about this mug", "makes the model miss this mug". Where the goal
+    comes first in a sentence, which has named the model, the claim is "it is wrong". Of
+    a commanded action only the command is claimed: nothing has moved.
 
     Args:
         summary: summary of the attack.
@@ -422,7 +451,8 @@ def _clauses(summary: AttackSummary, thing: str) -> tuple[str, str]:
 def method_texts(summary: AttackSummary) -> dict[str, str]:
     """Return how an attack came to its result, by name; empty texts are left out."""
     segments = summary.light_path_segments
-    moved = [
+    # values of the scene that a control leaves out, and the ones that the search used
+    moved_texts = [
         f"{value.parameter} from {format_number(value.scene)} to "
         f"{format_number(value.used)} {value.unit}".rstrip()
         for value in summary.clean.moved
@@ -440,7 +470,7 @@ def method_texts(summary: AttackSummary) -> dict[str, str]:
         ),
         "Printability": _printability_text(summary),
         "Cost of printability": print_cost_text(summary),
-        "Moved before": ", ".join(moved),
+        "Moved before": ", ".join(moved_texts),
     }
     return {name: text for name, text in facts.items() if text}
 
@@ -526,6 +556,7 @@ def _printability_text(summary: AttackSummary) -> str:
 
 
 def _short(value: float) -> str:
+    """Return a number with three digits, also one that is not known."""
     return f"{value:.3g}" if math.isfinite(value) else "an unknown amount"
 
 
@@ -537,11 +568,13 @@ def transport_text(summary: AttackSummary) -> str:
     if not transport.used:
         text = "every picture was rendered"
         return f"{text}: {transport.reason}" if transport.reason else text
-    predictor = "light on surfaces" if transport.way == "surface light" else "a matrix"
     n_predicted = format_count(summary.renders.get("products"), "picture")
-    parts = [f"{predictor} predicted {n_predicted}"]
     if transport.way == "crop":
         parts = ["only the part of each picture was rendered that can change"]
+    elif transport.way == "surface light":
+        parts = [f"light on surfaces predicted {n_predicted}"]
+    else:
+        parts = [f"a matrix predicted {n_predicted}"]
     if transport.error is not None:
         parts.append(
             "at the last comparison with a traced one it was off by "

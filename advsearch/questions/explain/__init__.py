@@ -133,7 +133,7 @@ def explain(context: RunContext[ExplainConfig]) -> ExplainResult:
         environment=settings.join_names(sweep.summary.environment for sweep in sweeps),
         controls=sweeps[0].summary.controls,
         parameters=list(table.attrs["units"]),
-        # right, of, interval, share and outcomes of all rows
+        # the counts of all rows: right, total, interval, share and outcomes
         **vars(findings.count_right(table)),
         # draws, where several rows share one
         units=None if table["unit"].is_unique else table["unit"].nunique(),
@@ -174,11 +174,7 @@ def _analyze_rows(
     """
     # heavy, and the help of the command line reads this module
     from advsearch.extend import rules
-
-    # likewise
     from advsearch.questions.explain.envelope import find_envelope
-
-    # likewise
     from advsearch.questions.explain.importance import find_importance
 
     choosing, counting = rules.split_in_halves(table, config.seed)

@@ -138,10 +138,11 @@ def list_factor_peels(
 
 
 def _find_higher_low(values: rules.FloatArray) -> float:
-    """Return the `low` of a condition low < value <= high that leaves out the lowest
-    values (n,): `PEELED_FRACTION` of them, with the bound rounded to three digits.
+    """Return a lower bound that leaves out the lowest values (n,).
 
-    Where rounding would leave out none or all of them, just the lowest is left out.
+    Values above the bound stay. It leaves out `PEELED_FRACTION` of them, and is rounded
+    to three digits. If rounding would leave out none or all, just the lowest value is
+    left out.
     """
     lowest = values.min()
     low = _round_to_3_digits(np.quantile(values, PEELED_FRACTION))
@@ -150,11 +151,11 @@ def _find_higher_low(values: rules.FloatArray) -> float:
 
 
 def _find_lower_high(values: rules.FloatArray) -> float | None:
-    """Return the `high` of a condition low < value <= high that leaves out the highest
-    values (n,): `PEELED_FRACTION` of them, with the bound rounded to three digits.
+    """Return an upper bound that leaves out the highest values (n,).
 
-    Where rounding would leave out none or all of them, just the highest is left out.
-    None if all values are the same.
+    Values up to the bound stay. It leaves out `PEELED_FRACTION` of them, and is rounded
+    to three digits. If rounding would leave out none or all, just the highest value is
+    left out. None if all values are the same.
     """
     highest = values.max()
     high = _round_to_3_digits(np.quantile(values, 1.0 - PEELED_FRACTION))

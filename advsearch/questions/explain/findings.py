@@ -41,16 +41,19 @@ def describe_rule(rule: rules.CountedRule) -> dict[str, Any]:
 def make_rejected_rule(
     rule: rules.CountedRule | None, n_rows: int
 ) -> RejectedRule | None:
-    """Return the result of a rule that is not significant among `n_rows` rows; None
-    without a rule.
+    """Return the result of a rule that is not significant; None without a rule.
 
-    Its field `rows` is how many rows with the same rates would make it significant;
-    None if no number does.
+    Its field `rows` is the number of rows that would make it significant, if their
+    rates were the same; None if no number does.
+
+    Args:
+        rule: the rule.
+        n_rows: number of rows in which it was sought.
     """
     if rule is None:
         return None
-    needed_multiple = rule.find_needed_factor()
-    n_needed = None if needed_multiple is None else round_up(needed_multiple * n_rows)
+    needed_factor = rule.find_needed_factor()
+    n_needed = None if needed_factor is None else round_up(needed_factor * n_rows)
     return RejectedRule(
         **describe_rule(rule),
         chance=rule.p_value,

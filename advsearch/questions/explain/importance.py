@@ -81,7 +81,7 @@ def _find_interacting_pairs(
         table: the predictions and the values of their factors.
         sample: the same predictions.
     """
-    # as many groups of each factor that the cells of two have enough rows on average
+    # so few groups of each factor that the cells of two have enough rows on average
     n_groups = max(2, math.isqrt(sample.n_clusters // MIN_ROWS_PER_CELL))
     group_of_factor = {
         factor: cut_into_groups(table[factor], n_groups)
@@ -184,13 +184,13 @@ class ClusteredPredictions:
         """Estimate the fraction of the variance between groups with its 95 % interval.
 
         Groups of a factor without effect differ by chance, too. What that adds to the
-        fraction on average is subtracted: of independent rows as in the adjusted R
-        squared, of clusters by `expected_statistic`. If that is not known, or there is
-        one group only, nothing is shown: the fraction is 0, from 0 to 1.
+        fraction on average is subtracted: for independent rows as in the adjusted R
+        squared, for clusters by `expected_statistic`. If that is not known, or there is
+        a single group, nothing is shown: the fraction is 0, and its interval 0 to 1.
 
-        For the interval, rows times the fraction, divided by the design effect, is a
-        noncentral chi-squared statistic, or with clusters one of F. Its noncentrality
-        divided by the rows, and times the design effect, is the true fraction.
+        The interval: the statistic (rows times the fraction, divided by the design
+        effect) is noncentral chi-squared, or with clusters noncentral F. The true
+        fraction is its noncentrality, divided by the rows and times the design effect.
 
         Args:
             factors: their names.
@@ -258,13 +258,10 @@ class ClusteredPredictions:
         clusters_per_group = np.bincount(cell_group, minlength=len(group_weight))[
             is_used
         ]
-        # a variance inside each group needs two clusters there, and one over all of them
-        # more clusters than groups
-        if (
-            self.n_clusters < 2
-            or self.n_clusters <= n_groups
-            or clusters_per_group.min() < 2
-        ):
+        # a variance inside each group needs two clusters there, and that of the overall
+        # rate more clusters than groups
+        has_enough_clusters = self.n_clusters >= 2 and self.n_clusters > n_groups
+        if not has_enough_clusters or clusters_per_group.min() < 2:
             return math.nan
 
         squared_residual = np.bincount(
@@ -322,21 +319,23 @@ class ClusteredPredictions:
     ) -> float:
         """Return the p-value of the interaction of two factors.
 
-        Without an interaction, the statistic (rows times the explained fraction) of
-        both factors together is the sum of the statistics of each. What it is more than
-        that is chi-squared of (cells - first - second + 1) degrees of freedom, or, with
-        clusters and after division by its expectation, distributed as F. 1 if the
-        clusters are too few to tell.
+        The statistic of a grouping is the rows times its explained fraction. Without an
+        interaction, that of both factors together is the sum of those of each. The
+        excess over this sum is the test statistic. For independent rows it is
+        chi-squared of (cells - first - second + 1) degrees of freedom; with clusters it
+        is divided by its expectation, and distributed as F. 1 if the clusters are too
+        few to tell.
 
         Args:
             joint_group: (n,) the group of each prediction by both factors.
             first_group: (n,) by the first factor alone.
             second_group: (n,) by the second factor alone.
         """
-        joint_share, n_cells = self.explained_fraction(joint_group)
-        first_share, n_first = self.explained_fraction(first_group)
-        second_share, n_second = self.explained_fraction(second_group)
-        statistic = len(self.correct) * (joint_share - first_share - second_share)
+        joint_fraction, n_cells = self.explained_fraction(joint_group)
+        first_fraction, n_first = self.explained_fraction(first_group)
+        second_fraction, n_second = self.explained_fraction(second_group)
+        excess_fraction = joint_fraction - first_fraction - second_fraction
+        statistic = len(self.correct) * excess_fraction
         degrees = max(1, n_cells - n_first - n_second + 1)
         if self.is_independent:
             return float(chi2.sf(statistic, degrees))
@@ -345,7 +344,8 @@ class ClusteredPredictions:
         expected -= self.expected_statistic(first_group)
         expected -= self.expected_statistic(second_group)
         error_degrees = self.n_clusters - degrees - 1
-        if not expected > 0.0 or error_degrees < 1:  # NaN is not over 0 either
+        is_known = expected > 0.0  # NaN is not
+        if not is_known or error_degrees < 1:
             return 1.0
         return float(f_distribution.sf(statistic / expected, degrees, error_degrees))
 
@@ -379,8 +379,8 @@ def noncentrality_interval(
     At each end, the statistic is a quantile of 97.5 or 2.5 % (`find_noncentrality`,
     which has the arguments).
     """
-    # A statistic below its degrees of freedom, the expectation by chance alone, would
-    # make the interval end too early.
+    # By chance alone the statistic is expected to be its degrees of freedom. If it is
+    # smaller, the upper bound would be too small.
     upper_statistic = max(statistic, float(degrees))
     tail = (1.0 - statistics.intervals.CONFIDENCE) / 2.0
     lower = find_noncentrality(statistic, degrees, error_degrees, 1.0 - tail)

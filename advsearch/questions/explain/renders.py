@@ -163,9 +163,8 @@ class Renders:
         Args:
             index: index of the rule.
             rule: the rule.
-            uncovered_fraction: uncovered fraction of its rows, that no earlier rule
-                covers.
-            earlier_conditions: earlier conditions of the rules before it.
+            uncovered_fraction: fraction of its rows that no earlier rule covers.
+            earlier_conditions: conditions of the rules before it.
 
         Returns:
             A frame for each sweep, whose units are distinct from those of others.
@@ -177,7 +176,7 @@ class Renders:
                 self.config.confirm / len(self.sweeps) / n_arcs / uncovered_fraction
             )
             for arc in range(n_arcs):
-                # a different number for each rule, sweep and arc
+                # distinct for each rule, sweep and arc
                 number = (index * len(self.sweeps) + sweep_index) * MAX_ARCS + arc
                 seed = seeds.stream(self.config.seed, "confirm", number)
                 self.progress.message(
@@ -275,13 +274,13 @@ class Renders:
         wrong_value = failure[factor]
         values = frame_a[factor].tolist()  # the failure's own value is among them
         failure_row = values.index(wrong_value)
-        is_right = np.asarray(frame_a["correct"] & frame_b["correct"])
-        is_wrong_in_both = not (
-            frame_a["correct"][failure_row] or frame_b["correct"][failure_row]
-        )
-        if not is_wrong_in_both or not is_right.any():
+        is_right_in_both = np.asarray(frame_a["correct"] & frame_b["correct"])
+        is_right_in_any = np.asarray(frame_a["correct"] | frame_b["correct"])
+        if is_right_in_any[failure_row] or not is_right_in_both.any():
             return None
-        nearest_row = self._find_nearest_value(factor, is_right, values, wrong_value)
+        nearest_row = self._find_nearest_value(
+            factor, is_right_in_both, values, wrong_value
+        )
         return NearestRight(
             values=failure,
             parameter=factor,
@@ -447,7 +446,8 @@ class Renders:
     def _select_sweeps(self) -> list[int]:
         """Return the indices of the sweeps whose failures are clustered.
 
-        Features are those of one model: the first one that was swept by itself.
+        Features are those of one model: the first one that was swept by itself. Without
+        such a model no sweep is selected.
         """
         models_of_sweeps = [sweep.config.models for sweep in self.sweeps]
         single = next((names for names in models_of_sweeps if len(names) == 1), None)
@@ -517,9 +517,10 @@ def find_typical_failures(
 ) -> list[tuple[int, rules.RuleConditions]]:
     """Return the indices of failures, the most typical first, each with its rule.
 
-    Rules take turns, a row belongs to the first that covers it, and what fails under
-    none of them, with no conditions, is the last to take a turn. The most typical
-    failure of a rule is the one nearest to the mean of its failures, by ranks.
+    A failure belongs to the first rule that covers it. Rules take turns in giving their
+    next typical failure; what fails under none of them takes the last turn, with no
+    conditions. The most typical failure of a rule is nearest to the mean of its
+    failures, by the ranks of the parameters.
 
     Args:
         table: the rows.
@@ -527,12 +528,13 @@ def find_typical_failures(
         limit: failures that are returned, at most.
     """
     ranks = _rank_rows(table)  # (n, parameters)
-    is_left: rules.Mask = ~table["correct"].to_numpy()
-    queues = []
+    is_unassigned: rules.Mask = ~table["correct"].to_numpy()
     no_conditions: rules.RuleConditions = ()  # cover every row
+    # for each rule its failures, the most typical first
+    queues = []
     for conditions in (*(rule.conditions for rule in counted_rules), no_conditions):
-        indices = np.flatnonzero(is_left & rules.find_covered(conditions, table))
-        is_left[indices] = False
+        indices = np.flatnonzero(is_unassigned & rules.find_covered(conditions, table))
+        is_unassigned[indices] = False
         if not len(indices):
             continue
         distance = np.abs(ranks[indices] - ranks[indices].mean(axis=0)).sum(axis=1)
@@ -540,7 +542,7 @@ def find_typical_failures(
         queues.append([(index, conditions) for index in most_typical_first])
     failures = []
     for turn in zip_longest(*queues):
-        # None: the queue of a rule has ended
+        # a rule whose queue has ended has None
         failures += [failure for failure in turn if failure is not None]
     return failures[:limit]
 

@@ -268,7 +268,7 @@ def _make_headline(result: ExplainResult) -> str:
 
 def _pair_section(pair: NearestRight) -> ResultPart:
     """Return the sentence and the images of a failure and the nearest right image."""
-    unit = f" {pair.unit}" if pair.unit not in ("", "1") else ""
+    unit = "" if pair.unit in wording.PLAIN_UNITS else f" {pair.unit}"
     wrong_value = _format_value(pair.wrong_at)
     right_value = _format_value(pair.right_at)
     text = (
@@ -432,8 +432,10 @@ def _make_rule_claim(number: int, rule: RuleRow) -> views.Claim:
 
 
 def _make_envelope_claim(box: EnvelopeRow) -> views.Claim:
-    """Return what is claimed of a box of values that holds, by the rows that did not
-    choose it.
+    """Return the claim that a model is right inside a box of parameter values.
+
+    One half of the rows chose the box. The claim counts the other half, which tested
+    it.
     """
     extent = box.make_extent("right, of rows that did not choose the box")
     where = wording.format_conditions(box.conditions)

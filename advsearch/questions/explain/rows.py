@@ -32,24 +32,21 @@ def read_predictions(sweeps: Sequence[workbench.StoredSweep]) -> pd.DataFrame:
         for name in SCENE_SETTINGS:
             if name in rows:
                 full_names = rows[name].astype(object)
-            else:
+            else:  # the same in all rows
                 full_names = pd.Series(getattr(sweep.summary, name), rows.index)
             rows[name] = full_names.map(wording.format_figure_value)
         rows["draw"] = name_draws(sweep, rows)
         rows["image"] = name_images(sweep, rows)
         frames.append(rows.assign(sweep=index))
 
-    # of each parameter that any sweep has, and of the settings, which have none
-    units = dict[str, str]()
-    for frame in frames:
-        units |= frame.attrs["units"]
-    units |= dict.fromkeys(SCENE_SETTINGS, "")
     table = pd.concat(frames, ignore_index=True)
-    table = table[~table.duplicated("image")].reset_index(drop=True)
+    is_repeated = table.duplicated("image")
+    table = table[~is_repeated].reset_index(drop=True)
+    units = _collect_units(frames)
     for name in units:
         if not pd.api.types.is_float_dtype(table[name]):
             table[name] = table[name].astype("category")
-    # the names of draws as numbers
+    # the number of each distinct draw
     table["unit"] = np.unique(table["draw"], return_inverse=True)[1]
     table = table.drop(columns=["draw", "image"])
     table["correct"] = (table["correct"] == 1) & rules.is_in_view(table)
@@ -57,17 +54,29 @@ def read_predictions(sweeps: Sequence[workbench.StoredSweep]) -> pd.DataFrame:
     return table
 
 
-def name_draws(sweep: workbench.StoredSweep, rows: pd.DataFrame) -> list[str]:
-    """Return a name of the draw of each row (n,), equal in all sweeps of the same draw.
+def _collect_units(frames: Sequence[pd.DataFrame]) -> dict[str, str]:
+    """Return the unit of each parameter that any of the frames has.
 
-    Draw k of a seed is the same in all sweeps, however many draws they have, and
-    whatever scenes these are placed in. Where nothing is drawn, images with the same
-    values differ in noise alone, and so do drives whose first frames have the same:
-    these share a name.
+    Object, environment and model are among them, without a unit.
     """
-    if sweep.summary.sampler is not None:
+    units = dict[str, str]()
+    for frame in frames:
+        units |= frame.attrs["units"]
+    return units | dict.fromkeys(SCENE_SETTINGS, "")
+
+
+def name_draws(sweep: workbench.StoredSweep, rows: pd.DataFrame) -> list[str]:
+    """Return a name of the draw of each row (n,): rows of the same draw are dependent.
+
+    Draw k of a seed is the same in all sweeps, however many draws they have, and in all
+    scenes. If nothing is drawn by chance, rows with the same values differ in noise
+    alone, and share a name. So do all rows of drives whose first frames have the same
+    values.
+    """
+    is_sampled = sweep.summary.sampler is not None
+    if is_sampled:
         return [f"draw {sweep.config.seed} {unit}" for unit in rows["unit"]]
-    # all that a draw is made of, but not what is predicted of it
+    # all that decides an image, but not what is predicted of it
     columns = [
         name
         for name in ("object", "environment", *rows.attrs["units"])
@@ -86,9 +95,11 @@ def name_draws(sweep: workbench.StoredSweep, rows: pd.DataFrame) -> list[str]:
 def name_images(sweep: workbench.StoredSweep, rows: pd.DataFrame) -> list[str]:
     """Return a name of each row (n,), equal for the same prediction of the same image.
 
-    It consists of settings, number, values, model, and whether the prediction is right.
+    It consists of the settings that decide the image, the number of the row, the
+    values, and whether the prediction is right. Settings of how many images there are
+    (`EXTENT_SETTINGS`) decide no image.
     """
-    deciding = {
+    deciding_settings = {
         name: value
         for name, value in sweep.config.get_deciding_settings().items()
         if name not in EXTENT_SETTINGS
@@ -96,7 +107,9 @@ def name_images(sweep: workbench.StoredSweep, rows: pd.DataFrame) -> list[str]:
     parameters = [name for name in rows.attrs["units"] if name not in SCENE_SETTINGS]
     values = rows[[*SCENE_SETTINGS, *parameters]].astype(str).agg(" ".join, axis=1)
     cells = zip(rows["step"], values, rows["correct"], strict=True)
-    return [f"{deciding} {step} {text} {correct}" for step, text, correct in cells]
+    return [
+        f"{deciding_settings} {step} {text} {correct}" for step, text, correct in cells
+    ]
 
 
 def read_values(rows: pd.DataFrame, index: int) -> dict[str, float | str]:

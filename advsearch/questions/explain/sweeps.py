@@ -87,8 +87,10 @@ def count_axis_values(values: Any) -> int:
 def cut_scene_settings(
     config: SweepConfig, values_inside: Mapping[str, Sequence[Any]]
 ) -> dict[str, str | None]:
-    """Return the settings object, environment and model with only those names that have
-    rows under conditions; unchanged where there are no such rows.
+    """Return object, environment and model of a sweep that renders under conditions.
+
+    Each has only those names that have rows under the conditions; all names if there
+    are no such rows.
 
     Args:
         config: settings of the sweep.
@@ -110,17 +112,19 @@ def cut_controls(
 ) -> dict[str, dict[str, Any]]:
     """Return the controls of a sweep with their sampled ranges cut to conditions.
 
-    A range is cut to the bounds of its condition, but is not wider than the rows. It
-    stays as it is where it would pass the parameter's upper limit, as of an angle that
-    passes 360 degrees. If a control had no ranges, all of its parameters were sampled,
-    but would not be beside a range: then those without a condition get the ranges that
-    the rows have.
+    A range is cut to the bounds of its condition, but is not wider than the values of
+    the rows. A condition on an angle may be two arcs of the circle, of which the range
+    becomes one; an arc that passes 360 degrees is skipped, and the range stays.
+
+    A control without ranges samples all of its parameters, but one with a range for a
+    parameter samples that one alone. So if such a control gets a range, its other
+    parameters get the ranges that the rows have.
 
     Args:
         config: settings of the sweep.
         table: its rows.
         conditions: those of names, and of what was not sampled, are skipped.
-        arc: arc of an angle that may lie on either side, the index of the side.
+        arc: index of the arc of an angle.
     """
     controls = {name: dict(options) for name, options in config.controls.items()}
     for condition in conditions:
@@ -129,7 +133,7 @@ def cut_controls(
             continue
         instance, _, parameter = condition.factor.partition(".")
         declared = config.declared_parameters(instance) or {}
-        if condition.turn:  # an angle
+        if condition.turn:  # of an angle, a full turn
             low, high = condition.arcs[arc % len(condition.arcs)]
         else:
             low = max(condition.low, float(table[condition.factor].min()))
@@ -138,7 +142,6 @@ def cut_controls(
             continue
         has_ranges = bool(declared.keys() & config.controls[instance].keys())
         if not has_ranges:
-            # With a range for one parameter, the others would stay as they are.
             ranges = observed_ranges(config, table, instance, declared)
             for name, values in ranges.items():
                 controls[instance].setdefault(name, values)
@@ -185,6 +188,7 @@ def make_sweep_along(
         seed: seed of the noise.
     """
     values = list_values_along(table[factor], row[factor])
+    # a parameter is named "control.parameter"; object, environment and model are not
     grid: dict[str, object] = {
         name: [row[name]] for name in row if "." in name and is_settable(config, name)
     }
@@ -235,9 +239,10 @@ def list_values_along(column: pd.Series, first: float | str) -> list[float | str
 def select_choices(
     config: SweepConfig, grid: Mapping[str, object]
 ) -> dict[str, dict[str, Any]]:
-    """Return the choices of controls all of whose parameters are in a grid.
+    """Return the controls whose parameters are all in a grid, with their choices alone.
 
-    Such a control samples nothing, but its choices still matter.
+    A choice is a setting of a control that is no parameter, such as the kind of a
+    light. Such a control samples nothing, but its choices still decide the images.
     """
     controls = {}
     for instance, options in config.controls.items():
@@ -300,6 +305,7 @@ def make_minimal_config(config: SweepConfig, **changes: object) -> SweepConfig:
         "aov": None,
         "surface": False,
     }
-    # a sampler that was chosen would be refused where nothing is sampled
+    # Without controls nothing is sampled, and a sampler other than the default is
+    # refused.
     sampler = {} if changes.get("controls") else {"sampler": "sobol"}
     return SweepConfig(**{**config.to_json(), **quiet, **changes, **sampler})

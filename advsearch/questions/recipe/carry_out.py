@@ -263,24 +263,25 @@ def check_runs(runs: Sequence[PlannedRun]) -> dict[str, set[str]]:
 
 
 def _check_run(config: SceneConfig, search: SceneConfig | None) -> set[str]:
-    """Load what a run names, and return the parameters of its rows.
+    """Check a run by loading what it names, and return the parameters of its rows.
 
-    Those of a sweep are what its scenes describe. A run around the result of a search
-    is not loaded, since its ranges follow from the result; it has the parameters of the
-    search's controls.
+    The rows of a sweep have what its scenes describe. A run that samples around the
+    result of a search is not loaded, since its ranges follow from the result; its rows
+    have the parameters of the search's controls.
 
     Args:
         config: the settings of the run.
-        search: settings of the search; None of a run that samples around none.
+        search: settings of the search that the run samples around; None without one.
     """
-    if search is None and isinstance(config, SweepConfig):
+    samples_around = search is not None
+    if not samples_around and isinstance(config, SweepConfig):
         return workbench.row_parameters(config)
     columns = set[str]()
-    if search is None:
+    if not samples_around:
         columns.add(TRIAL_COLUMN)  # rows of an attack are its trials
         assert isinstance(config, AttackConfig)
         workbench.check_from_config(config)
-    source = search or config
+    source = search or config  # the settings with the controls
     for name in (*source.controls, *getattr(source, "over", {})):
         kind = name.partition(":")[0]
         parameters = []
@@ -288,7 +289,7 @@ def _check_run(config: SceneConfig, search: SceneConfig | None) -> set[str]:
             parameters = [
                 parameter.name for parameter in workbench.CONTROLS[kind].parameters
             ]
-        # A control that declares none gets its parameters from the scene.
+        # A control that declares none has parameters of the scene, whatever they are.
         columns |= {
             f"{name}.{parameter}" for parameter in parameters or [ANY_PARAMETER]
         }
@@ -369,7 +370,9 @@ def _check_column(
     Raises:
         InputError: if no part has it, or only some have.
     """
-    known = {*COMMON_COLUMNS, *([rates.GROUP_COLUMN] if recipe.groups else [])}
+    known = set(COMMON_COLUMNS)  # columns that all parts have
+    if recipe.groups:
+        known.add(rates.GROUP_COLUMN)
     if name in known:
         return
     # a control that does not declare its parameters may have this one

@@ -265,9 +265,11 @@ class PlannedRun:
 def plan_runs(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
     """Plan the runs of a recipe in the order in which they run.
 
-    A run has one object; a search has one environment and one model too. A directory is
-    named after the part, the number of the run in it, and what tells it from the
-    others; a run samples around the run of the same number and names of another part.
+    A part is a run for each object; if it is a search, for each object, environment and
+    model. The directory of a run is named after the part, the number of the run in it,
+    the object, and what else tells it from the others. A part may sample around the
+    results of another one: then each run samples around that with the same number and
+    names.
 
     Raises:
         InputError: if a part has a setting that its command lacks, or there are too
@@ -287,7 +289,7 @@ def plan_runs(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
                 if axis == "object" or len(axes[axis]) > 1
             ]
             suffix = f"{index:02d}-{make_directory_name(words)}"
-            # the run of the search has the same number and words
+            # the directory of the run that it samples around
             around = f"{part.around}-{suffix}" if part.around else part.around
             runs.append(
                 PlannedRun(
@@ -371,15 +373,15 @@ def _safe_name(text: str) -> str:
 
 
 def check_powers(recipe: Recipe, runs: Iterable[PlannedRun], name: str) -> None:
-    """Reject a part that would do more than its run, unless the recipe is bundled.
+    """Reject a part with power over more than its run, unless the recipe is bundled.
 
-    That is to connect to other machines, or to start more processes than there are
-    cores.
+    Such a part connects to other machines, or starts more processes than there are
+    cores. The recipe in a file may be anybody's.
 
     Raises:
         InputError: for the first such part.
     """
-    # a bundled recipe that a run has noted may have been changed there
+    # A run stores its recipe, and the stored one may have been changed.
     is_bundled = not is_file_name(name) and recipe == read_recipe(name)
     if not is_bundled:
         for run in runs:

@@ -26,8 +26,7 @@ from advsearch.questions.recipe.rates import (
 MAX_LETTERS = 85
 MIN_LETTERS = 4
 
-# a prediction with its count, and how many of these predictions are correct
-# how often a prediction is made, and how many of these are right
+# how often a prediction is given, and how many of these are right
 PredictionCount = tuple[ClusteredFraction, int]
 
 
@@ -194,8 +193,8 @@ def make_cues_figure(rows: Rows, options: CuesOptions) -> FigureContent:
 
     Its sentences also say which of both cues predicts the predictions better.
     """
-    # by texture: which predictions name it, and counts of those that name the object,
-    # and the texture
+    # All three are by texture: which predictions about it name the texture, and how
+    # many name the object and the texture.
     names_texture = dict[str, Any]()
     by_shape = dict[str, ClusteredFraction]()
     by_texture = dict[str, ClusteredFraction]()
@@ -237,8 +236,8 @@ def _describe_named(
         rows: rows with object and texture.
         names_texture: for each texture, whether the prediction of each of its rows
             (n,) names it.
-        options: options of the figure; a texture without `classes` has no name that a
-            prediction could have.
+        options: options of the figure. Its `classes` are the names of textures that a
+            prediction can have; a texture without any cannot be named.
     """
     text = [
         "The prediction is the object, whatever its texture: "
@@ -624,6 +623,7 @@ def _describe_ingredients(
     heads = ["prediction", "where most is", "given in", *rates.FRACTION_HEADS]
     for label, times in ranking:
         is_label = (rows[rates.PREDICTION_COLUMN] == label).to_numpy()
+        # for each ingredient how often the label is predicted where it is the largest
         tallies = []
         for index, name in enumerate(names):
             is_main = main_ingredient == index
@@ -672,15 +672,9 @@ def _draw_panels(
     for axes, (prediction, values) in zip(all_axes, panels.items(), strict=True):
         triangles = _draw_panel(axes, prediction, values, corners, names)
         known = [value for value in values if value is not None]
-        # The colors are from 0 to 1, or to negative margins. If normalised, they are
-        # from the smallest to the largest value; fractions still begin at 0.
-        lower = min([*known, 0.0])
-        upper = 1.0
-        if options.normalised and by_margin:
-            lower = min(known)
-        if options.normalised or by_margin:
-            upper = max([*known, 1e-9])  # above 0, where the colors begin
-        triangles.set_clim(lower, upper)
+        triangles.set_clim(
+            *_choose_color_range(known, by_margin, normalised=options.normalised)
+        )
         if options.normalised:
             figure.colorbar(
                 triangles, ax=axes, shrink=0.7, location="bottom", label=prediction
@@ -699,9 +693,11 @@ def find_triangle(mixture: Sequence[float], side: int) -> Triangle:
     """Return the triangle of a ternary diagram that three fractions (3,) lie in.
 
     A triangle is (a, b, points_down): the first two fractions times `side`, rounded
-    down, and whether it points down. With the third one, rounded likewise, they add up
-    to side - 1 in a triangle that points up, and to side - 2 in one that points down.
-    `side` is the number of triangles along a side of the diagram.
+    down, and whether it points down.
+
+    Args:
+        mixture: three fractions, whose sum is 1.
+        side: number of triangles along a side of the diagram.
     """
     a, b, c = (int(fraction * side) for fraction in mixture)
     # The sum is `side` at a corner, which several triangles share. It counts for one of
@@ -713,35 +709,38 @@ def find_triangle(mixture: Sequence[float], side: int) -> Triangle:
             b -= 1
         else:
             c -= 1
-    return a, b, a + b + c < side - 1
+    # The three numbers add up to `side` before they are rounded down, which takes 1 from
+    # the sum in a triangle that points up, and 2 in one that points down.
+    points_down = a + b + c < side - 1
+    return a, b, points_down
 
 
 def list_triangles(side: int) -> dict[Triangle, tuple[Mixture, Mixture, Mixture]]:
     """Return the triangles of a ternary diagram with the mixtures at their corners.
 
     The key of a triangle is (a, b, points_down): the first two fractions inside it,
-    times `side` and rounded down, and whether it points down.
+    times `side` and rounded down, and whether it points down. Two triangles have the
+    same a and b, and share an edge; at the side of the diagram where the third fraction
+    is small, there is only the one that points up.
 
     Args:
         side: number of triangles along a side of the diagram.
     """
 
     def mixture_at(x: int, y: int) -> Mixture:
-        """Return the fractions at the corner x and y steps along the first two."""
+        """Return the mixture whose first two fractions are x / side and y / side."""
         return x / side, y / side, (side - x - y) / side
 
     corners = {}
     for a in range(side):
         for b in range(side - a):
-            shared_edge = mixture_at(a + 1, b), mixture_at(a, b + 1)
-            corners[a, b, False] = (mixture_at(a, b), *shared_edge)
-            # along one side of the diagram no triangle points down
-            if a + b < side - 1:
-                corners[a, b, True] = (
-                    mixture_at(a + 1, b + 1),
-                    mixture_at(a, b + 1),
-                    mixture_at(a + 1, b),
-                )
+            # the ends of the edge that both triangles share
+            right = mixture_at(a + 1, b)
+            left = mixture_at(a, b + 1)
+            corners[a, b, False] = (mixture_at(a, b), right, left)
+            has_triangle_down = a + b < side - 1
+            if has_triangle_down:
+                corners[a, b, True] = (mixture_at(a + 1, b + 1), left, right)
     return corners
 
 
@@ -796,6 +795,29 @@ def _mean_interval(values: Float64Array, n_compared: int = 1) -> tuple[float, fl
 def _standard_error(values: Float64Array) -> float:
     """Compute the standard error of the mean of values (n,)."""
     return float(values.std(ddof=1)) / math.sqrt(len(values))
+
+
+def _choose_color_range(
+    values: Sequence[float], by_margin: bool, *, normalised: bool
+) -> tuple[float, float]:
+    """Return the values of the first and the last color of a ternary diagram.
+
+    Fractions have colors from 0 to 1, or if normalised to the largest of them. Margins
+    have colors up to the largest: from 0, or from the smallest if it is below 0 or if
+    they are normalised.
+
+    Args:
+        values: values of the triangles.
+        by_margin: whether these are margins, not fractions.
+        normalised: whether the range is that of the values.
+    """
+    lower = min([*values, 0.0])
+    upper = 1.0
+    if normalised and by_margin:
+        lower = min(values)
+    if normalised or by_margin:
+        upper = max([*values, 1e-9])  # above 0, where the colors begin
+    return lower, upper
 
 
 def _draw_panel(

@@ -65,7 +65,8 @@ def read_rows(
     Each row has `object`, `environment`, `model` and the parameters; the prediction
     (`answer`, `correct`, `margin`); `time`, when it was stored (seconds since 1970);
     and `unit`, the independent unit that it belongs to. Rows with the same draw of
-    the same seed share a unit, also across parts.
+    the same seed share a unit, also across parts. So do the trials of several attacks
+    that have the same number. Any other row is a unit by itself.
 
     Args:
         part: part of the recipe that the run belongs to.
@@ -77,21 +78,23 @@ def read_rows(
     """
     rows = list[dict[str, Any]]()
     units = dict[str, str]()
-    draws = None  # how the rows of a sweep follow from draws
+    sweep_units = None  # how the rows of a sweep follow from draws
     with Store.open_to_read(folder) as store:
         if summary.command == "sweep":
-            draws = workbench.read_units(store, is_sampled=summary.sampler is not None)
+            is_sampled = summary.sampler is not None
+            sweep_units = workbench.read_units(store, is_sampled=is_sampled)
         for row in store.rows():
             if row.kind not in kinds:
                 continue
             if row.kind == "sweep" and row.is_out_of_view:
                 continue
             units |= {name: stored["unit"] for name, stored in row.values.items()}
-            unit = f"{folder.name} {row.kind} {row.id}"  # each row by itself
-            if row.kind == "sweep" and draws is not None:
-                unit = f"{seed} {draws.find_unit(row.step)}"
             if summary.command == "attack":
                 unit = f"{seed} {row.step}"
+            elif row.kind == "sweep" and sweep_units is not None:
+                unit = f"{seed} {sweep_units.find_unit(row.step)}"
+            else:
+                unit = f"{folder.name} {row.kind} {row.id}"
             values = _read_row_values(row, summary)
             rows.append(
                 {**values, "time": row.time, PART_COLUMN: part, "unit": unit, **more}
@@ -174,7 +177,7 @@ def get_numeric_column(rows: Rows, name: str) -> Any:
 def format_unit(rows: Rows, name: str) -> str:
     """Format the unit of a column to follow a number: " m", or "" if it has none."""
     unit = rows.attrs["units"].get(name, "")
-    if unit in ("", "1", "name"):
+    if unit in (*wording.PLAIN_UNITS, "name"):  # "name" is that of a discrete choice
         return ""
     return f" {unit}"
 
@@ -456,10 +459,10 @@ def make_rates_figure(rows: Rows, options: RatesOptions) -> FigureContent:
     text = _describe_cells(cells, series, bin_centers is not None, options)
     text += _describe_series(cells, totals, series, options)
     if options.beside and len(baseline_rows):
+        # the part that all others are compared with: its bar comes first
         name = options.names.get(options.beside, options.beside)
         tallies = _count_series("", baseline_rows, series_values, options)
         text += _compare_with_baseline(name, tallies, totals, series, verb)
-        # the baseline comes first
         bars = {name: tallies, **cells}
 
     def draw(figure: Any) -> None:
@@ -552,7 +555,7 @@ def _name_series(series: Sequence[str], options: RatesOptions) -> list[str]:
 def _describe_cells(
     cells: Cells, series: Sequence[str], is_binned: bool, options: RatesOptions
 ) -> list[str]:
-    """Describe the lowest and the highest cell: over a map, or else of each series.
+    """Describe the lowest and the highest cell: of a map, or else of each series.
 
     Args:
         cells: for each row by its name, a tally for each series.
@@ -560,21 +563,9 @@ def _describe_cells(
         is_binned: whether the rows are bins of a number.
         options: options of the figure.
     """
-    verb = "wrong" if options.wrong else "right"
     if options.form == "map":
-        pairs = []
-        for row_name, tallies in cells.items():
-            names = _name_series(series, options)
-            for name, tally in zip(names, tallies, strict=True):
-                pairs.append(tally.with_name(f"{row_name} with {name}"))
-        return describe_extremes(
-            pairs,
-            lowest_prefix="The lowest pair",
-            highest_prefix="the highest",
-            things=f"pairs of {_name_columns(options)}",
-            verb=verb,
-        )
-
+        return _describe_map_cells(cells, series, options)
+    verb = "wrong" if options.wrong else "right"
     text = list[str]()
     where = f" where {options.axis_label}" if is_binned else ""
     has_several_series = len(series) > 1
@@ -592,6 +583,24 @@ def _describe_cells(
             verb=verb,
         )
     return text
+
+
+def _describe_map_cells(
+    cells: Cells, series: Sequence[str], options: RatesOptions
+) -> list[str]:
+    """Describe the lowest and the highest cell of all rows and series of a map."""
+    pairs = []
+    for row_name, tallies in cells.items():
+        names = _name_series(series, options)
+        for name, tally in zip(names, tallies, strict=True):
+            pairs.append(tally.with_name(f"{row_name} with {name}"))
+    return describe_extremes(
+        pairs,
+        lowest_prefix="The lowest pair",
+        highest_prefix="the highest",
+        things=f"pairs of {_name_columns(options)}",
+        verb="wrong" if options.wrong else "right",
+    )
 
 
 def _describe_series(
@@ -920,6 +929,17 @@ class AgreementOptions(Options):
         return (*self.of, PHOTOGRAPHS)
 
 
+AGREEMENT_HEADS = [
+    "rendering and",
+    "object",
+    # whether the model is right about the rendering, and about the other image
+    *("right, right", "right, wrong", "wrong, right", "wrong, wrong"),
+    "same prediction",
+    "agree",
+    *FRACTION_HEADS,
+]
+
+
 def make_agreement_figure(rows: Rows, options: AgreementOptions) -> FigureContent:
     """Compare predictions about renderings with those about other images of the same.
 
@@ -930,7 +950,7 @@ def make_agreement_figure(rows: Rows, options: AgreementOptions) -> FigureConten
     Raises:
         InputError: if a part has no rows or other configurations.
     """
-    # without the columns that only other parts have
+    # `dropna` leaves out the columns that only other parts have
     renderings = _select_part(rows, options.of[0]).dropna(axis=1, how="all")
     if renderings.empty:
         raise InputError(
@@ -938,10 +958,11 @@ def make_agreement_figure(rows: Rows, options: AgreementOptions) -> FigureConten
             f"{options.of[0]!r}, got none"
         )
     objects = [ALL_OBJECTS, *renderings["object"].unique()]
+    # for each object a tally of each series; a series compares with one part's images
     bars: dict[str, list[ClusteredFraction]] = {name: [] for name in objects}
+    series = list[str]()
     text = list[str]()
     table = list[list[Cell]]()
-    series = list[str]()
     for part in (PHOTOGRAPHS, *options.of[1:]):
         part_rows = _select_part(rows, part)
         if part == PHOTOGRAPHS and part_rows.empty:
@@ -949,6 +970,7 @@ def make_agreement_figure(rows: Rows, options: AgreementOptions) -> FigureConten
             continue
         pairs = _pair_rows(part_rows, renderings)
         n_unpaired = len(part_rows) - len(pairs)
+        # a photograph may show no rendering, but another part has to have all of them
         if part != PHOTOGRAPHS and n_unpaired:
             raise InputError(
                 f"figures: agreement: expected {part} to have the "
@@ -962,18 +984,10 @@ def make_agreement_figure(rows: Rows, options: AgreementOptions) -> FigureConten
         if part == PHOTOGRAPHS:
             text += _describe_photographs(len(pairs), n_unpaired)
 
-    four_heads = ["right, right", "right, wrong", "wrong, right", "wrong, wrong"]
     return FigureContent(
         title="Renderings and other pictures of the same",
         text=text,
-        columns=[
-            "rendering and",
-            "object",
-            *four_heads,
-            "same prediction",
-            "agree",
-            *FRACTION_HEADS,
-        ],
+        columns=AGREEMENT_HEADS,
         rows=table,
         draw=lambda figure: _draw_agreement(figure, bars, series),
         size=(6.0, 1.7 + 0.2 * len(series) + 0.34 * (len(bars) - 1)),
@@ -992,12 +1006,15 @@ def _add_agreement(
     table: list[list[Cell]],
     series_name: str,
 ) -> None:
-    """Add the agreement of pairs to the bars and the table, of all objects and of each.
+    """Add how often pairs of images agree to the bars and to the table of a figure.
+
+    Two images agree if the model is right about both, or wrong about both.
 
     Args:
-        bars: tallies by object, or `ALL_OBJECTS`; each gets one more.
+        bars: for each object, and for `ALL_OBJECTS`, the tallies of the series; these
+            pairs are one more series.
         pairs: pairs of renderings and other images.
-        table: rows of the table, to which one for each object is added.
+        table: rows of the table, to which one for each entry of the bars is added.
         series_name: name of the other images.
     """
     for name, tallies in bars.items():
@@ -1023,14 +1040,21 @@ def _draw_agreement(figure: Any, bars: Cells, series: Sequence[str]) -> None:
 
 
 def _pair_rows(part_rows: Rows, renderings: Rows) -> Rows:
-    """Join rows with the renderings of the same configuration.
+    """Join the rows of a part with the renderings of the same configuration.
 
-    A configuration is all columns of the renderings but those that say something of a
-    single row. Rows may have more parameters. Columns of a single row come twice: those
-    of the rendering end in `` rendered``.
+    A configuration is all columns of the renderings but those of a single row, such as
+    the prediction. Rows of the part may have further parameters. Columns of a single
+    row come twice: those of the rendering end in `` rendered``.
     """
-    per_row = {PREDICTION_COLUMN, PART_COLUMN, "correct", "margin", "time", "unit"}
-    configuration = [name for name in renderings if name not in per_row]
+    columns_of_row = {
+        PREDICTION_COLUMN,
+        PART_COLUMN,
+        "correct",
+        "margin",
+        "time",
+        "unit",
+    }
+    configuration = [name for name in renderings if name not in columns_of_row]
     return part_rows.merge(renderings, on=configuration, suffixes=("", " rendered"))
 
 
@@ -1092,14 +1116,15 @@ def _describe_photographs(n_pairs: int, n_unpaired: int) -> list[str]:
 
 
 def _describe_where(right: bool, pairs: Rows) -> str:
-    """Describe how often both predictions are right, or wrong, if the first one is.
+    """Describe how often the second prediction of a pair is like the first.
 
-    The first is about the rendering, the second about the other image of a pair. "It"
-    in the sentence is the model, of which the sentence before speaks.
+    The first is about a rendering, the second about another image. The sentence before
+    speaks of the model, which is "it" here.
 
     Args:
-        right: whether the first is right.
-        pairs: pairs of both.
+        right: selects the pairs in which the model is right about the rendering, or
+            else wrong.
+        pairs: pairs of a rendering and another image.
     """
     verb = "right" if right else "wrong"
     is_selected = pairs["correct rendered"] == right

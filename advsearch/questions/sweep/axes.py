@@ -131,14 +131,13 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
         instances: the sampled controls by name.
     """
     where = f"`grid` {name}"
-    control_name, _, rest = name.partition(".")
     # An instance may stand on either side: KIND:INSTANCE.PARAMETER, or
     # KIND.PARAMETER:INSTANCE.
-    parameter_name, last_colon, last_instance = rest.partition(":")
+    control_name, _, rest = name.partition(".")
     kind, first_colon, first_instance = control_name.partition(":")
-    if control_name in instances:
-        instance = control_name
-    else:
+    parameter_name, last_colon, last_instance = rest.partition(":")
+    instance = control_name
+    if control_name not in instances:
         instance = families.make_instance_name(kind, last_instance or first_instance)
     if name in _LISTED_SETTINGS:  # such as "model", which is no control
         raise InputError(
@@ -270,12 +269,14 @@ def parse_axis_values(
         InputError: they are no values of the parameter, or not different.
     """
     is_angle = parameter.periodic and parameter.unit == "degrees"
-    values: Sequence[Any] = (
-        raw_values if isinstance(raw_values, (list, tuple)) else [raw_values]
-    )
-    takes_range = not parameter.options  # the name of an option may have a colon
-    if isinstance(raw_values, str) and ":" in raw_values and takes_range:
+    can_be_range = not parameter.options  # the name of an option may have a colon
+    values: Sequence[Any]
+    if isinstance(raw_values, str) and ":" in raw_values and can_be_range:
         values = _parse_range(where, raw_values, is_angle)
+    elif isinstance(raw_values, (list, tuple)):
+        values = raw_values
+    else:
+        values = [raw_values]
     if not values:
         raise InputError(
             f"{where}: expected at least one value, got none; write "
@@ -285,7 +286,7 @@ def parse_axis_values(
     # NumPy's scalars become Python's
     choices = [value.item() if hasattr(value, "item") else value for value in values]
     spec = parse_spec(where, parameter, {"choices": choices})
-    assert isinstance(spec, OneOf)  # as choices always are
+    assert isinstance(spec, OneOf)  # it is what choices are parsed to
     _check_different(where, spec.values, is_angle)
     has_names = any(isinstance(value, str) for value in spec.values)
     if not parameter.options and not has_names:
@@ -329,6 +330,7 @@ def _check_single_precision(where: str, values: Sequence[Any]) -> None:
 
 
 def _format_value(value: ParameterValue) -> str:
+    """Return a value as an error message has it."""
     return value if isinstance(value, str) else f"{value:g}"
 
 
@@ -436,7 +438,11 @@ def add_grid_axes(
 
 
 def _sampled_settings(control: Control, scene: SceneDescription) -> dict[str, object]:
-    """Return the settings of a sampled control, with its default ranges spelled out."""
+    """Return the settings of a sampled control, with its default ranges stated.
+
+    A control without any range samples all its parameters in their default ranges. With
+    a range for one of them, which an axis of the grid is, only stated ranges count.
+    """
     # Kind and name are no parameters: the class and the instance state them.
     settings = {
         name: value
@@ -444,11 +450,11 @@ def _sampled_settings(control: Control, scene: SceneDescription) -> dict[str, ob
         if name not in ("kind", "name")
     }
     if control.has_requested_search:
-        # Ranges were set, so that its other parameters have no default range.
-        return settings
-    in_scene = control.with_scene(scene).resolve_parameter
-    for parameter in map(in_scene, control.parameters):
-        if parameter.name in control.specs or parameter.search is None:
+        return settings  # the user stated its ranges: no default ones
+    resolve_in_scene = control.with_scene(scene).resolve_parameter
+    for parameter in map(resolve_in_scene, control.parameters):
+        is_stated = parameter.name in control.specs
+        if is_stated or parameter.search is None:
             continue
         if parameter.options:
             settings[parameter.name] = {"choices": list(parameter.options)}
@@ -459,17 +465,19 @@ def _sampled_settings(control: Control, scene: SceneDescription) -> dict[str, ob
 
 @dataclass(frozen=True)
 class SampledNumber:
-    """A sampled number, as the table shows it.
+    """A sampled number, as tables show it: they count predictions by its parts.
+
+    Its draws are in [0, 1], which is cut into equal shares, one for each part. An
+    option of a choice that has more weight than others has several shares.
 
     Attributes:
         name: name of the parameter, with the index of a component.
         unit: unit of the values.
         column: its index among the draws.
-        parts: what equal parts of [0, 1] stand for: bounds [low, high] of a range each,
-            or values of a list.
+        parts: parts of its range, as bounds [low, high] each, or its options.
         same_in_all_scenes: whether `parts` are the same in every scene.
-        part_of_share: where values have weights, [0, 1] is cut into more equal shares
-            than there are values; the index of the value of each. Else empty.
+        part_of_share: the index of the part of each share, if options have weights;
+            else empty.
     """
 
     name: str
@@ -491,10 +499,12 @@ class SampledNumber:
 
     @property
     def edges(self) -> list[float] | None:
-        """The bounds of the parts, ascending; None of a list."""
-        if not self.same_in_all_scenes or not all(
-            isinstance(part, list) for part in self.parts
-        ):
+        """The bounds of the parts, ascending.
+
+        None of a choice, and of parts that differ between scenes.
+        """
+        are_ranges = all(isinstance(part, list) for part in self.parts)
+        if not self.same_in_all_scenes or not are_ranges:
             return None
         return sorted({bound for part in self.parts for bound in part})
 
@@ -549,7 +559,7 @@ class Points:
         space: the controls, bound to the scene; it starts from the scene as it is.
         domain: the budgets of the controls.
         axes: axes of the grid.
-        samples: at each point of the grid.
+        samples: number of samples at each point of the grid.
         sampler: how the draws are made, "sobol" or "random".
         seed: seed of the draws.
         repeat_after_scenes: after so many scenes the draws repeat, so that scenes that
@@ -559,8 +569,8 @@ class Points:
             turn; 1 without one.
 
     Attributes:
-        count: images of the scene.
-        n_parts: into which tables cut the range of each sampled number.
+        count: number of images of the scene.
+        n_parts: number of parts into which tables cut the range of a sampled number.
         sampled_numbers: the sampled numbers that tables show.
         sampled_layout: which numbers are sampled; the same for all scenes.
         is_sampled: whether anything is sampled: a control may have all its values from
@@ -582,7 +592,7 @@ class Points:
     ) -> None:
         self.grid = ProductIndex(tuple(len(axis.values) for axis in axes))
         self.samples = samples
-        self.count = self.grid.count * samples  # images of the scene
+        self.count = self.grid.count * samples
         self.n_parts = choose_n_parts(self.count * n_scenes)
         self.space = space
         self._start = domain.start.numpy().astype(np.float64)
@@ -590,38 +600,41 @@ class Points:
         self._upper = domain.upper.numpy()
         self._axes = {axis.name: (index, axis) for index, axis in enumerate(axes)}
         # `_assign_blocks` fills these lists. Blocks of few numbers share the sequence
-        # of the sampler; large ones have random draws, since Sobol numbers are for few.
+        # of the sampler; large ones have random draws, since Sobol sequences are for
+        # few dimensions.
         self._grid_coordinates: list[_GridCoordinate] = []
         self._small_blocks: list[_SampledBlock] = []
         self._large_blocks: list[_SampledBlock] = []
         self.sampled_numbers = tuple(self._assign_blocks(domain))
-        self._columns = [number.column for number in self.sampled_numbers]
-        # Tables divide the range of a sampled number into parts, which cut [0, 1] into
-        # equal shares: one for each part, or several for an option with more weight.
-        n_shares = [
-            len(number.part_of_share or number.parts) for number in self.sampled_numbers
-        ]
-        self._n_shares = np.array(n_shares, dtype=np.int64)
+        n_small = _count_columns(self._small_blocks)
+        n_large = _count_columns(self._large_blocks)
+        self._small_draws = SampleSequence(n_small, sampler, seed)
+        self._large_draws = SampleSequence(n_large, "random", seed, "large draws")
+        self.is_sampled = n_small + n_large > 0
+        self.sampled_layout = (n_small, self._list_sampled_layout())
 
-        small_dimensions = _count_columns(self._small_blocks)
-        large_dimensions = _count_columns(self._large_blocks)
-        self._small_draws = SampleSequence(small_dimensions, sampler, seed)
-        self._large_draws = SampleSequence(
-            large_dimensions, "random", seed, "large draws"
-        )
-        self.is_sampled = small_dimensions + large_dimensions > 0
         self.units = self._make_units(
             axes,
             images_until_repeat=repeat_after_scenes * self.count,
             n_photographs=n_photographs,
         )
-        # Scenes with the same layout get the same meaning from a draw.
-        numbers = tuple(
+        # of each number in the tables: its column among the draws, and its shares
+        self._columns = [number.column for number in self.sampled_numbers]
+        n_shares = [
+            len(number.part_of_share or number.parts) for number in self.sampled_numbers
+        ]
+        self._n_shares = np.array(n_shares, dtype=np.int64)
+        self._description_cache: dict[tuple[object, ...], Mapping[str, Value]] = {}
+
+    def _list_sampled_layout(self) -> tuple[tuple[str, int, int], ...]:
+        """Return name, column and number of parts of each number in the tables.
+
+        In scenes for which these are equal, a draw has the same meaning.
+        """
+        return tuple(
             (number.name, number.column, len(number.parts))
             for number in self.sampled_numbers
         )
-        self.sampled_layout = (small_dimensions, numbers)
-        self._description_cache: dict[tuple[object, ...], Mapping[str, Value]] = {}
 
     def _make_units(
         self, axes: Sequence[Axis], *, images_until_repeat: int, n_photographs: int
@@ -651,11 +664,12 @@ class Points:
         )
 
     def _assign_blocks(self, domain: Domain) -> Iterator[SampledNumber]:
-        """Fill the lists of grid coordinates and sampled blocks from the blocks.
+        """Decide for each block of coordinates where its values come from.
 
         A block is the coordinates of one parameter. If an axis of the grid has the
         parameter, its values come from there, else from columns of the draws: a column
-        for each coordinate, and in a ball one more for the length.
+        for each coordinate, and in a ball one more for the length. This fills the lists
+        of grid coordinates and of sampled blocks.
 
         Yields:
             The sampled numbers that tables show: those of short blocks, of controls
@@ -673,50 +687,59 @@ class Points:
                 continue
             is_small = block.size <= MAX_SOBOL_SIZE
             blocks = self._small_blocks if is_small else self._large_blocks
-            begin = _count_columns(blocks)  # the first column that is free
+            first_column = _count_columns(blocks)  # the first that is free
             is_ball = block.norm == "l2"
-            n_columns = block.size
-            if is_ball:
-                n_columns += 1  # for the length
-            columns = slice(begin, begin + n_columns)
+            n_columns = block.size + 1 if is_ball else block.size
+            columns = slice(first_column, first_column + n_columns)
             blocks.append(_SampledBlock(block, coordinates, columns))
             control = controls[group.control]
-            # In a ball a component has no range of its own.
-            is_in_tables = block.size <= MAX_TABLE_COMPONENTS and not is_ball
-            if is_in_tables and control.slots:  # a control without slots has no ranges
+            # A component of a ball has no range of its own, and neither has a parameter
+            # of a control without slots.
+            has_ranges = bool(control.slots) and not is_ball
+            if has_ranges and block.size <= MAX_TABLE_COMPONENTS:
                 yield from self._describe_sampled(
-                    control, group.parameter, coordinates, begin
+                    control, group.parameter, coordinates, first_column
                 )
 
     def _describe_sampled(
-        self, control: Control, name: str, coordinates: slice, begin: int
+        self, control: Control, name: str, coordinates: slice, first_column: int
     ) -> Iterator[SampledNumber]:
         """Yield the sampled numbers of a parameter, as tables show them.
+
+        A choice is one number, a vector has one for each component.
 
         Args:
             control: bound to the scene.
             name: name of its parameter.
             coordinates: coordinates of the parameter in a configuration.
-            begin: index of its first number among the draws.
+            first_column: index of its first number among the draws.
         """
         parameter, spec = _find_spec(control, name)
         full_name = f"{control.name}.{name}"
         if isinstance(spec, OneOf):
-            values = tuple(dict.fromkeys(spec.values))
-            shares: tuple[int, ...] = ()
-            if values != spec.values:  # a value with a weight comes several times
-                shares = tuple(map(values.index, spec.values))
+            options = tuple(dict.fromkeys(spec.values))
+            part_of_share: tuple[int, ...] = ()
+            has_weights = options != spec.values  # such an option comes several times
+            if has_weights:
+                part_of_share = tuple(map(options.index, spec.values))
             yield SampledNumber(
-                full_name, _stored_unit(parameter), begin, values, part_of_share=shares
+                full_name,
+                _stored_unit(parameter),
+                first_column,
+                options,
+                part_of_share=part_of_share,
             )
             return
-        for component, column in enumerate(range(coordinates.start, coordinates.stop)):
-            suffix = f".{component}" if parameter.shape else ""  # of a vector
+        is_vector = bool(parameter.shape)
+        for component, coordinate in enumerate(
+            range(coordinates.start, coordinates.stop)
+        ):
+            suffix = f".{component}" if is_vector else ""
             yield SampledNumber(
                 full_name + suffix,
                 parameter.unit,
-                begin + component,
-                self._cut_range(column, spec, log=parameter.log),
+                first_column + component,
+                self._cut_range(coordinate, spec, log=parameter.log),
             )
 
     def _cut_range(
@@ -752,21 +775,27 @@ class Points:
         """
         draws = self._sample(self._small_draws, first, count)
         shares = (draws[:, self._columns] * self._n_shares).astype(np.int64)
-        parts = np.minimum(shares, self._n_shares - 1)  # a draw may be 1
+        shares = np.minimum(shares, self._n_shares - 1)  # a draw of 1 is in the last
+        # A part has one share, unless it is an option among others with weights.
+        parts = shares
         for column, number in enumerate(self.sampled_numbers):
             if number.part_of_share:
                 parts[:, column] = np.take(number.part_of_share, parts[:, column])
         return parts
 
     def noise_number(self, number: int) -> int:
-        """Return the number of the noise of an image, by its number in the sweep."""
-        return number % self.units.again if self.units.again else number
+        """Return which noise an image has, by its number in the sweep.
+
+        Images whose draws repeat those of others have the same noise as these.
+        """
+        images_until_repeat = self.units.again  # 0 for never
+        return number % images_until_repeat if images_until_repeat else number
 
     def _sample(self, draws: SampleSequence, first: int, count: int) -> Float64Array:
         """Return the draws (count, k) of neighbouring images.
 
-        Those of a sweep over frames do not follow one another: all frames of a drive
-        have the same draw.
+        Neighbouring images have neighbouring draws, except in a sweep over frames, in
+        which all frames of a drive have the same draw.
 
         Args:
             draws: draws of k numbers.
@@ -875,7 +904,8 @@ class Points:
         indices = self._axis_indices(first_image, len(u))
         coordinates = u.split(self.space.sizes, dim=1)
         for control, control_u in zip(self.space.controls, coordinates, strict=True):
-            if _is_described_by_base(control):  # then all images at once, which is fast
+            if _is_described_by_base(control):
+                # all images at once, which is sixty times as fast
                 columns = self._describe_columns(control, control_u, indices)
                 for name, unit, values in columns:
                     for row, value in zip(rows, values, strict=True):
@@ -919,15 +949,17 @@ class Points:
         cached = self._description_cache.get(key)
         if cached is not None:
             return cached
-        if control.refines:  # takes inputs of other controls, and so needs all of u
+        if control.refines:  # it depends on other controls, and so needs all of u
             description = dict(self.space.describe(u, (control,)))
         else:
             description = dict(control.describe(control_u))
         for axis, index in axis_points:
             description[axis.name] = {"value": axis.values[index], "unit": axis.unit}
         # Only a description that follows from the axes alone holds for other images.
-        is_of_axes = not control.refines and len(axis_points) == len(control.groups)
-        if is_of_axes and len(self._description_cache) < MAX_CACHED_DESCRIPTIONS:
+        is_all_in_grid = len(axis_points) == len(control.groups)
+        follows_from_axes = is_all_in_grid and not control.refines
+        has_room = len(self._description_cache) < MAX_CACHED_DESCRIPTIONS
+        if follows_from_axes and has_room:
             self._description_cache[key] = description
         return description
 
@@ -939,8 +971,8 @@ class Points:
     ) -> Iterator[tuple[str, str, list[Any]]]:
         """Yield name, unit and values (n,) of each parameter of a control.
 
-        The values are those of `describe` of each configuration, sixty times as fast,
-        since all n configurations are converted at once.
+        The values are those of `describe` of each configuration, but all n
+        configurations are converted at once.
 
         Args:
             control: which describes itself as `Control` does.
@@ -990,11 +1022,12 @@ def _is_described_by_base(control: Control) -> bool:
 
 
 def _count_columns(blocks: Sequence[_SampledBlock]) -> int:
-    """Return how many numbers are drawn for blocks."""
+    """Return how many columns the draws of blocks have; the last block has the last."""
     return blocks[-1].columns.stop if blocks else 0
 
 
 def _stored_unit(parameter: Parameter) -> str:
+    """Return the unit that is stored with a value; the unit of an option is "name"."""
     return "name" if parameter.options else parameter.unit
 
 

@@ -158,7 +158,7 @@ def sweep(
             "grid: expected a mapping from parameters to values, got "
             f"{type(grid).__name__}"
         )
-    # What is not passed is as in the attack, if there is one.
+    # What the caller does not pass is as in the attack, if there is one.
     attack_run = _find_attack_run(adversarial_of)
     defaults = _load_defaults(attack_run, scene, grid, controls)
     scenes = _as_list(defaults["object"] if scene is None else scene)
@@ -185,7 +185,7 @@ def sweep(
         naming.check_no_scene_settings(set_options)
     described |= _describe_scenes(scenes, loaded)
     run_setting = {"run": None if run is None else str(run)}
-    # later ones replace earlier ones
+    # of a setting in several of these mappings, the last value counts
     config = SweepConfig(**{**defaults, **described, **set_options, **run_setting})
     config = config.with_python_only_parts(
         _find_python_only(config, networks, loaded, task, tracker, controls)
@@ -214,24 +214,40 @@ def _check_can_use_workers(
     task: AnyTask,
     controls: Controls,
     networks: Sequence[Any],
-    loaded: Sequence[Any],
+    loaded_scenes: Sequence[Any],
     set_options: Mapping[str, Any],
 ) -> None:
     """Raise an error if workers are requested for objects that they cannot load.
 
     Workers are other processes. They load everything by its name, and do not have the
     objects of this session.
+
+    Args:
+        task: task of the models.
+        controls: controls that are sampled.
+        networks: models as the caller passed them: names, files or objects.
+        loaded_scenes: scenes that the caller has loaded.
+        set_options: the settings that the caller passed.
+
+    Raises:
+        InputError: such a setting is among `set_options`.
     """
-    are_named = all(isinstance(network, (str, Path)) for network in networks)
-    has_objects = bool(loaded) or bool(loading.list_session_only_controls(controls))
-    if has_objects or not are_named or isinstance(task, FunctionTask):
+    are_models_named = all(isinstance(network, (str, Path)) for network in networks)
+    is_task_named = not isinstance(task, FunctionTask)
+    has_session_controls = bool(loading.list_session_only_controls(controls))
+    has_session_objects = bool(loaded_scenes) or has_session_controls
+    if has_session_objects or not are_models_named or not is_task_named:
         naming.check_no_worker_settings(set_options)
 
 
 def _find_attack_run(
     adversarial_of: str | Path | AttackResult | None,
 ) -> str | Path | None:
-    """Return the run of an attack. Raises InputError: it was not kept in one."""
+    """Return the run of an attack.
+
+    Raises:
+        InputError: the attack was not kept in a run directory.
+    """
     if not isinstance(adversarial_of, AttackResult):
         return adversarial_of
     if adversarial_of.run is None:
@@ -349,24 +365,26 @@ def _find_python_only(
 
 
 def _check_config(config: SweepConfig) -> None:
-    """Check that workers can load the metrics, and that files have a run directory.
+    """Check that the settings of a sweep can be met.
 
     Raises:
-        InputError: they cannot, or there is none.
+        InputError: workers cannot load a metric, or files are to be stored and there is
+            no run directory.
     """
     if config.workers is not None or config.cluster is not None:
         judging.check_metrics_importable(config.metrics)
-    stored_things = {
+    # settings that store files, with what they store, as the message has it
+    stored_files = {
         "keep_pictures": "them",
         "aov": "the layers",
         "surface": "the map",
     }
-    for name, thing in stored_things.items():
-        is_stored = getattr(config, name) not in ("none", None, False)
-        if config.run is None and is_stored:
+    for setting, stored in stored_files.items():
+        stores_files = getattr(config, setting) not in ("none", None, False)
+        if config.run is None and stores_files:
             raise InputError(
-                f"{name}: expected `run` beside it, the folder that keeps "
-                f"{thing}; name one"
+                f"{setting}: expected `run` beside it, the folder that keeps "
+                f"{stored}; name one"
             )
 
 
@@ -389,14 +407,13 @@ def _run_config(
         models: models as the caller passed them; so are all others.
     """
     resumed = _find_resumable(config)
+    # The directory of a new run is created before the work. It is None without one.
+    context: Any = nullcontext(resumed)
     if config.run is not None and resumed is None:
         check_free(config.run, overwrite=config.overwrite)
-    context: Any = nullcontext(resumed)  # None without a run directory
-    if config.run is not None and resumed is None:
         context = create_before_work(config)
     if config.twins is not None:
-        # a check before the work: raises an error if it cannot be read
-        read_twins(config.twins)
+        read_twins(config.twins)  # a check before the work: raises if it is corrupt
     with context as directory:
         named_scenes = expand_photographs(config, scenes) or load_scenes(config)
         job = _make_job(
@@ -422,13 +439,13 @@ def _find_resumable(config: SweepConfig) -> Path | None:
         return None
     path = locate_run(config.run)
     config_file = path / CONFIG
-    if config.overwrite or not is_run(path) or not config_file.is_file():
+    has_run = is_run(path) and config_file.is_file()
+    if config.overwrite or not has_run:
         return None
     stored = SweepConfig.from_yaml(config_file, config.session_settings)
     has_same_settings = stored.to_json() == config.make_repeatable().to_json()
-    if not has_same_settings or is_finished(path):
-        return None
-    return path
+    can_continue = has_same_settings and not is_finished(path)
+    return path if can_continue else None
 
 
 def sweep_from_config(
@@ -446,9 +463,8 @@ def sweep_from_config(
     """
     if config.run is not None and resumed is None:
         check_free(config.run, overwrite=config.overwrite)
-    # a check before the work: raises an error if the run of twins cannot be read
     if config.twins is not None:
-        read_twins(config.twins)
+        read_twins(config.twins)  # a check before the work: raises if it is corrupt
     progress = progress or NullProgress()
     progress.stage(LOADING)
     return _run_in_directory(config, load_job(config), progress, resumed)
@@ -462,7 +478,8 @@ def _add_adversarial_arm(
 ) -> tuple[NamedScene, ...]:
     """Return the clean scenes, then the same with an adversarial configuration.
 
-    Without `adversarial_of` these are the scenes as they are.
+    These are the two arms of a comparison. Without `adversarial_of` nothing is
+    compared, and the scenes stay as they are.
 
     Args:
         config: the settings.
@@ -499,7 +516,11 @@ def _add_adversarial_arm(
 
 
 def _as_list(value: Any) -> list[Any]:
-    """Return scenes or models as a list. Raises InputError: there is none."""
+    """Return scenes or models as a list.
+
+    Raises:
+        InputError: the list is empty.
+    """
     values = list(value) if isinstance(value, (list, tuple)) else [value]
     if not values:
         raise InputError(
@@ -740,8 +761,8 @@ def _load_named_scenes(config: SweepConfig) -> list[NamedScene]:
     """
     session_scene: Scene | None = config.python_object(naming.SCENE, config.object)
     if session_scene is not None:  # passed by a Python caller
-        environment = session_scene.description.environment_name
-        return [NamedScene(config.object, environment, session_scene)]
+        name = session_scene.description.environment_name
+        return [NamedScene(config.object, name, session_scene)]
     objects = naming.check_distinct(config.objects, "object")
     environments = naming.check_distinct(config.environments, "environment")
     first_environment = environments[0] if config.environment else None
@@ -755,24 +776,26 @@ def _load_named_scenes(config: SweepConfig) -> list[NamedScene]:
             for name, scene in scenes.items()
         ]
     first_scene = scenes[objects[0]].description
-    # Environments are loaded once, with the first object, and given to all others.
-    maps = {first_environment: first_scene.environment}
+    # Each environment is loaded once, with the first object, and given to all others.
+    environment_by_name = {first_environment: first_scene.environment}
     for name in environments[1:]:
         scene = load_scene(first_scene.object, name)
-        maps[name] = scene.description.environment
-    return [
-        NamedScene(name, environment, scenes[name].with_environment(maps[environment]))
-        for name in objects
-        for environment in maps
-    ]
+        environment_by_name[name] = scene.description.environment
+    named_scenes = []
+    for object_name in objects:
+        for environment_name, environment in environment_by_name.items():
+            scene = scenes[object_name].with_environment(environment)
+            named_scenes.append(NamedScene(object_name, environment_name, scene))
+    return named_scenes
 
 
 def expand_photographs(
     config: SweepConfig, scenes: Iterable[NamedScene]
 ) -> tuple[NamedScene, ...]:
-    """Return scenes, and of a scene in a folder of photographs one for each of them.
+    """Return the scenes, each in every photograph of its folder of photographs.
 
-    They stay as they are if a control draws the photograph, or the grid names it.
+    Scenes without such a folder stay as they are. So do all scenes if a control of the
+    sweep or an axis of its grid chooses the photograph.
     """
     control_names = [
         *config.controls,

@@ -205,6 +205,7 @@ def _ticks(values: Sequence[Any]) -> tuple[list[int], list[str]]:
 
 
 def _tick_label(value: Any) -> str:
+    """Return the label of a value at an axis; a part of a range has two bounds."""
     if isinstance(value, (list, tuple)):
         return " to ".join(f"{bound:.3g}" for bound in value)
     return shorten_name(value) if isinstance(value, str) else f"{value:.4g}"
@@ -233,6 +234,7 @@ MAX_PAGE_ROWS = 96  # values of an axis that a page lists as a table; of more, n
 
 
 def _difference_text(part: SurfacePart) -> str:
+    """Return the difference of two rates in percent, with its interval if it has one."""
     low, high = part.interval
     difference = f"{part.difference:+.0%}"
     has_interval = not math.isnan(low)  # images that share draws have none
@@ -288,15 +290,16 @@ def make_sweep_view(summary: SweepSummary) -> ShownResult:
     has_drive_file = bool(summary.drives and summary.run)
     facts = {
         "worst": _worst_configuration(summary),
-        "there": _worst_prediction(summary),
+        "there": _worst_prediction(summary),  # in the worst configuration
         "renders": str(summary.renders["sweep"]),
         "worst drive": f"{run_images}/drive.webp" if has_drive_file else "",
         "map of the surface": f"{run_images}/surface.png" if summary.surface else "",
     }
+    # The verdict names an interrupt only of a sweep that it cut off.
     if summary.configurations > 0:
         ended_early = summary.looked_at < summary.planned
     else:
-        # Without a count, either all images lack the object, or none was evaluated.
+        # Nothing counts: either no image has the object, or none was evaluated.
         ended_early = not summary.out_of_view
     return ShownResult(_verdict(summary), sections, facts, says_interrupted=ended_early)
 
@@ -417,6 +420,7 @@ def _page_parts(
             note=sentence,
         )
     for index, rates in enumerate(summary.drives or ()):
+        # the title stands above all tables, and the images are of the worst drive
         is_first = index == 0
         yield ResultPart(
             "Whole drives" if is_first else "",
@@ -498,27 +502,26 @@ def grid_clause(summary: SweepSummary) -> str:
 
 
 def _accuracy_cells(counts: CountedPredictions) -> tuple[str, str]:
+    """Return the accuracy and its interval, as cells of a table."""
     return percent(counts.accuracy), wording.format_interval(counts.interval)
 
 
 def _axis_table(name: str, rows: Sequence[AxisRow], task: str) -> ResultPart:
     """Return a table of the accuracy by the values of an axis, with bars.
 
+    Of more than `MAX_TEXT_ROWS` values only the worst are listed.
+
     Args:
         name: name of the axis.
-        rows: its values; of very many, only the worst are listed.
+        rows: its values.
         task: name of the task.
     """
     title = name
-    if rows[0].unit not in ("", "name", "1"):
+    if rows[0].unit not in (*wording.PLAIN_UNITS, "name"):  # "name": a discrete choice
         title += f", {rows[0].unit}"
     listed = list(rows)
     if len(rows) > MAX_TEXT_ROWS:
-        by_accuracy = sorted(
-            range(len(rows)), key=lambda index: rows[index].accuracy or 0.0
-        )
-        worst = by_accuracy[: MAX_TEXT_ROWS // 2]
-        listed = [rows[index] for index in sorted(worst)]
+        listed = _select_worst(rows, MAX_TEXT_ROWS // 2)
         title += (
             f" (the {len(listed)} of {len(rows)} values where the model is right "
             "least often)"
@@ -526,7 +529,7 @@ def _axis_table(name: str, rows: Sequence[AxisRow], task: str) -> ResultPart:
     has_outcomes = any(row.outcomes for row in rows)
     lines = []
     for row in listed:
-        # no bar where the accuracy is not known, or 0
+        # an accuracy that is not known has no bar, as has one of 0
         bar = "#" * round((row.accuracy or 0.0) * BAR_LENGTH)
         accuracy, interval = _accuracy_cells(row)
         cells = [
@@ -540,6 +543,15 @@ def _axis_table(name: str, rows: Sequence[AxisRow], task: str) -> ResultPart:
             cells.append(wording.format_outcomes(row.outcomes, task))
         lines.append(cells)
     return ResultPart(title, rows=lines)
+
+
+def _select_worst(rows: Sequence[AxisRow], count: int) -> list[AxisRow]:
+    """Return the rows with the smallest accuracies, in their own order."""
+    by_accuracy = sorted(
+        range(len(rows)), key=lambda index: rows[index].accuracy or 0.0
+    )
+    worst = sorted(by_accuracy[:count])
+    return [rows[index] for index in worst]
 
 
 def make_sweep_claims(result: SweepSummary) -> Iterator[Claim]:
@@ -578,41 +590,49 @@ def _describe_population(result: SweepSummary) -> tuple[str, str]:
     """Return what the rates of a sweep are over, and a caution about the interval.
 
     A sweep has a grid, samples (then it has a `sampler`), or both; imported rows have
-    neither. Only independent random draws need no caution.
+    neither. Only independent random draws need no caution, which is empty then.
     """
-    configurations = "configurations"
-    if result.drives:
-        configurations = f"frames of {result.drives[0].drives} drives"
-    if result.sampler is None and not result.grid:
-        return configurations, (
+    is_sampled = result.sampler is not None
+    if not is_sampled and not result.grid:
+        population = "configurations"
+        if result.drives:
+            population = _name_frames(result.drives)
+        note = (
             " How these were chosen is not known; the interval takes them as a sample."
         )
-    if result.sampler is None:
-        points = "points of the grid"
+    elif not is_sampled:
+        population = "points of the grid"
         if result.drives:
-            points = f"{configurations}, whose ways and moments are given"
-        return points, (
+            frames = _name_frames(result.drives)
+            population = f"{frames}, whose ways and moments are given"
+        note = (
             " Nothing is said of what lies between or beside these points, and another "
             "grid gives another share; the "
             "interval takes them as a sample."
         )
-    if result.drives:
+    elif result.drives:
         # The frames are the grid; what else differs between drives is sampled.
-        sampled_drives = (
-            f"{configurations}; what else differs between drives is drawn at random "
-            f"({result.sampler})"
+        population = (
+            f"{_name_frames(result.drives)}; what else differs between drives is drawn "
+            f"at random ({result.sampler})"
         )
         note = ""
         if result.sampler != "random":
             note = " The interval is over drives, as if these were independent."
-        return sampled_drives, note
-    if result.sampler != "random" or result.grid:
-        sampled = f"configurations drawn at random ({result.sampler})"
+    elif result.sampler != "random" or result.grid:
+        population = f"configurations drawn at random ({result.sampler})"
         if result.grid:
-            sampled += " at each point of a grid"
+            population += " at each point of a grid"
         note = " The interval is that of independent draws, which these are not."
-        return sampled, note
-    return f"{configurations} drawn by chance from the ranges that are named", ""
+    else:
+        population = "configurations drawn by chance from the ranges that are named"
+        note = ""
+    return population, note
+
+
+def _name_frames(drives: Sequence[DriveRates]) -> str:
+    """Return what a sweep over drives counts: ``frames of 24 drives``."""
+    return f"frames of {drives[0].drives} drives"
 
 
 def _arm_claims(
@@ -664,7 +684,8 @@ def _accuracy_claims(
     counts_by_model: dict[str, CountedPredictions] = {
         f"The model {row.value}": row for row in result.axes if row.axis == "model"
     }
-    # Models get the same images, so that predictions of several are not independent.
+    # Each model has a claim of its own: models get the same images, so that their
+    # predictions together are not independent.
     if len(split_names(result.model)) <= 1 or not counts_by_model:
         counts_by_model = {"The model": result}
     for model, counts in counts_by_model.items():
@@ -696,6 +717,7 @@ def _accuracy_extent(description: str, counts: CountedPredictions) -> Extent:
 
 
 DRIVE_HEADS = ("", "mean", "95 % interval", "worst drive")
+PERCENT = " %"  # the unit of rates that are fractions, and written in percent
 
 
 def rate_text(summary: SweepSummary) -> str:
@@ -728,7 +750,7 @@ def drive_rows(drive_rates: DriveRates) -> list[tuple[str, str, str, str]]:
     never = f", never in {drive_rates.never_seen}" if drive_rates.never_seen else ""
     # name, values, unit and remark on the mean
     rates: list[tuple[str, OverDrives | None, str, str]] = [
-        ("frames in which it is right", drive_rates.right, " %", ""),
+        ("frames in which it is right", drive_rates.right, PERCENT, ""),
         (
             "first right at a distance of",
             drive_rates.first_seen,
@@ -740,8 +762,8 @@ def drive_rows(drive_rates: DriveRates) -> list[tuple[str, str, str, str]]:
     ]
     if tracks is not None:
         rates += [
-            ("frames without its track", tracks.lost, " %", ""),
-            ("frames with a loose track instead", tracks.loose, " %", ""),
+            ("frames without its track", tracks.lost, PERCENT, ""),
+            ("frames with a loose track instead", tracks.loose, PERCENT, ""),
             ("identity switches", tracks.switches, "", ""),
             ("longest gap of its track", tracks.longest_gap, " s", ""),
         ]
@@ -760,10 +782,10 @@ def _format_drive_row(
     Args:
         name: name of the rate.
         value: the rate; a dash stands for an interval that it lacks.
-        unit: unit with a space before it; fractions of the unit " %" become percent.
+        unit: unit with a space before it; of a fraction it is `PERCENT`.
         remark: remark on the mean, after it.
     """
-    factor = 100.0 if unit == " %" else 1.0
+    factor = 100.0 if unit == PERCENT else 1.0
     interval = "-"
     if value.interval:
         low, high = value.interval
@@ -864,17 +886,15 @@ def find_detection_distance(summary: SweepSummary) -> DetectionDistance | None:
     """
     rows = [row for row in summary.axes if row.axis == DISTANCE and row.configurations]
     is_detection = summary.task.partition("=")[0] == "detection"
-    is_single = (
-        "," not in summary.object
-        and "," not in summary.model
-        and summary.beside is None
-    )
+    # names of several objects or models stand with commas
+    is_single = "," not in summary.object and "," not in summary.model
+    is_comparison = summary.beside is not None
     # Frames of a drive are not independent, nor are samples of a point where nothing is
     # sampled.
     are_independent = summary.drives is None and summary.units is None
-    if not (is_detection and is_single and are_independent and len(rows) > 1):
+    if not (is_detection and is_single and are_independent) or is_comparison:
         return None
-    return compute_detection_distance(rows)
+    return compute_detection_distance(rows) if len(rows) > 1 else None
 
 
 def compute_detection_distance(rows: Sequence[AxisRow]) -> DetectionDistance:
@@ -896,19 +916,19 @@ def compute_detection_distance(rows: Sequence[AxisRow]) -> DetectionDistance:
         )
     rows = sorted(rows, key=_center_distance)
     distances = tuple(_center_distance(row) for row in rows)
-    k = np.array([row.correct for row in rows])
-    n = np.array([row.configurations for row in rows])
+    k = np.array([row.correct for row in rows])  # right images at each distance
+    n = np.array([row.configurations for row in rows])  # images
     # Of a binomial test at one of the distances: 2.5 % on each side, divided by the
     # number of tests (Bonferroni).
     significance = 0.025 / len(rows)
     low, high = _bound_distance(np.array(distances), k, n, significance)
     dips = find_dips(distances, k, n)
-    # The index of the nearest distance beyond the last dip that is not chance: nearer
+    # The line is fitted to the distances beyond the last dip that is not chance: nearer
     # ones contradict a falling line.
-    first = max(
-        (distances.index(dip.distance) + 1 for dip in dips if dip.is_significant),
-        default=0,
-    )
+    indices_beyond_dips = [
+        distances.index(dip.distance) + 1 for dip in dips if dip.is_significant
+    ]
+    first = max(indices_beyond_dips, default=0)
     falling = _fit_falling(k[first:], n[first:])
     # n images that are all right differ from one half if 2**-n < significance.
     min_images = math.floor(-math.log2(significance)) + 1
@@ -1025,6 +1045,8 @@ def _clause_beyond_dips(
 ) -> str:
     """Return how often the model is right beyond the last dip of its detections.
 
+    A dip is a distance at which the object is detected less often than farther away.
+
     Args:
         estimate: estimate of the detection distance.
         distance: the estimated distance; None if it is not among the measured ones.
@@ -1062,11 +1084,12 @@ def _interval_clause(estimate: DetectionDistance, unit: str) -> str:
 
 
 def _dips_sentences(estimate: DetectionDistance, unit: str) -> list[str]:
-    """Return a sentence about dips: distances with fewer detections than beyond.
+    """Return a sentence about dips, distances with fewer detections than farther away.
 
-    It has all of these dips that are not chance. If all may be chance, it has the least
-    likely one that contradicts the estimate, if any: a dip with fewer than half of the
-    images right, nearer than the estimated distance or before a rise to at least half.
+    It lists all dips that are not chance. If all may be chance, it has the least likely
+    one that contradicts the estimate, if any. Such a dip has fewer than half of the
+    images right, and either the estimate says that the object is seen there, or at
+    least half of the images farther away are right.
 
     Args:
         estimate: estimate of the detection distance.
@@ -1087,9 +1110,10 @@ def _dips_sentences(estimate: DetectionDistance, unit: str) -> list[str]:
     for dip in estimate.dips:
         n_right, n_images = dip.counts
         n_right_beyond, n_images_beyond = dip.counts_beyond
-        is_rise_beyond = n_right_beyond >= HALF * n_images_beyond
         is_below_half = n_right < HALF * n_images
-        if is_below_half and (dip.distance < detected_until or is_rise_beyond):
+        is_above_half_beyond = n_right_beyond >= HALF * n_images_beyond
+        contradicts_line = dip.distance < detected_until
+        if is_below_half and (contradicts_line or is_above_half_beyond):
             contradicting.append(dip)
     if not contradicting:
         return []

@@ -46,7 +46,9 @@ from advsearch.tasks.boxes import MIN_OVERLAP
 
 MAX_ANIMATED_FRAMES = 60
 MAX_LISTED_DRIVES = 1000  # drives of a model that a result lists
-# flags of a frame, besides 1 (right) and 0 (not right)
+# what a model's flag of a frame can be
+WRONG = 0
+RIGHT = 1
 UNKNOWN = -1  # there is no row
 HIDDEN = 2  # nothing of the object is in the image
 Flags = npt.NDArray[np.int8]
@@ -59,8 +61,8 @@ def add_frames(
 
     A control that travels along the path is added if there is none. The times of the
     frames become the last axis of the grid, unless it has them already: from 0 to the
-    end of the path, `fps` a second, at least two. If there are several paths, nothing
-    chooses among them and nothing is sampled, then all are swept.
+    end of the path, `fps` a second, at least two. If there are several paths, all are
+    swept, unless a setting chooses among them or paths are sampled.
 
     Args:
         config: settings with a `path`.
@@ -81,21 +83,22 @@ def add_frames(
         # both ends have a frame
         n_frames = max(2, round(seconds * config.fps) + 1)
         grid = {**grid, time_name: f"0:{seconds:g}:{n_frames}"}
-    paths = next(
-        (
-            parameter.options
-            for parameter in travelling.instance_parameters
-            if parameter.name == Control.PATH_PARAMETER
-        ),
-        (),
-    )
-    is_path_free = (
-        path_name not in grid and Control.PATH_PARAMETER not in travelling.specs
-    )
-    if paths and config.samples is None and is_path_free:
-        # Nothing is sampled, so every path is swept.
-        grid = {path_name: list(paths), **grid}
+    is_path_in_grid = path_name in grid
+    is_path_set = Control.PATH_PARAMETER in travelling.specs
+    is_sampled = config.samples is not None
+    if not (is_path_in_grid or is_path_set or is_sampled):
+        paths = _list_paths(travelling)
+        if paths:
+            grid = {path_name: paths, **grid}
     return sampled, grid
+
+
+def _list_paths(travelling: Any) -> list[Any]:
+    """Return the paths among which a control can choose; none if it has a single one."""
+    for parameter in travelling.instance_parameters:
+        if parameter.name == Control.PATH_PARAMETER:
+            return list(parameter.options)
+    return []
 
 
 def find_time_axis(axes: Sequence[Axis]) -> int | None:
@@ -147,7 +150,7 @@ class _CompleteDrives(NamedTuple):
     """The n drives of which all frames are known, in which the object is visible.
 
     Attributes:
-        flags: (n, frames) 1 where the model is right, 0 where it is not, HIDDEN.
+        flags: (n, frames) RIGHT, WRONG or HIDDEN.
         distance: (n, frames) to the object; NaN where that is not known.
         steps: (n, frames) numbers of the rows.
     """
@@ -177,13 +180,20 @@ class Drives:
     _distance_bounds: tuple[float, float] | None = None
 
     def __init__(self, job: Job, rows: Iterable[Row]) -> None:
+        """Sort the rows of a sweep over frames into drives.
+
+        Args:
+            job: the sweep, with an axis of times.
+            rows: its rows so far.
+        """
         axis_index = find_time_axis(job.axes)
         assert axis_index is not None
         self._job = job
         axis = job.axes[axis_index]
         self._units = next(iter(job.load_points(0).values())).units
         self._distance_bounds = compute_distance_bounds(job, axis)
-        # The number of a row is its index in the flat array of this shape.
+        # An array of this shape has an element for each row; the row's number is its
+        # index in the flat array.
         shape = (
             len(job.scenes),
             *(len(axis.values) for axis in job.axes),
@@ -205,10 +215,11 @@ class Drives:
         self.seconds = float(self.times[-1] - self.times[0])
         steps = np.arange(flags.size).reshape(shape)
         # The frames become the last axis, in the order of their times. The arrays begin
-        # with the axis of the scenes, so that axes of the grid are one further back.
-        self._flags = np.moveaxis(flags, axis_index + 1, -1)[..., order]
-        self._steps = np.moveaxis(steps, axis_index + 1, -1)[..., order]
-        self._distance = np.moveaxis(distance, axis_index + 1, -1)[..., order]
+        # with the axis of the scenes, and those of the grid follow.
+        time_axis = axis_index + 1
+        self._flags = np.moveaxis(flags, time_axis, -1)[..., order]
+        self._steps = np.moveaxis(steps, time_axis, -1)[..., order]
+        self._distance = np.moveaxis(distance, time_axis, -1)[..., order]
 
     def _read_rows(
         self,
@@ -274,40 +285,43 @@ class Drives:
         return _CompleteDrives(flags[selected], distance[selected], steps[selected])
 
     def compute_rates(self) -> list[DriveRates]:
-        """Compute the rates over drives of each model, by adversarial scene.
+        """Compute the rates over drives of each model, without and with the adversarial
+        configuration.
 
         Frames without the object count neither as right nor as part of a gap. Models
         without a complete drive are left out.
         """
         rates = list[DriveRates]()
         named_scenes = self._job.scenes
-        for answer in dict.fromkeys(named_scene.arm for named_scene in named_scenes):
+        # the arms of a comparison, without and with the adversarial configuration; a
+        # single one without a name if nothing is compared
+        for arm in dict.fromkeys(named_scene.arm for named_scene in named_scenes):
             scenes = [
                 scene
                 for scene, named_scene in enumerate(named_scenes)
-                if named_scene.arm == answer
+                if named_scene.arm == arm
             ]
             for model in range(len(self._job.models)):
                 drives = self._select_complete(scenes, model)
                 if len(drives.flags):
-                    rates.append(self._compute_rates(drives, model, answer))
+                    rates.append(self._compute_rates(drives, model, arm))
         return rates
 
     def _compute_rates(
-        self, drives: _CompleteDrives, model: int, answer: str
+        self, drives: _CompleteDrives, model: int, arm: str
     ) -> DriveRates:
         """Compute the rates of one model over drives.
 
         Args:
             drives: drives with all their frames.
             model: index of the model.
-            answer: name of the scene that they have, clean or adversarial; empty if
-                the sweep has no adversarial one.
+            arm: name of the scene that they have, clean or adversarial; empty if the
+                sweep has no adversarial one.
         """
         n_frames = len(self.times)
         first_distance = _first_right_distance(drives)
         drive_records = self._describe_drives(drives, first_distance)
-        has_right = np.asarray((drives.flags == 1).any(axis=1))
+        has_right = np.asarray((drives.flags == RIGHT).any(axis=1))
 
         # Rows of one draw differ in noise alone: they are repeats of one drive.
         first_images = drives.steps[:, 0] // len(self._job.models)
@@ -320,7 +334,7 @@ class Drives:
         max_flicker = (n_frames - 1) / self.seconds
         return DriveRates(
             model=self._job.models[model].name,
-            answer=answer or None,
+            answer=arm or None,
             drives=n_drives,
             repeats=math.ceil(len(drives.flags) / n_drives),
             frames=n_frames,
@@ -346,10 +360,10 @@ class Drives:
     def _describe_drives(
         self, drives: _CompleteDrives, first_distance: npt.NDArray[np.float64]
     ) -> list[DriveRecord]:
-        """Return the values of the first drives, each by itself.
+        """Return the values of the first `MAX_LISTED_DRIVES` drives, each by itself.
 
         Args:
-            drives: n of them.
+            drives: n drives.
             first_distance: (n,) at the first right frame; NaN if there is none.
         """
         right_fraction = _right_fraction(drives.flags)
@@ -375,12 +389,12 @@ class Drives:
 
     def _longest_gaps(self, flags: Flags) -> npt.NDArray[np.float64]:
         """Return the seconds (n,) of the longest run of wrong frames of each drive."""
-        runs = np.array([find_longest_run(is_wrong) for is_wrong in flags == 0])
+        runs = np.array([find_longest_run(is_wrong) for is_wrong in flags == WRONG])
         return runs * self._frame_interval
 
     def _changes_per_second(self, flags: Flags) -> npt.NDArray[np.float64]:
         """Return how often each drive (n,) changes between right and wrong a second."""
-        is_right = flags == 1
+        is_right = flags == RIGHT
         is_visible = flags != HIDDEN
         both_visible = is_visible[:, 1:] & is_visible[:, :-1]
         is_change = (is_right[:, 1:] != is_right[:, :-1]) & both_visible
@@ -406,8 +420,8 @@ class Drives:
     ) -> TrackRates | None:
         """Compute what a tracker makes of the boxes of drives.
 
-        A frame is lost if the object is visible and no track is on it. A lost frame is
-        loose if a track would be on it with less overlap.
+        A frame is lost if the object is visible and no track is on it. A lost frame
+        counts as loose if some track overlaps the object, but too little.
 
         Args:
             model: index of the model.
@@ -425,13 +439,15 @@ class Drives:
         if any(step not in self._frame_of_step for step in steps.flat):
             return None
         frames = [[self._frame_of_step[step] for step in row] for row in steps.tolist()]
-        drives = [
+        tracked_drives = [
             track_drive(drive_frames, tracker, task.iou) for drive_frames in frames
         ]
         lost_loosely = _compute_lost_loosely(task, tracker, frames)
-        lost = np.array([drive.lost for drive in drives], dtype=float)
-        switches = np.array([drive.switches for drive in drives], dtype=float)
-        longest_gap = np.array([drive.gap for drive in drives], dtype=float)
+        lost = np.array([tracked.lost for tracked in tracked_drives], dtype=float)
+        switches = np.array(
+            [tracked.switches for tracked in tracked_drives], dtype=float
+        )
+        longest_gap = np.array([tracked.gap for tracked in tracked_drives], dtype=float)
         n_frames = len(self.times)
         seconds_bounds = (0.0, n_frames * self._frame_interval)
         return TrackRates(
@@ -478,10 +494,10 @@ class Drives:
 def _compute_lost_loosely(
     task: Detection, tracker: Tracker, frames: Sequence[Sequence[DetectedFrame]]
 ) -> npt.NDArray[np.float64]:
-    """Compute for each drive the fraction (n,) of frames that are lost even loosely.
+    """Compute for each drive the fraction (n,) of frames without any track on the object.
 
-    For that a track needs to overlap the object by `MIN_OVERLAP` only, if that is less
-    than the `iou` of the task.
+    A frame is lost if no track overlaps the object enough. Here little overlap is
+    enough: `MIN_OVERLAP`, or the `iou` of the task if that is less.
 
     Args:
         task: task of the model; a track is on the object from its `iou` on.
@@ -505,7 +521,7 @@ def find_longest_run(flags: npt.NDArray[np.bool_]) -> int:
 
 def _first_right_distance(drives: _CompleteDrives) -> npt.NDArray[np.float64]:
     """Return the distance (n,) at the first right frame; NaN if there is none."""
-    is_right = drives.flags == 1
+    is_right = drives.flags == RIGHT
     first_frame = is_right.argmax(axis=1)
     distance = drives.distance[np.arange(len(first_frame)), first_frame]
     return np.where(is_right.any(axis=1), distance, np.nan)
@@ -513,7 +529,7 @@ def _first_right_distance(drives: _CompleteDrives) -> npt.NDArray[np.float64]:
 
 def _right_fraction(flags: Flags) -> npt.NDArray[np.float64]:
     """Return the fraction (n,) of the visible frames (n, frames) that are right."""
-    n_right = (flags == 1).sum(axis=1)
+    n_right = (flags == RIGHT).sum(axis=1)
     n_visible = (flags != HIDDEN).sum(axis=1)
     return np.asarray(n_right / n_visible)
 
@@ -535,7 +551,8 @@ def summarize_drives(
     Args:
         values: (n,) one for each time that a drive was evaluated.
         worst: selects the worst of them: `min` or `max`.
-        bounds: bounds of the values whatever a model predicts, from the plan.
+        bounds: smallest and largest value that a drive of the sweep can have, whatever
+            a model predicts; None if they are not known.
         drive_of_value: (n,) the drive of each value. Values of one drive differ in
             noise alone, and are averaged first. None: each has a drive of its own.
     """

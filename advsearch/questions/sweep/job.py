@@ -154,7 +154,7 @@ class Job:
         return SeedSequence(self.config.seed, KIND)
 
     def load_points(self, scene: int) -> dict[ImageSize, Points]:
-        """Return the configurations of a scene for each size of image.
+        """Return the configurations of a scene, by the size of the images.
 
         Those of the last scene are cached.
         """
@@ -171,8 +171,7 @@ class Job:
     def make_queries(self, numbers: range) -> list[WorkItem]:
         """Return the queries of all models about images of one scene.
 
-        The number of a query is that of its image, times the models, plus the index of
-        its model.
+        A query is numbered as the row that stores its result: by image, then by model.
 
         Args:
             numbers: numbers of the images in the sweep.
@@ -182,10 +181,9 @@ class Job:
             The problem's name is the scene's number.
         """
         scene = numbers.start // self.images_per_scene
-        images_before = scene * self.images_per_scene
+        images_before = scene * self.images_per_scene  # those of the scenes before
         first_in_scene = numbers.start - images_before
         queries = list[Query]()
-        # Controls may depend on the size of the images: each size has its own points.
         for size, points in self.load_points(scene).items():
             configurations = points.make_configurations(
                 first_in_scene, len(numbers), images_before
@@ -242,7 +240,7 @@ class Job:
     ) -> dict[str, Value]:
         """Return the stored values of a row: names of scene and model, and parameters.
 
-        Parameters of the controls that the scene itself fixes are left out.
+        Controls that the adversarial configuration of the scene fixes are left out.
 
         Args:
             scene: index of the scene.
@@ -266,10 +264,11 @@ class Job:
         return row_values
 
     def bind_controls(self, named_scene: NamedScene, size: ImageSize) -> Space:
-        """Bind the controls, those of the grid as choices, to a scene.
+        """Bind all controls of the sweep to a scene.
 
-        Fixed controls come first, and are set to the scene's configuration, so that
-        only the others are left to vary.
+        The axes of the grid are discrete choices of their controls. Controls that an
+        adversarial configuration fixes come first, and are set to it, so that only the
+        others are left to vary.
 
         Args:
             named_scene: the scene.
@@ -289,7 +288,7 @@ class Job:
         space = make_space(controls, description)
         if named_scene.fixed_controls:
             space = _fix_controls(named_scene, space)
-        # `check_scenes` has checked the environment
+        # without the environment, which `check_scenes` has checked
         set_by_user = named_scene.scene.description.requested - {ENVIRONMENT}
         for group in space.groups:
             if group.setting in set_by_user:
@@ -303,11 +302,12 @@ class Job:
     def make_points(self, space: Space) -> Points:
         """Return the configurations of a space.
 
-        Scenes with an adversarial configuration, which are the second half, have the
-        draws of those without it.
+        In a comparison without and with an adversarial configuration, the second half
+        of the scenes are those with it. They repeat the draws of the first half.
         """
         repeat_after_scenes = 0  # never
-        if self.scenes[0].arm:
+        is_comparison = bool(self.scenes[0].arm)
+        if is_comparison:
             repeat_after_scenes = len(self.scenes) // 2
         return Points(
             space,
@@ -370,11 +370,13 @@ def check_scenes(
         InputError: an axis varies what `set` fixes, or an axis or a control chooses the
             environment although several environments are named.
     """
+    # what the user has set in the scenes with `set`
     fixed_settings = {
         name
         for named_scene in named_scenes
         for name in named_scene.scene.description.requested
     }
+    # the axes and controls that choose the environment, as the user wrote them
     environment_choices = list[str]()
     for axis in axes:
         setting = _find_setting(axis, controls)
@@ -451,9 +453,10 @@ def check_job(job: Job) -> tuple[Points, tuple[SampledNumber, ...]]:
 
 
 def _merge_versions(versions: Sequence[SampledNumber], n_parts: int) -> SampledNumber:
-    """Return a sampled number as the table of all scenes shows it.
+    """Return a sampled number with parts that are the same in all scenes.
 
-    Where its range differs between scenes, parts are fractions of the range.
+    A table counts predictions by the parts of its range. If the range differs between
+    scenes, the parts are fractions of the range instead of values.
 
     Args:
         versions: the number in each scene.
@@ -471,68 +474,78 @@ def _merge_versions(versions: Sequence[SampledNumber], n_parts: int) -> SampledN
 class SweptScene:
     """One scene, ready to be rendered and evaluated.
 
-    Points, renderers and predictors are there for each size of image, on which what a
-    control frames may depend.
+    Models may get images of different sizes, and what a control frames may depend on
+    the size. So there are configurations, a renderer and a predictor for each size.
 
     Attributes:
         number: its index in the sweep.
-        points: its configurations.
-        renderers: its renderers.
+        points_of_size: its configurations, by image size.
+        renderer_of_size: its renderer, by image size.
         problems: one for each model.
-        predictors: what predicts its images.
+        predictor_of_size: what predicts its images, by image size.
     """
 
     def __init__(self, job: Job, number: int) -> None:
-        named_scene = job.scenes[number]
-        config = job.config
         self.number = number
         self.job = job
-        self.points = job.load_points(number)  # by image size
+        self.points_of_size = job.load_points(number)
         # renderers of the scene without its object, by size, made on demand
         self._empty_renderers: dict[ImageSize, Renderer] = {}
-        self.renderers = {size: self._make_renderer(size) for size in self.points}
+        self.renderer_of_size = {
+            size: self._make_renderer(size) for size in self.points_of_size
+        }
+        self.problems = tuple(map(self._make_problem, range(len(job.models))))
+        self.predictor_of_size = {
+            size: self._make_predictor(size) for size in self.points_of_size
+        }
+
+    def _make_problem(self, model: int) -> Problem:
+        """Return the problem of a model, by its index."""
+        job = self.job
+        named_scene = job.scenes[self.number]
+        size = job.image_sizes[model]
         make_scene_facts = partial(
             make_facts,
             named_scene.scene.description,
             named_scene.object,
-            config.label,
-            judge=config.judge,
+            job.config.label,
+            judge=job.config.judge,
         )
-        self.problems = tuple(
-            Problem(
-                renderer=self.renderers[size],
-                space=self.points[size].space,
-                model=model,
-                task=task,
-                make_facts=make_scene_facts,
-                objective=None,
-                spp=job.spp,
-                seed=config.seed,
-                metrics=job.metrics,
-            )
-            for size, model, task in zip(
-                job.image_sizes, job.models, job.tasks, strict=True
-            )
+        return Problem(
+            renderer=self.renderer_of_size[size],
+            space=self.points_of_size[size].space,
+            model=job.models[model],
+            task=job.tasks[model],
+            make_facts=make_scene_facts,
+            objective=None,
+            spp=job.spp,
+            seed=job.config.seed,
+            metrics=job.metrics,
         )
-        light_seed = seeds.stream(config.seed, "sweep light", number)
-        self.predictors = dict[ImageSize, SweepPredictor]()
-        for size, points in self.points.items():
-            # Models of one size share their images, and so the predictor of these.
-            first_model_of_size = job.image_sizes.index(size)
-            self.predictors[size] = SweepPredictor(
-                problem=self.problems[first_model_of_size],
-                points=points,
-                axes=job.axes,
-                seed=light_seed,
-                specialise=config.specialise,
-                images_before=number * points.count,
-            )
+
+    def _make_predictor(self, size: ImageSize) -> SweepPredictor:
+        """Return what predicts the images of a size, which models of that size share."""
+        config = self.job.config
+        points = self.points_of_size[size]
+        first_model_of_size = self.job.image_sizes.index(size)
+        return SweepPredictor(
+            problem=self.problems[first_model_of_size],
+            points=points,
+            axes=self.job.axes,
+            seed=seeds.stream(config.seed, "sweep light", self.number),
+            specialise=config.specialise,
+            images_before=self.number * points.count,
+        )
 
     @property
     def n_non_finite(self) -> int:
         """Values of images that were not finite, and were set to 0."""
-        rendered = sum(renderer.non_finite for renderer in self.renderers.values())
-        predicted = sum(images.n_non_finite for images in self.predictors.values())
+        rendered = sum(
+            renderer.non_finite for renderer in self.renderer_of_size.values()
+        )
+        predicted = sum(
+            images.n_non_finite for images in self.predictor_of_size.values()
+        )
         return rendered + predicted
 
     def evaluate_all(
@@ -551,9 +564,11 @@ class SweptScene:
         begin = time.perf_counter()
         not_finite_before = self.n_non_finite
         n_models = len(self.job.models)
-        images = {size: self._make_images(size, queries) for size in self.points}
+        images = {
+            size: self._make_images(size, queries) for size in self.points_of_size
+        }
         judgements = self._judge(queries, images)
-        # The image of a query is that of its row: rows are numbered by image, model.
+        # queries are numbered by image, then by model
         wrong_images = {
             row_number // n_models
             for row_number, judgement in judgements.items()
@@ -566,7 +581,9 @@ class SweptScene:
         # what concerns the batch
         evaluations[-1] = replace(
             evaluations[-1],
-            light=[predictor.summarize() for predictor in self.predictors.values()],
+            light=[
+                predictor.summarize() for predictor in self.predictor_of_size.values()
+            ],
             non_finite=max(0, self.n_non_finite - not_finite_before),
         )
         return evaluations
@@ -615,8 +632,7 @@ class SweptScene:
     ) -> dict[int, Judgement]:
         """Return the judgements of all queries by their numbers.
 
-        The number of a query is that of its image, times the models, plus the index of
-        its model.
+        Queries are numbered by image, then by model.
 
         Args:
             queries: queries of all models.
@@ -663,7 +679,7 @@ class SweptScene:
             thumbnail = thumbnails.make_thumbnail(image.image)
             evaluation = replace(evaluation, jpeg=thumbnail)
         if job.aovs:
-            surfaces = self.renderers[job.image_sizes[0]].surfaces(query.u)
+            surfaces = self.renderer_of_size[job.image_sizes[0]].surfaces(query.u)
             layers = {
                 name: layer.numpy()
                 for name, layer in surfaces.make_layers(job.aovs, OBJECT).items()
@@ -682,9 +698,10 @@ class SweptScene:
     ) -> list[Judgement]:
         """Return judgements with a metric for each claim about changed images.
 
-        Its name is the claim and the change, as "must_change black"; it is 1 where the
-        prediction is as claimed, else 0. The ground truth stays what it was before the
-        change.
+        A claim says whether the prediction must change, or must not change, if the
+        image is changed. The name of the metric is the claim and the change, as
+        "must_change black"; it is 1 where the prediction is as claimed, else 0. The
+        ground truth stays what it was before the change.
 
         Args:
             problem: problem of the model.
@@ -735,7 +752,7 @@ class SweptScene:
         description = fit_camera(self.job.scenes[self.number].scene.description, size)
         return make_renderer(
             description,
-            self.points[size].space,
+            self.points_of_size[size].space,
             size,
             config.denoise,
             config.seed,
@@ -747,11 +764,12 @@ class SweptScene:
     ) -> dict[int, SweptImage]:
         """Return the images of one size, rounded to 8 bits, by number in the sweep.
 
-        The number of a query is that of its image, times the models, plus the index of
-        its model.
+        Args:
+            size: the size.
+            queries: queries of all models, which are numbered by image, then by model.
         """
         n_models = len(self.job.models)
-        images_before = self.number * self.points[size].count
+        images_before = self.number * self.points_of_size[size].count
         # The predictor numbers the images of this scene from 0.
         query_of_image = {
             query.index // n_models - images_before: query
@@ -759,7 +777,7 @@ class SweptScene:
             if self.job.image_sizes[query.index % n_models] == size
         }
         with torch.no_grad():
-            images = self.predictors[size].make_images(query_of_image)
+            images = self.predictor_of_size[size].make_images(query_of_image)
         return {
             images_before + number: replace(image, image=round_to_8_bit(image.image))
             for number, image in images.items()
@@ -812,9 +830,11 @@ class SceneLoader:
         """Find the layer whose features the first model decides by.
 
         Raises:
-            InputError: the task has none.
+            InputError: the task is not classification.
         """
-        if self.job.tasks[0].varies:
+        # the truth of a classifier is the same in all configurations
+        is_classification = not self.job.tasks[0].varies
+        if not is_classification:
             raise InputError(
                 f"task {self.job.config.task_name}: features are read of classifiers"
             )
@@ -841,9 +861,10 @@ def verify_worst(
 ) -> WorstVerified | None:
     """Render the worst configuration again, and count wrong predictions.
 
-    The samples per pixel are chosen first, on a ladder: up to the count from which on
-    more samples leave the sign of the margin. Then they have converged, as they have if
-    the ladder has one step only. Renders that the run has stored are not made again.
+    The samples per pixel are chosen first, from a ladder of counts: the smallest from
+    which on more samples leave the sign of the margin. Then they have converged, as
+    they have if the ladder has one count only, which the settings give. Renders that
+    the run has stored are not made again.
 
     Args:
         problem: problem of its scene and model.
@@ -870,7 +891,8 @@ def verify_worst(
     trials = run_trials(
         verifier.evaluate_all, u, spp=spp, seed=config.seed, trials=config.trials
     )
-    wrong_trials = [trial for trial in trials if trial.success]  # of an attack
+    # a wrong prediction is a success of an attack
+    wrong_trials = [trial for trial in trials if trial.success]
     counts = Trials(len(wrong_trials), len(trials), spp)
     verified_rate = make_rate(counts, trials, wrong_trials)
     has_converged = sample_count is not None and sample_count.converged

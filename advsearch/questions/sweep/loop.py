@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -76,6 +76,7 @@ from advsearch.runs.results import (
     Formation,
     LinearTransport,
     SharedWork,
+    TwinEvidence,
 )
 from advsearch.runs.store import Row
 from advsearch.runs.tables import EDGES_NOTE, UNITS_NOTE
@@ -105,12 +106,15 @@ class Sweep:
         progress: reports it.
         executor: evaluates the batches; None does so in this process.
 
+    Rows are numbered by image, then by model.
+
     Attributes:
         points: the configurations of the first scene.
-        images_per_scene: images of a scene.
-        n_models: how many there are.
-        units: how rows follow from draws.
-        n_rows: rows of the full sweep.
+        images_per_scene: number of images of a scene.
+        n_models: number of models, all of which predict every image.
+        units: the independent units that rows belong to: rows of the same draw share
+            one.
+        n_rows: number of rows of the full sweep.
     """
 
     def __init__(
@@ -130,13 +134,7 @@ class Sweep:
         self.units = replace(self.points.units, models=self.n_models)
         self.n_rows = len(job.scenes) * self.images_per_scene * self.n_models
         if run is not None:
-            edges = {
-                number.name: number.edges
-                for number in self._sampled_numbers
-                if number.edges
-            }
-            run.store.write_note(EDGES_NOTE, json.dumps(edges))
-            run.store.write_note(UNITS_NOTE, json.dumps(asdict(self.units)))
+            self._write_notes(run)
         self._scenes = SceneLoader(job)
         if executor is None:
             self._executor: Workers = InProcess(
@@ -160,6 +158,16 @@ class Sweep:
         self._n_unreported = 0
         self._surface: SurfaceMap | None = None
         self._drives: list[DriveRates] | None = None
+
+    def _write_notes(self, run: RunDirectory) -> None:
+        """Store what readers of the rows need: parts of ranges, and independent units."""
+        edges = {
+            number.name: number.edges
+            for number in self._sampled_numbers
+            if number.edges
+        }
+        run.store.write_note(EDGES_NOTE, json.dumps(edges))
+        run.store.write_note(UNITS_NOTE, json.dumps(asdict(self.units)))
 
     def execute(self, first: int | None = None) -> SweepResult:
         """Evaluate the rows that are missing, and return the result.
@@ -211,6 +219,7 @@ class Sweep:
         self._drives = drives.compute_rates()
 
     def _scene_of(self, row: int) -> int:
+        """Return the index of the scene of a row."""
         return row // self.n_models // self.images_per_scene
 
     def _find_missing(self) -> list[range]:
@@ -310,28 +319,31 @@ class Sweep:
         Args:
             missing: ranges of row numbers; a row is an image and a model.
         """
-        batch_size = self.job.config.batch
         for rows in missing:
-            image = rows.start // self.n_models
-            last_image = -(-rows.stop // self.n_models)  # rounded up
-            while image < last_image:
-                scene_begin = image // self.images_per_scene * self.images_per_scene
-                images = split_into_batches(
-                    image - scene_begin,
-                    min(last_image - scene_begin, self.images_per_scene),
-                    batch_size,
-                )
-                for batch in images:
-                    items = self.job.make_queries(
-                        range(scene_begin + batch.start, scene_begin + batch.stop)
-                    )
-                    yield [
-                        (problem_name, u, query)
-                        for problem_name, u, query in items
-                        if query.index in rows
-                    ]
-                # the first image of the next scene
-                image = scene_begin + self.images_per_scene
+            for images in self._split_images(rows):
+                items = self.job.make_queries(images)
+                yield [
+                    (problem_name, u, query)
+                    for problem_name, u, query in items
+                    if query.index in rows
+                ]
+
+    def _split_images(self, rows: range) -> Iterator[range]:
+        """Yield the images that rows are about, in batches, none over two scenes."""
+        image = rows.start // self.n_models
+        images_end = -(-rows.stop // self.n_models)  # rounded up
+        while image < images_end:
+            scene_begin = image // self.images_per_scene * self.images_per_scene
+            scene_end = scene_begin + self.images_per_scene
+            # batches are counted in the scene
+            batches = split_into_batches(
+                image - scene_begin,
+                min(images_end, scene_end) - scene_begin,
+                self.job.config.batch,
+            )
+            for batch in batches:
+                yield range(scene_begin + batch.start, scene_begin + batch.stop)
+            image = scene_end
 
     def _report(self, n_rows: int, predictions: Predictions) -> None:
         """Report progress by some rows, at most every `REPORT_SECONDS`."""
@@ -386,10 +398,11 @@ class Sweep:
                 self._n_lost += 1
 
     def _make_axes(self, rows: npt.NDArray[np.int64]) -> list[TableAxis]:
-        """Return what tables are by: all axes with several values.
+        """Return the axes by whose values tables count predictions.
 
-        These are object, environment, photograph and adversarial scene, the model, the
-        axes of the grid, and the parts of sampled numbers.
+        These are object, environment, photograph, adversarial scene, model, the axes of
+        the grid and the parts of sampled numbers; of all these, those that have several
+        values.
 
         Args:
             rows: (n,) numbers of the rows, ascending, whose values are looked up.
@@ -478,13 +491,10 @@ class Sweep:
         row_number = predictions.worst_row
         if row_number is None:
             return None
-        rows: Iterable[Row | None] = self.journal.rows
-        if self.run is not None:
-            rows = [self.run.store.read_row(KIND, row_number)]
-        row = next(row for row in rows if row is not None and row.step == row_number)
+        row = self._read_row(row_number)
         image, model = divmod(row_number, self.n_models)
-        # the queries of all models about this one image
-        _, _, query = self.job.make_queries(range(image, image + 1))[model]
+        queries_of_image = self.job.make_queries(range(image, image + 1))
+        _, _, query = queries_of_image[model]
         scene = self._scene_of(row_number)
         worst = WorstConfiguration(
             configuration=row_number,
@@ -500,6 +510,13 @@ class Sweep:
             return worst
         problem = self._scenes.load(scene).problems[model]
         return self._verify_worst(worst, problem, query.u)
+
+    def _read_row(self, number: int) -> Row:
+        """Return a row that was evaluated, from the run directory if there is one."""
+        rows: Iterable[Row | None] = self.journal.rows
+        if self.run is not None:
+            rows = [self.run.store.read_row(KIND, number)]
+        return next(row for row in rows if row is not None and row.step == number)
 
     def _find_right_labels(self, scene: int, model: int, query: Query) -> list[str]:
         """Return the names that count as right in the image of a query."""
@@ -547,10 +564,6 @@ class Sweep:
         path = None if self.run is None else self.run.path
         return SweepResult(summary, path, tuple(self.journal.rows))
 
-    def _sampled_values(self) -> dict[str, Any]:
-        """Return what varies in each number that is sampled, by its name."""
-        return {number.name: number.varied_value for number in self._sampled_numbers}
-
     def _summarize(
         self, predictions: Predictions, ending: str, worst: WorstConfiguration | None
     ) -> SweepSummary:
@@ -564,63 +577,91 @@ class Sweep:
         job = self.job
         config = job.config
         path = None if self.run is None else self.run.path
-        seconds = self.stages.seconds
         verified = worst.verified if worst else None
         formation, gains = self._describe_formation()
-        # Rates are of these rows, and their intervals of the units that they belong to:
-        # of drives, say, since the frames of one are not independent.
-        rows = np.flatnonzero(predictions.is_counted)
-        right = predictions.is_right[rows]
-        units = self.units.find_unit(rows)
-        axes = self._make_axes(rows)
-        outcome = predictions.outcome[rows]
         changes = self._compute_change_rates()
         return SweepSummary(
+            **self._summarize_job(),
+            **self._summarize_predictions(predictions),
             run=None if path is None else str(path),
-            object=config.object,
-            model=",".join(_get_names(job.models)),
-            task=config.task_name,
-            environment=self.points.environment or config.environment_name,
-            controls=_get_names(job.controls),
             ending=ending,
             image_formation=formation,
             gains=gains if len(gains) > 1 else None,
-            drawn=self._sampled_values(),
-            planned=self.n_rows,
-            **vars(count_by_unit(right, units, outcome)),
-            out_of_view=int(predictions.is_hidden.sum()),
-            phantoms_out_of_view=predictions.n_phantoms_out_of_view,
-            units=len(np.unique(units)) if self.units.size > 1 and len(units) else None,
-            not_finite=predictions.n_non_finite,
-            answers=predictions.frequent_wrong_labels,
-            axes=_make_axis_rows(axes, right, units, outcome),
-            cells=make_map(axes, right, predictions.margin[rows]),
-            beside=self._compare_arms(predictions),
             worst=worst,
-            grid={axis.name: len(axis.values) for axis in job.axes},
-            samples=job.samples,
-            sampler=config.sampler if self.points.is_sampled else None,
-            spp=job.spp,
             renders=self._count_renders(verified),
             transport=self._combine_transport(),
             surface=self._surface,
             drives=self._drives,
             changes=changes or None,
             shared=SharedWork.of_facts(self._executor.stats, self.journal.machines),
-            renders_per_second=self._compute_speed(seconds.get("sweep", 0.0)),
-            seconds={**seconds, "total": self.stages.total},
-            seed=config.seed,
+            renders_per_second=self._compute_speed(
+                self.stages.seconds.get("sweep", 0.0)
+            ),
+            seconds={**self.stages.seconds, "total": self.stages.total},
             warnings=[*job.warnings, *self._remarks(predictions, verified, changes)],
             command_line=config.command_line(path),
             python_only=config.python_only,
-            twins=find_twin_evidence(
-                config.twins,
-                model=",".join(_get_names(job.models)),
-                task=config.task_name,
-                object_name=config.object,
-                environment=self.points.environment or config.environment_name,
-                in_photograph=getattr(config, "backdrop", None) is not None,
-            ),
+            twins=self._find_twins(),
+        )
+
+    def _summarize_job(self) -> dict[str, Any]:
+        """Return the fields of a summary about what was swept."""
+        job = self.job
+        config = job.config
+        return {
+            "object": config.object,
+            "model": ",".join(_get_names(job.models)),
+            "task": config.task_name,
+            "environment": self._environment,
+            "controls": _get_names(job.controls),
+            "drawn": {
+                number.name: number.varied_value for number in self._sampled_numbers
+            },
+            "planned": self.n_rows,
+            "grid": {axis.name: len(axis.values) for axis in job.axes},
+            "samples": job.samples,
+            "sampler": config.sampler if self.points.is_sampled else None,
+            "spp": job.spp,
+            "seed": config.seed,
+        }
+
+    def _summarize_predictions(self, predictions: Predictions) -> dict[str, Any]:
+        """Return the fields of a summary that count the predictions of all rows so far."""
+        # Rates count these rows. Their intervals count independent units instead: the
+        # frames of a drive, say, are not independent, and belong to one unit.
+        rows = np.flatnonzero(predictions.is_counted)
+        right = predictions.is_right[rows]
+        units = self.units.find_unit(rows)
+        outcome = predictions.outcome[rows]
+        axes = self._make_axes(rows)
+        has_shared_units = self.units.size > 1 and len(units) > 0
+        return {
+            **vars(count_by_unit(right, units, outcome)),
+            "out_of_view": int(predictions.is_hidden.sum()),
+            "phantoms_out_of_view": predictions.n_phantoms_out_of_view,
+            "units": len(np.unique(units)) if has_shared_units else None,
+            "not_finite": predictions.n_non_finite,
+            "answers": predictions.frequent_wrong_labels,
+            "axes": _make_axis_rows(axes, right, units, outcome),
+            "cells": make_map(axes, right, predictions.margin[rows]),
+            "beside": self._compare_arms(predictions),
+        }
+
+    @property
+    def _environment(self) -> str:
+        """Name of the environments: those that a control chooses, or the settings'."""
+        return self.points.environment or self.job.config.environment_name
+
+    def _find_twins(self) -> TwinEvidence | None:
+        """Return how far verdicts hold for photographs, by a run of twins, if any."""
+        config = self.job.config
+        return find_twin_evidence(
+            config.twins,
+            model=",".join(_get_names(self.job.models)),
+            task=config.task_name,
+            object_name=config.object,
+            environment=self._environment,
+            in_photograph=getattr(config, "backdrop", None) is not None,
         )
 
     def _describe_formation(self) -> tuple[Formation | None, dict[str, float]]:
@@ -633,7 +674,7 @@ class Sweep:
         gains: dict[str, float] = {}
         if self._scenes.scene is None:
             return None, gains
-        renderer = next(iter(self._scenes.scene.renderers.values()))
+        renderer = next(iter(self._scenes.scene.renderer_of_size.values()))
         formation = Formation.of(renderer.formation)
         if len(self.job.scenes) <= MAX_LISTED_GAINS:
             for named_scene in self.job.scenes:
@@ -670,9 +711,9 @@ class Sweep:
         transport = [
             summary for summaries in self._transport.values() for summary in summaries
         ]
-        # without a batch in this session, what the loaded scene has
+        # A continued sweep may have no batch to evaluate: then the loaded scene is told.
         if not self._transport and self._scenes.scene is not None:
-            predictors = self._scenes.scene.predictors.values()
+            predictors = self._scenes.scene.predictor_of_size.values()
             transport = [predictor.summarize() for predictor in predictors]
         return combine_transport(transport)
 
@@ -685,9 +726,9 @@ class Sweep:
     def _compute_change_rates(self) -> list[ChangeRates]:
         """Return how often the predictions about changed images are as claimed.
 
-        The rows have that as a metric, 1 where the prediction is as claimed. There is a
-        rate for each claim, change and model; its `row` is the first row in which the
-        prediction is not as claimed. Rows without the object do not count.
+        A claim says that the prediction must change, or must not change, if the image
+        is changed in some way. Each row has a metric for it, 1 where it holds. There is
+        a rate for each claim, change and model. Rows without the object do not count.
         """
         rates = list[ChangeRates]()
         for claim, change in self.job.config.claims:
@@ -697,25 +738,43 @@ class Sweep:
                 for row in self.iterate_rows()
                 if row.label != OUT_OF_VIEW and metric in row.metrics
             }
-            for model, network in enumerate(self.job.models):
-                rows = np.array(
-                    [row for row in value_of_row if row % self.n_models == model],
-                    dtype=np.int64,
-                )
-                is_claimed = np.array(
-                    [value_of_row[row] == 1.0 for row in rows.tolist()], dtype=bool
-                )
-                violations = rows[~is_claimed]
-                rates.append(
-                    ChangeRates(
-                        **vars(count_by_unit(is_claimed, self.units.find_unit(rows))),
-                        model=network.name,
-                        claim=claim,
-                        when=change,
-                        row=int(violations[0]) if len(violations) else None,
-                    )
-                )
+            for model in range(self.n_models):
+                rate = self._compute_change_rate(value_of_row, model, claim, change)
+                rates.append(rate)
         return rates
+
+    def _compute_change_rate(
+        self,
+        value_of_row: Mapping[int, float | None],
+        model: int,
+        claim: str,
+        change: str,
+    ) -> ChangeRates:
+        """Return how often the predictions of a model are as claimed.
+
+        Its `row` is the first row in which the prediction is not as claimed.
+
+        Args:
+            value_of_row: the claim's metric by the number of the row, 1 where it holds.
+            model: index of the model.
+            claim: name of the claim.
+            change: name of the change of the image.
+        """
+        rows = np.array(
+            [row for row in value_of_row if row % self.n_models == model],
+            dtype=np.int64,
+        )
+        is_claimed = np.array(
+            [value_of_row[row] == 1.0 for row in rows.tolist()], dtype=bool
+        )
+        violations = rows[~is_claimed]
+        return ChangeRates(
+            **vars(count_by_unit(is_claimed, self.units.find_unit(rows))),
+            model=self.job.models[model].name,
+            claim=claim,
+            when=change,
+            row=int(violations[0]) if len(violations) else None,
+        )
 
     def _remarks(
         self,
@@ -723,7 +782,7 @@ class Sweep:
         verified: WorstVerified | None,
         changes: Sequence[ChangeRates],
     ) -> Iterator[str]:
-        """Yield what a reader of the result has to know."""
+        """Yield sentences about what limits the result, and what stands out in it."""
         yield from make_lost_remarks(self._n_lost)
         yield from self.journal.remarks
         if self.units.noise > 1 and self.units.photographs == 1:
@@ -741,12 +800,9 @@ class Sweep:
                 "that a check takes: noise may take part in it."
             )
         for rates in changes:
-            # surely less than half of the predictions change, and all should
-            is_blind = (
-                rates.claim == "must_change"
-                and rates.interval is not None
-                and rates.interval[1] < 0.5
-            )
+            upper_bound = rates.interval[1] if rates.interval is not None else 1.0
+            # all predictions should change, and surely less than half of them do
+            is_blind = rates.claim == "must_change" and upper_bound < 0.5
             if is_blind:
                 n_same = rates.configurations - rates.correct
                 yield (
@@ -757,7 +813,7 @@ class Sweep:
 
     def _drive_remarks(self) -> Iterator[str]:
         """Yield what few drives can show at best."""
-        # of the model with the fewest; enough if no drives are swept
+        # drives of the model that has the fewest; without any drives nothing is yielded
         n_drives = min(
             (rates.drives for rates in self._drives or ()), default=ENOUGH_DRIVES
         )
@@ -828,7 +884,7 @@ def _make_axis_rows(
     Args:
         axes: axes of the tables.
         right: (n,) whether each prediction is right.
-        units: (n,) the unit of each.
+        units: (n,) the independent unit of each.
         outcome: (n,) indices among `result.OUTCOMES`.
     """
     return [row for axis in axes for row in axis.make_rows(right, units, outcome)]

@@ -184,7 +184,7 @@ def _describe_runs(
             images, note = _describe_images(source, source.thumbnails)
             description["pictures"] = images
             image_notes += [] if note is None else [note]
-        descriptions.append(description | _describe_evaluation(path, summary))
+        descriptions.append(description | _describe_for_explorer(path, summary))
     return descriptions, embedded_rows, image_notes
 
 
@@ -200,7 +200,14 @@ def _embed_rows(rows: Any, element_id: str) -> Html:
 def _describe_images(
     source: SweepSource, thumbnails: Thumbnails
 ) -> tuple[JsonObject, Html | None]:
-    """Return where the explorer finds thumbnails, and which are left out, if any."""
+    """Describe for the explorer where the thumbnails of a sweep are.
+
+    They are in a folder beside the page, or embedded in it. A page embeds only as many
+    as fit.
+
+    Returns:
+        The description; and a note if some are left out, else None.
+    """
     images: JsonObject = {"models": thumbnails.configurations_per_image}
     if source.thumbnail_address is not None:
         images["folder"] = source.thumbnail_address
@@ -235,12 +242,13 @@ def _page_parts_html(path: Path, summary: SweepSummary) -> list[Html | None]:
     ]
 
 
-def _describe_evaluation(run: Path, summary: SweepSummary | None) -> JsonObject:
-    """Return what the explorer has to know of a sweep.
+def _describe_for_explorer(run: Path, summary: SweepSummary | None) -> JsonObject:
+    """Return what the page's explorer of rows has to know of a sweep.
 
-    That is the task, the axes of the grid, and height and width in pixels of the
-    evaluated images if all have one size: boxes are in these. Without a summary it is
-    the task, as far as the settings can be read.
+    That is the task, the axes of the grid, and height and width of the evaluated images
+    in pixels, in which boxes are. With several models there is no size, since they may
+    differ in it. A sweep without a summary yet has the task only, as far as its
+    settings can be read.
     """
     if summary is None:
         with suppress(AdvsearchError):
@@ -250,7 +258,8 @@ def _describe_evaluation(run: Path, summary: SweepSummary | None) -> JsonObject:
         return {}
     formation = summary.image_formation
     size = None
-    if formation is not None and "," not in summary.model:
+    has_single_model = "," not in summary.model
+    if formation is not None and has_single_model:
         size = list[JsonValue](formation.resolution)
     return {
         "task": summary.task,
@@ -361,6 +370,7 @@ def _worst_caption(summary: SweepSummary) -> str:
         f"{name} {wording.format_number(described.value)}"
         for name, described in worst.values.items()
     )
+    # the prediction about the saved image, or about the image of the sweep
     claim = worst.pictured or worst.claimed
     text = f"{values}: the model predicts {format_prediction(summary.task, claim)}"
     rate = worst.verified
@@ -405,7 +415,8 @@ INDEX = "index.html"
 def write_bundle(runs: Sequence[Path], folder: Path) -> Path:
     """Write a directory with a page, the rows and the thumbnails of sweeps.
 
-    Of a run of another command, it has its page.
+    A single run of another command may be in place of the sweeps: then the directory
+    has its page, and those of its parts.
 
     Args:
         runs: run directories.
@@ -467,11 +478,12 @@ def _write_source(run: Path, index: int, folder: Path) -> SweepSource:
         rows = f"rows-{index}.bin"
         write_bytes(folder / rows, pack_columns(columns))
     image_folder = f"pictures-{index}"
-    stored = find_thumbnails(run)
-    for number in stored.numbers if stored else ():
+    thumbnails = find_thumbnails(run)
+    numbers = thumbnails.numbers if thumbnails else ()
+    for number in numbers:
         file = thumbnail_path(folder / image_folder, number)
         target = folder / image_folder / file.parent.name / file.name
         write_bytes(target, read_thumbnail(run, number))
     return SweepSource(
-        run.name, rows, thumbnails=stored, thumbnail_address=image_folder
+        run.name, rows, thumbnails=thumbnails, thumbnail_address=image_folder
     )

@@ -69,9 +69,12 @@ prediction, comparisons included.
 class Groups:
     """How the images of a scene fall into groups that one predictor serves.
 
+    Images of a group differ along some axes, those *within* groups, and have the same
+    index along the others, those *between* groups.
+
     Args:
         grid: grid of the sweep.
-        samples: at each point of the grid.
+        samples: number of samples at each point of the grid.
         within: whether images of a group may differ along each axis of the grid.
         is_sampled: whether they may differ in what is sampled. If not, they differ
             along no axis but `frames`, since other images have other draws.
@@ -79,11 +82,11 @@ class Groups:
             None without a drive.
 
     Attributes:
-        group_size: images of a group.
-        n_groups: groups.
-        n_cached_groups: groups that have to be cached, so that no predictor is made
-            twice, when images come in order: 1 if the images of a group follow each
-            other.
+        group_size: number of images of a group.
+        n_groups: number of groups.
+        n_cached_groups: number of groups that have to be cached so that no predictor is
+            made twice, when images come in order: 1 if the images of a group follow
+            each other.
     """
 
     def __init__(
@@ -96,10 +99,9 @@ class Groups:
     ) -> None:
         self.grid = grid
         self.samples = samples
-        # Samples are like one more axis, the fastest.
+        # Samples are like one more axis, the last and fastest.
         self._all_axes = ProductIndex((*grid.sizes, samples))
-        # An image with other draws is of another group. Along an axis the draws change,
-        # except from one frame of a drive to the next.
+        # Along an axis the draws change, except from one frame of a drive to the next.
         axis_is_within = [
             may_differ and (is_sampled or axis == frames)
             for axis, may_differ in enumerate(within)
@@ -111,14 +113,22 @@ class Groups:
         self._between = ProductIndex(tuple(between_sizes))
         self.group_size = self._within.count
         self.n_groups = self._between.count
-        self.n_cached_groups = 1
-        if True in self._is_within:
-            # Images come in order, the last axis fastest. If an axis after the first
-            # one within lies between groups, groups along it alternate: all are cached.
-            first_within = self._is_within.index(True)
-            for axis in range(first_within, len(self._is_within)):
-                if not self._is_within[axis]:
-                    self.n_cached_groups *= self._all_axes.sizes[axis]
+        self.n_cached_groups = self._count_cached_groups()
+
+    def _count_cached_groups(self) -> int:
+        """Return how many groups alternate when images come in order.
+
+        The last axis is the fastest. Groups along an axis between them alternate if it
+        comes after an axis within groups.
+        """
+        n_groups = 1
+        was_axis_within = False
+        for size, is_within in zip(self._all_axes.sizes, self._is_within, strict=True):
+            if is_within:
+                was_axis_within = True
+            elif was_axis_within:
+                n_groups *= size
+        return n_groups
 
     def _select(self, values: Sequence[int], *, is_within: bool) -> list[int]:
         """Select the values that belong to axes within groups, or to those between.
@@ -139,13 +149,14 @@ class Groups:
     def find_member(self, number: int, index: int) -> int:
         """Return the number of a member of the group that an image belongs to.
 
-        Both have the same index along every axis between groups; along the axes within,
-        the member has what its index in the group says.
+        Image and member have the same index along every axis between groups. The index
+        of the member counts the axes within the group, the last one fastest.
 
         Args:
             number: number of the image.
             index: index of the member in the group, in [0, group_size).
         """
+        # the digits of a number are its indices along the axes
         member_digits = list(self._all_axes.digits(number))
         within_axes = [
             axis for axis, is_within in enumerate(self._is_within) if is_within
@@ -229,8 +240,10 @@ class BasisPictures:
 
 ARRANGEMENT_SAMPLES = 2_200_000
 LIGHT_SAMPLES = 80_000
-"""Samples that take as long as finding what texels see, and the light of an
-environment: 0.8 and 0.03 s where an image of 128 x 128 pixels with 8 samples per pixel
+"""Costs, as the number of rendered samples that take as long: of an arrangement (what
+texels of the surfaces see of each other), and of the light of an environment on them.
+
+They take 0.8 and 0.03 s where an image of 128 x 128 pixels with 8 samples per pixel
 takes 46 ms.
 """
 PREDICTION_SPP = 0.8  # samples per pixel that take as long as a predicted image
@@ -241,19 +254,21 @@ LIGHT_BYTES = 4_000_000  # memory of the light of an environment besides its map
 def find_break_even(renderer: Renderer, spp: int, arrangements: float = 1.0) -> int:
     """Return how many images under one light make light on surfaces pay.
 
-    Preparing the light and comparing it with traced images takes a fixed number of
-    samples per pixel; each image that is predicted saves `spp - PREDICTION_SPP`.
+    Preparing the light and comparing it with traced images has a fixed cost; each image
+    that is predicted saves `spp - PREDICTION_SPP`. It pays if the images save
+    `MIN_SAVING_FACTOR` times the fixed cost. All costs are in samples per pixel.
 
     Args:
         renderer: renderer of the images.
         spp: samples per pixel of the images.
-        arrangements: arrangements that are found for each light.
+        arrangements: arrangements that are found for each light, below 1 if several
+            lights share one. An arrangement is what surfaces see of each other.
     """
     height, width = renderer.formation.resolution
-    light_samples = ARRANGEMENT_SAMPLES * arrangements + LIGHT_SAMPLES
-    # a view is traced in two halves to tell its noise, and once as images are
-    check_spp = N_VIEWS * (2 * CHECK_SPP + spp)
-    fixed_spp = light_samples / (height * width) + check_spp
+    preparation_samples = ARRANGEMENT_SAMPLES * arrangements + LIGHT_SAMPLES
+    # a view is traced in two halves, to estimate its noise, and once as images are
+    spp_of_view = 2 * CHECK_SPP + spp
+    fixed_spp = preparation_samples / (height * width) + N_VIEWS * spp_of_view
     return math.ceil(MIN_SAVING_FACTOR * fixed_spp / (spp - PREDICTION_SPP))
 
 
@@ -325,10 +340,8 @@ class LightOnSurfaces:
         refusal = find_scene_refusal(self._renderer)
         if refusal is not None:
             return refusal
-        light_bytes = (
-            LIGHT_BYTES
-            + 4 * self._renderer.scene.get_base_value(ENVIRONMENT_INPUT).numel()
-        )
+        environment = self._renderer.scene.get_base_value(ENVIRONMENT_INPUT)
+        light_bytes = LIGHT_BYTES + 4 * environment.numel()  # 4 bytes for a float32
         n_bytes = (
             arrangement_groups.n_cached_groups * ARRANGEMENT_BYTES
             + groups.n_cached_groups * light_bytes
@@ -424,10 +437,12 @@ class SweepPredictor:
         self._groups = self._make_groups(self.method.follows)
 
     def _choose_method(self) -> tuple[BasisPictures | LightOnSurfaces, Refusal | None]:
-        """Return the cheapest method that pays here, and None.
+        """Choose how images are predicted.
 
-        If none does, return a method that is not used, and why: the first that could
-        follow something that varies, else the last.
+        Returns:
+            The cheapest method that pays here, and None. If none pays, a method that is
+            not used, and why not. Something that varies may be what this method could
+            predict, so that its reason concerns the user; else it is the last method.
         """
         refused: list[tuple[BasisPictures | LightOnSurfaces, Refusal]] = []
         for method_type in (BasisPictures, LightOnSurfaces):  # cheapest first
@@ -500,11 +515,13 @@ class SweepPredictor:
         return images
 
     def _count_traced(self, number: int) -> int:
-        """Return the images that were traced for the predictor of an image's group.
+        """Return how many images were traced to prepare the predictor of an image.
 
-        They count for the first image of the group; for all others this is 0.
+        The predictor serves a group of images. What was traced for it counts for the
+        first of them; for the others this is 0.
         """
-        if number != self._groups.find_member(number, 0):
+        first_of_group = self._groups.find_member(number, 0)
+        if number != first_of_group:
             return 0
         return self._traced.get(self._groups.find_group(number), 0)
 
@@ -548,21 +565,27 @@ class SweepPredictor:
             seed: selects the images that are compared.
         """
 
-        def margin(image: Tensor, u: Tensor) -> float:
+        def compute_margin(image: Tensor, u: Tensor) -> float:
+            """Return the margin of the model's prediction about an image."""
             return self.problem.judge(round_to_8_bit(image), u).margin
 
-        def view(check: int) -> ComparedView:
+        def compare_view(check: int) -> ComparedView:
             """Compare the prediction of a random configuration of the group."""
             index = seeds.stream(seed, "check", check) % self._groups.group_size
             u = self._configuration(number, index)
             (predicted,) = predictor.predict_images([u])
             noise_seed = seeds.stream(seed, "traced", check)
             return compare_with_traced(
-                self.renderer, predicted, u, noise_seed, self.problem.spp, margin
+                self.renderer,
+                predicted,
+                u,
+                noise_seed,
+                self.problem.spp,
+                compute_margin,
             )
 
         with torch.no_grad():
-            return compare_views(view)
+            return compare_views(compare_view)
 
     def _configuration(self, number: int, index: int) -> Tensor:
         """Return a configuration (d,) of the group of an image, by its index there."""
@@ -646,16 +669,17 @@ def combine_transport(
 def prepare_surface_light(
     verifier: Verifier, at: Tensor, coordinates: Tensor, n_images: int
 ) -> None:
-    """Prepare light on surfaces around a configuration, if it is cheaper than renders.
+    """Prepare light on surfaces for trials, if that is cheaper than rendering them.
 
-    The verifier's findings then have it as `transport`, or state why images are
-    rendered where cameras move.
+    The trials vary some numbers around a configuration. The verifier's findings then
+    have the light as `predictor`. If cameras move, but it is not used, they have the
+    reason as `predictor_refusal`.
 
     Args:
         verifier: verifier of the trials, whose sample count is known.
-        at: the configuration (d,).
-        coordinates: coordinates of the numbers that vary (k,).
-        n_images: trials, about.
+        at: (d,) the configuration.
+        coordinates: (k,) indices of the coordinates that vary.
+        n_images: about how many trials there are.
     """
     problem = verifier.problem
     varying = set(coordinates.tolist())
@@ -671,12 +695,13 @@ def prepare_surface_light(
     if not moves_camera or not can_follow:
         return
     findings = verifier.state
-    findings.predictor_refusal = find_scene_refusal(problem.renderer)
+    refusal = find_scene_refusal(problem.renderer)
     min_images = find_break_even(problem.renderer, findings.spp)
-    if findings.predictor_refusal is None and n_images < min_images:
+    if refusal is None and n_images < min_images:
         reason = f"light on surfaces pays from {min_images} pictures on"
-        findings.predictor_refusal = Refusal(reason, RefusalCause.TOO_FEW_STEPS)
-    if findings.predictor_refusal is not None:
+        refusal = Refusal(reason, RefusalCause.TOO_FEW_STEPS)
+    findings.predictor_refusal = refusal
+    if refusal is not None:
         return
     title = "finding the light on surfaces"
     verifier.stages.begin(
@@ -684,7 +709,6 @@ def prepare_surface_light(
     )
     light = SurfaceLight(problem, 0, light_u=at, moving_coordinates=coordinates)
     light.prepare(verifier.stages.progress.advance)
-    findings.predictor = light
     findings.predictor_refusal = light.accuracy_refusal
-    if findings.predictor_refusal is not None:
-        findings.predictor = None
+    is_accurate = light.accuracy_refusal is None
+    findings.predictor = light if is_accurate else None

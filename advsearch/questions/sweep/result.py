@@ -322,8 +322,9 @@ def make_map(
 ) -> SweepMap | None:
     """Count predictions, and average margins, over every pair of values of two axes.
 
-    The two are the first axes of the grid; if it has fewer, the last ones outside of
-    the scene follow. Only if there are none of either kind, they are sampled ones.
+    The two are the first axes of the grid. If it has fewer than two, axes outside of
+    the scene follow, such as the model, the last one first. If there are neither, they
+    are the first two sampled numbers.
 
     Args:
         axes: all of the tables.

@@ -306,10 +306,12 @@ class SweepConfig(SceneConfig):
     ) -> dict[str, Any]:
         """Return the settings that a sweep takes from the attack it is about.
 
+        Unless the sweep states what varies, that is what varied by chance in the
+        attack (its setting `over`).
+
         Args:
             file: `run.yaml` of the attack.
-            typed: settings of the sweep. If neither `grid` nor `controls` is among
-                them, what the attack was over varies.
+            typed: settings that the sweep states, by name.
         """
         attack_config = AttackConfig.from_yaml(file)
         # Both commands have these settings, but a sweep has its own values of them.
@@ -326,7 +328,8 @@ class SweepConfig(SceneConfig):
             for name, value in cls.get_shared_settings(attack_config).items()
             if name not in excluded
         }
-        if not typed.get("grid") and not typed.get("controls"):
+        states_what_varies = typed.get("grid") or typed.get("controls")
+        if not states_what_varies:
             settings["controls"] = attack_config.over
         return settings
 
@@ -357,8 +360,9 @@ class SweepConfig(SceneConfig):
 def _parse_axis(axis: Any) -> str | list[Any]:
     """Return the values of an axis as a list, or FIRST:LAST:COUNT as text.
 
-    Text may have brackets, as in a YAML file. A single value is a list of one; arrays
-    and their elements become Python's numbers.
+    Values are a list, text such as "1, 2" or "[1, 2]", an array, a single value, or a
+    mapping {"choices": ...} of these, as controls take it. Arrays and their elements
+    become Python's numbers.
 
     Raises:
         ValueError: there are no values, or some are lists, mappings, booleans or None.

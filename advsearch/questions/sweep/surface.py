@@ -88,9 +88,9 @@ class PartCounts:
     def add(self, parts: Int64Array, failed: bool) -> None:
         """Count an image, and decide in which permutations it is a failure.
 
-        The permutations show what would be counted if predictions had nothing to do
-        with the parts. Images are added in the order of `permuted_failures`, `n_images`
-        in all.
+        A permutation deals the failures out to the images anew: what it counts is what
+        could be counted if predictions had nothing to do with the parts. Images are
+        added in the order of `permuted_failures`, `n_images` in all.
 
         Args:
             parts: indices of the parts that it shows, each once.
@@ -99,6 +99,7 @@ class PartCounts:
         self.visible_counts[parts] += 1
         self.wrong_counts[parts] += failed
         if self.permuted_failures is not None:
+            # given, as a bit for each permutation
             image = self.n_images - self._images_left
             bits = np.unpackbits(self.permuted_failures[:, image], count=N_PERMUTATIONS)
             permuted_failure = bits.astype(bool)
@@ -106,8 +107,8 @@ class PartCounts:
             # Sequential sampling (Knuth's algorithm S): an image is a failure with the
             # probability failures left / images left, so that each choice of
             # `n_failures` images is equally likely.
-            draw = self._random.random(N_PERMUTATIONS) * self._images_left
-            permuted_failure = draw < self._failures_left
+            uniform = self._random.random(N_PERMUTATIONS)
+            permuted_failure = uniform * self._images_left < self._failures_left
         self._images_left -= 1
         self._failures_left = self._failures_left - permuted_failure
         self.permuted_counts[np.ix_(np.flatnonzero(permuted_failure), parts)] += 1
@@ -220,9 +221,13 @@ def _likelihood_ratio(
     failures in the other images, are with a rate each than with a common rate; at
     least 0. The shapes of `k` and `n` are broadcast.
     """
-    # Images by whether they show the part and whether they are failures, and the sums
-    # of this table by row and by column.
-    cells = (k, n - k, n_failures - k, n_images - n - n_failures + k)
+    # the table of images by whether they show the part, and by whether they fail
+    visible_failing = k
+    visible_passing = n - k
+    hidden_failing = n_failures - k
+    hidden_passing = n_images - n - n_failures + k
+    cells = (visible_failing, visible_passing, hidden_failing, hidden_passing)
+    # its sums by row and by column
     margins = (n, n_images - n, np.array(n_failures), np.array(n_images - n_failures))
     log_ratio = (
         xlogy(n_images, n_images)
@@ -332,15 +337,14 @@ class SurfaceCounts:
             kind: kind of the parts, a key of `SurfaceParts.kinds`.
             compared: comparison of the parts, from `compare_parts`.
         """
-        strongest = list[SurfacePart]()
-        for has_sign in (compared.difference > 0.0, compared.difference < 0.0):
-            candidates = compared[compared.significant & has_sign]
-            strongest += [
-                self._describe_part(part, counts, compared)
-                for part in self._select_spread(candidates)
-            ]
         is_worse = compared.significant & (compared.difference > 0)
         is_better = compared.significant & (compared.difference < 0)
+        strongest = list[SurfacePart]()
+        for is_candidate in (is_worse, is_better):
+            strongest += [
+                self._describe_part(part, counts, compared)
+                for part in self._select_spread(compared[is_candidate])
+            ]
         return SurfaceTable(
             object=object_name,
             model=model,
@@ -478,7 +482,7 @@ def _draw_of_images(
     scenes: SceneLoader, wrong: npt.NDArray[np.int8], job: Job
 ) -> npt.NDArray[Any]:
     """Return the draw of each image, (scenes, images of a scene)."""
-    units = scenes.load(0).points[job.image_sizes[0]].units
+    units = scenes.load(0).points_of_size[job.image_sizes[0]].units
     image_numbers = np.arange(wrong[..., 0].size)
     return np.asarray(units.find_cluster(image_numbers)).reshape(wrong.shape[:2])
 
@@ -510,7 +514,7 @@ def _count_scene(
     """Trace the surface in every image of a scene and count it.
 
     Small images are traced with several rays per pixel; see `MIN_RAYS`. Models of one
-    image size share them.
+    image size share the traced image.
 
     Args:
         scenes: scenes of the sweep.
@@ -527,11 +531,14 @@ def _count_scene(
             models = [
                 model for model in range(n_models) if job.image_sizes[model] == size
             ]
-            configurations = swept_scene.points[size].make_configurations(
-                batch.start, len(batch), scene * n_images
+            configurations = swept_scene.points_of_size[size].make_configurations(
+                # every scene before this one has as many images
+                batch.start,
+                len(batch),
+                before=scene * n_images,
             )
             rays_per_pixel = ceil(MIN_RAYS / min(size))
-            renderer = swept_scene.renderers[size]
+            renderer = swept_scene.renderer_of_size[size]
             for number, u in zip(batch, configurations, strict=True):
                 surfaces = renderer.surfaces(u, rays_per_pixel)
                 counts.add(surfaces, _select_known(wrong[number], models))
@@ -842,6 +849,7 @@ def _draw(panels: Sequence[Panel], figure: Any) -> None:
         map_axes.set_title(panel.title)
         _draw_views(view_axes, panel.views, cell_colors)
 
+    # the color bar stands beside all rows, and need not be as high
     shrink = 0.8 if len(panels) == 1 else 0.4
     bar = figure.colorbar(scale, ax=axes, shrink=shrink, format=_format_percent)
     bar.set_label(

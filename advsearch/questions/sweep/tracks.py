@@ -182,9 +182,12 @@ def read_frame(payload: Any, names: Collection[str]) -> DetectedFrame:
             scores, "box" the true one, None if the object is not visible.
         names: names of the classes whose boxes count.
     """
-    found = [box for box in payload["found"] if box["label"] in names]
-    boxes = np.array([box["box"] for box in found], dtype=float).reshape(-1, 4)
-    scores = np.array([box["score"] for box in found])
+    detections = [
+        detection for detection in payload["found"] if detection["label"] in names
+    ]
+    boxes = np.array([detection["box"] for detection in detections], dtype=float)
+    boxes = boxes.reshape(-1, 4)  # also without any
+    scores = np.array([detection["score"] for detection in detections])
     true_box = None
     if payload["box"] is not None:
         true_box = np.array(payload["box"], dtype=float)

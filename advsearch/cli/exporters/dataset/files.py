@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import tempfile
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from advsearch.extend import (
     writing,
 )
 
+OBJECT = "object"  # the name of the object among the things of an image
 IMAGES = "images"  # what is in the folder of a dataset
 LABELS = "labels"
 COCO = "annotations.json"
@@ -35,8 +37,12 @@ YOLO = "data.yaml"
 
 @dataclass
 class Categories:
-    """The labels of the models, in the order of their outputs; of models without, what
-    the object is called; and the things that were seen and have no category.
+    """The categories of a dataset.
+
+    Attributes:
+        labels: the category of each index: the labels of the model, or of a model
+            without labels the name of the object alone. Empty before the first image.
+        unnamed: names of the things that images show and that no label names.
     """
 
     labels: tuple[str, ...] = ()
@@ -45,41 +51,55 @@ class Categories:
     def find_things(self, image: Any) -> list[tuple[Any, int]]:
         """Return the things that an image shows, each with the index of its category.
 
-        The labels become those of the first image; things that no label names are added
-        to `unnamed`.
+        The first image decides `labels`. Things that no label names are left out, and
+        added to `unnamed`.
 
         Raises:
             InputError: another image of the run has other labels.
         """
-        task = image.task
-        facts = image.facts
-        # several models have their tasks; the classes are those of the first
-        if isinstance(task, tasks.EnsembleTask):
-            task = task.tasks[0]
-        labels: tuple[str, ...] = (facts.label or facts.object_label or facts.object,)
-        object_category = 0
-        if isinstance(task, tasks.ClassTask) and task.labels:
-            labels = task.labels
-            # the first of the classes that are right for the object
-            object_category = task.find_right_classes(facts)[0]
-        # empty before the first image
-        if self.labels not in ((), labels):
+        labels, object_category = _find_object_category(image)
+        is_first_image = not self.labels
+        if not is_first_image and labels != self.labels:
             raise InputError(
-                f"RUN: its parts have other categories, {facts.object} among them; "
-                "export one of its parts"
+                f"RUN: its parts have other categories, {image.facts.object} among "
+                "them; export one of its parts"
             )
         self.labels = labels
         things = []
         for thing in image.list_things():
-            try:
-                category = object_category
-                if thing.name != "object":
-                    label_set = models.find_label_set(image.get_label(thing), labels)
-                    category = label_set.indices[0]
-                things.append((thing, category))
-            except InputError:
+            category: int | None = object_category
+            if thing.name != OBJECT:
+                category = _find_category(image.get_label(thing), labels)
+            if category is None:
                 self.unnamed.add(thing.name)
+            else:
+                things.append((thing, category))
         return things
+
+
+def _find_object_category(image: Any) -> tuple[tuple[str, ...], int]:
+    """Return the labels of the categories, and the index of the object's category."""
+    task = image.task
+    facts = image.facts
+    # an ensemble has a task for each model; the classes are those of the first
+    if isinstance(task, tasks.EnsembleTask):
+        task = task.tasks[0]
+    if isinstance(task, tasks.ClassTask) and task.labels:
+        # several classes may be right for the object: the first of them
+        return task.labels, task.find_right_classes(facts)[0]
+    # The model has no labels: the object's name is the only category. The label that
+    # the settings give it goes before its own.
+    name = facts.label or facts.object_label or facts.object
+    return (name,), 0
+
+
+def _find_category(label: str, labels: tuple[str, ...]) -> int | None:
+    """Return the index of the first of `labels` that a label means; None without one."""
+    try:
+        label_set = models.find_label_set(label, labels)
+    except InputError:
+        return None
+    return int(label_set.indices[0])
 
 
 def write_dataset(
@@ -113,39 +133,62 @@ def write_dataset(
             temporary = tempfile.TemporaryDirectory(prefix=".export-", dir=out.parent)
         with temporary:
             folder = Path(temporary.name) / "dataset"
-            images = list[dict[str, Any]]()
-            annotations = list[dict[str, Any]]()
-            n_changed = 0  # images that are not as they were in the run
             rendered = exports.render_rows(run, every=every, progress=progress)
-            for image_id, image in enumerate(rendered, 1):
-                things = categories.find_things(image)
-                path = folder / IMAGES / f"{image.name}.png"
-                Exporter.write_png(path, image.picture.numpy())
-                images.append(make_image(image_id, image))
-                annotations += make_things(len(annotations) + 1, image_id, things)
-                n_changed += not image.is_reproduced
-                if format == "yolo":
-                    labels = make_yolo_labels(image, things)
-                    writing.write_text(folder / LABELS / f"{image.name}.txt", labels)
-            if not images:
+            n_images, n_changed = _write_files(folder, rendered, categories, format)
+            if not n_images:
                 return 0, []
-            if format == "yolo":
-                write_yolo_index(folder, categories)
-            else:
-                write_coco_index(folder, categories, images, annotations)
-            # all at once, so that an interrupt leaves no half of it
+            # moved as one, so that an interrupt leaves no half of it
             with writing.storage_errors(out):
                 os.replace(folder, out)
-    return len(images), make_notes(categories, n_changed)
+    return n_images, make_notes(categories, n_changed)
+
+
+def _write_files(
+    folder: Path, rendered: Iterable[Any], categories: Categories, format: str
+) -> tuple[int, int]:
+    """Write pictures, labels and the index of a dataset; without pictures, nothing.
+
+    Args:
+        folder: folder of the dataset.
+        rendered: the images of the run.
+        categories: is filled with the categories of the images.
+        format: "coco" or "yolo".
+
+    Returns:
+        How many pictures there are, and in how many of them a prediction differs from
+        that of the run.
+    """
+    images = list[dict[str, Any]]()
+    annotations = list[dict[str, Any]]()
+    n_changed = 0
+    for image_id, image in enumerate(rendered, 1):
+        things = categories.find_things(image)
+        path = folder / IMAGES / f"{image.name}.png"
+        Exporter.write_png(path, image.picture.numpy())
+        images.append(make_image(image_id, image))
+        annotations += make_things(len(annotations) + 1, image_id, things)
+        n_changed += not image.is_reproduced
+        if format == "yolo":
+            labels = make_yolo_labels(image, things)
+            writing.write_text(folder / LABELS / f"{image.name}.txt", labels)
+    if images and format == "yolo":
+        write_yolo_index(folder, categories)
+    elif images:
+        write_coco_index(folder, categories, images, annotations)
+    return len(images), n_changed
 
 
 def make_yolo_labels(image: Any, things: list[tuple[Any, int]]) -> str:
-    """Return the labels of a picture for YOLO, a line for each thing: ``CATEGORY X Y
-    WIDTH HEIGHT``.
+    """Return the labels of a picture for YOLO: ``CATEGORY X Y WIDTH HEIGHT`` lines.
 
-    X and Y are the center of the box; all four are fractions of the picture.
+    There is a line for each thing. X and Y are the center of its box; all four are
+    fractions of the picture.
+
+    Args:
+        image: the image.
+        things: the things that it shows, each with the index of its category.
     """
-    (image_height, image_width) = image.picture.shape[:2]
+    image_height, image_width = image.picture.shape[:2]
     lines = []
     for thing, category in things:
         x, y, width, height = find_box(thing)
@@ -225,23 +268,7 @@ def make_image(image_id: int, image: Any) -> dict[str, Any]:
     values of the parameters.
     """
     height, width = image.picture.shape[:2]
-    predictions: list[dict[str, Any]] = [
-        {
-            "row": row.id,
-            "kind": row.kind,
-            "step": row.step,
-            "right": row.correct,
-            "label": row.label,
-            "probability": row.probability,
-            "margin": row.margin,
-            **{
-                name: entry["value"]
-                for name, entry in row.values.items()
-                if name == "model"
-            },
-        }
-        for row in image.rows
-    ]
+    predictions = [_describe_prediction(row) for row in image.rows]
     configuration = {
         name: dict(entry) for name, entry in image.values.items() if name != "model"
     }
@@ -259,8 +286,24 @@ def make_image(image_id: int, image: Any) -> dict[str, Any]:
     }
 
 
+def _describe_prediction(row: Any) -> dict[str, Any]:
+    """Return the prediction that a row stores; with the model's name if it has one."""
+    prediction = {
+        "row": row.id,
+        "kind": row.kind,
+        "step": row.step,
+        "right": row.correct,
+        "label": row.label,
+        "probability": row.probability,
+        "margin": row.margin,
+    }
+    if "model" in row.values:
+        prediction["model"] = row.values["model"]["value"]
+    return prediction
+
+
 def find_box(thing: Any) -> tuple[float, float, float, float]:
-    """Its left and upper side, width and height, in pixels."""
+    """Return left and upper side, width and height of a thing's box, in pixels."""
     left, top, right, bottom = thing.box
     return left, top, right - left, bottom - top
 
@@ -268,8 +311,12 @@ def find_box(thing: Any) -> tuple[float, float, float, float]:
 def make_things(
     first_id: int, image_id: int, things: list[tuple[Any, int]]
 ) -> list[dict[str, Any]]:
-    """Return the annotations of the things in a picture, with ids from `first_id`
-    on.
+    """Return the annotations of the things in a picture, with ids from `first_id` on.
+
+    Args:
+        first_id: id of the first annotation.
+        image_id: id of the picture.
+        things: the things, each with the index of its category.
     """
     return [
         make_thing(first_id + index, image_id, thing, category)
@@ -306,9 +353,14 @@ def make_thing(number: int, image: int, thing: Any, category: int) -> dict[str, 
 
 
 def find_runs(mask: NDArray[np.bool_]) -> list[int]:
-    """The lengths of runs down the columns of a mask, from left to right, the first of
-    pixels outside of it.
+    """Return the run lengths of a mask (H, W), as COCO encodes masks.
+
+    Pixels are taken down each column, the columns from left to right. Runs outside and
+    inside of the mask alternate, and the first is outside: it has length 0 if the first
+    pixel is inside.
     """
     flat = mask.ravel(order="F")
-    ends = [0, *(np.flatnonzero(np.diff(flat)) + 1).tolist(), flat.size]
-    return [*[0][: int(flat[0])], *map(int, np.diff(ends))]
+    bounds = [0, *(np.flatnonzero(np.diff(flat)) + 1).tolist(), flat.size]
+    lengths = np.diff(bounds).tolist()
+    begins_inside = bool(flat[0])
+    return [0, *lengths] if begins_inside else lengths

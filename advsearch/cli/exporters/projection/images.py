@@ -7,8 +7,9 @@ from __future__ import annotations
 import itertools
 import math
 import os
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from PIL import Image, ImageDraw
@@ -29,6 +30,22 @@ ROWS = 1024  # least height of the pictures to project, in pixels
 # where the nine marks are in a picture, of its width and height
 SHARES = (1 / 8, 1 / 2, 7 / 8)
 SPP = 64  # samples a pixel of the picture of the scene with the marks
+
+
+class MarkedTexel(NamedTuple):
+    """A texel of a pattern with a mark at its center.
+
+    Attributes:
+        row: row of the texel.
+        column: its column.
+        x: its center from the left, as a fraction of the width of the picture.
+        y: its center from above, as a fraction of the height.
+    """
+
+    row: int
+    column: int
+    x: float
+    y: float
 
 
 def write_projection(run: str | Path, out: Path) -> list[str]:
@@ -84,10 +101,10 @@ def write_projector(
     # -(-a // b) is rounded up, so that pictures have ROWS pixels of height at least
     factor = -(-ROWS // n_rows)
     marks, marked_texels = make_marks((n_rows, n_columns), factor)
-    # the mean of each texel, at the resolution of the pattern
-    texel_marks = torch.nn.functional.avg_pool2d(marks.permute(2, 0, 1)[None], factor)[
-        0
-    ].permute(1, 2, 0)
+    # the mean of each texel, at the resolution of the pattern; avg_pool2d takes
+    # (1, 3, H, W)
+    pooled_marks = torch.nn.functional.avg_pool2d(marks.permute(2, 0, 1)[None], factor)
+    texel_marks = pooled_marks[0].permute(1, 2, 0)
     Exporter.write_png(folder / "picture.png", images.enlarge(pattern, factor))
     Exporter.write_png(folder / "texels.png", pattern)
     Exporter.write_png(folder / "marks.png", color.linear_to_srgb(marks))
@@ -133,27 +150,28 @@ def describe_settings(control: Any, values: dict[str, Tensor]) -> list[str]:
     ]
 
 
-def describe_marks(
-    control: Any, marked_texels: list[tuple[int, int, float, float]]
-) -> list[str]:
-    """Return a line for each mark: its texel, and its direction from the projector's
-    axis in degrees.
+def describe_marks(control: Any, marked_texels: Sequence[MarkedTexel]) -> list[str]:
+    """Return a line for each mark: its texel, and its direction in degrees.
+
+    The direction is relative to the projector's axis.
 
     Args:
         control: the projector.
-        marked_texels: marked texels of each mark row, column, and x and y as fractions
-            of the picture from its upper left.
+        marked_texels: the texels with a mark.
     """
+    # of the picture, at distance 1
     half_width = math.tan(math.radians(control.part.fov) / 2.0)
     lines = []
-    for index, (row, column, x, y) in enumerate(marked_texels, 1):
-        # x and y are 0 to 1 from the upper left. From the middle they are -1 to 1, which
-        # times half the width at distance 1 is the tangent of the angle.
-        right = math.degrees(math.atan((2 * x - 1) * half_width))
-        up = math.degrees(math.atan((1 - 2 * y) * half_width / control.part.aspect))
+    for index, texel in enumerate(marked_texels, 1):
+        # from the middle of the picture, from -1 to 1; times the half width or height
+        # they are tangents of the angles
+        right_of_middle = 2 * texel.x - 1
+        above_middle = 1 - 2 * texel.y
+        right = math.degrees(math.atan(right_of_middle * half_width))
+        up = math.degrees(math.atan(above_middle * half_width / control.part.aspect))
         lines.append(
-            f"{index}: row {row}, column {column}; {right:.2f} degrees to the right of "
-            f"the middle, {up:.2f} up"
+            f"{index}: row {texel.row}, column {texel.column}; {right:.2f} degrees to "
+            f"the right of the middle, {up:.2f} up"
         )
     return lines
 
@@ -167,9 +185,7 @@ def has_pattern(control: Control) -> bool:
     )
 
 
-def make_marks(
-    shape: tuple[int, int], factor: int
-) -> tuple[Tensor, list[tuple[int, int, float, float]]]:
+def make_marks(shape: tuple[int, int], factor: int) -> tuple[Tensor, list[MarkedTexel]]:
     """Return a picture of a frame and nine numbered crosses, and where the crosses are.
 
     Args:
@@ -177,32 +193,29 @@ def make_marks(
         factor: how many pixels of the picture a texel is wide.
 
     Returns:
-        The picture, white on black, (h, w, 3) linear in [0, 1]; and for each cross row
-        and column of its texel, and x and y of the texel's center as fractions of
-        width and height.
+        The picture, white on black, (h, w, 3) linear in [0, 1]; and the texel at the
+        center of each cross.
     """
     n_rows, n_columns = shape
     width = n_columns * factor
     height = n_rows * factor
     picture = Image.new("L", (width, height))
     draw = ImageDraw.Draw(picture)
-    line = max(2, height // 200)
+    line = max(2, height // 200)  # width of the lines of the crosses, in pixels
     draw.rectangle((0, 0, width - 1, height - 1), outline=255, width=2 * line)
     marked_texels = []
     # three rows and three columns of crosses
-    for down, across in itertools.product(SHARES, SHARES):
-        row = int(down * n_rows)
-        column = int(across * n_columns)
+    for fraction_down, fraction_across in itertools.product(SHARES, SHARES):
+        row = int(fraction_down * n_rows)
+        column = int(fraction_across * n_columns)
         marked_texels.append(
-            (row, column, (column + 0.5) / n_columns, (row + 0.5) / n_rows)
+            MarkedTexel(row, column, (column + 0.5) / n_columns, (row + 0.5) / n_rows)
         )
-        center = (column + 0.5) * factor, (row + 0.5) * factor
-        # the number beside the cross is how many there are by now
-        draw_cross(draw, center, height // 24, line, str(len(marked_texels)))
-    levels = torch.frombuffer(bytearray(picture.tobytes()), dtype=torch.uint8).reshape(
-        height, width, 1
-    )
-    return levels.expand(-1, -1, 3) / 255.0, marked_texels
+        center = ((column + 0.5) * factor, (row + 0.5) * factor)
+        draw_cross(draw, center, height // 24, line, text=str(len(marked_texels)))
+    levels = torch.frombuffer(bytearray(picture.tobytes()), dtype=torch.uint8)
+    levels = levels.reshape(height, width, 1).expand(-1, -1, 3)
+    return levels / 255.0, marked_texels
 
 
 def draw_cross(

@@ -39,23 +39,14 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
     check_free(path, out)
     adversarial = exports.AdversarialRun.load(run)
     renderer = adversarial.problem.renderer
+    # those of the scene that Mitsuba renders, and those of the finished picture
     inputs, on_picture = adversarial.split_inputs()
     backdrop = on_picture.get("backdrop.color")
     hazy = has_haze(renderer, inputs)
-    # a photograph is an image, a plain background one colour
-    if backdrop is not None and backdrop.ndim > 1:
-        raise InputError(
-            f"{adversarial.folder}: the scene is rendered into a photograph, which is "
-            "no part of a Mitsuba scene; export the object as glTF (.glb) instead"
-        )
-    if hazy and backdrop is not None:
-        raise InputError(
-            f"{adversarial.folder}: haze before a plain background is no "
-            "part of a Mitsuba scene"
-        )
+    _check_backdrop(backdrop, adversarial.folder, hazy=hazy)
     gain = renderer.formation.gain
     if "camera.exposure" in on_picture:
-        # an exposure in stops: each doubles the light
+        # the exposure is in stops, each of which doubles the light
         gain *= float(torch.exp2(on_picture["camera.exposure"]))
     notes = [
         *describe_formation(renderer, gain, backdrop),
@@ -85,22 +76,50 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
     return notes
 
 
-def check_free(path: Path, out: Path) -> None:
-    """Check that no file of the scene at `path` exists, and that `out` is no link.
+def _check_backdrop(backdrop: torch.Tensor | None, folder: Path, *, hazy: bool) -> None:
+    """Check that a scene file of Mitsuba can have what is behind the scene.
+
+    Args:
+        backdrop: a plain background (3,) or a photograph (H, W, 3); None without.
+        folder: folder of the run, for the message.
+        hazy: whether there is haze in the scene.
 
     Raises:
-        InputError: there is one already.
+        InputError: it cannot.
     """
-    # the files beside the XML have names that begin with its own
+    if backdrop is None:
+        return
+    is_photograph = backdrop.ndim > 1
+    if is_photograph:
+        raise InputError(
+            f"{folder}: the scene is rendered into a photograph, which is "
+            "no part of a Mitsuba scene; export the object as glTF (.glb) instead"
+        )
+    if hazy:
+        raise InputError(
+            f"{folder}: haze before a plain background is no part of a Mitsuba scene"
+        )
+
+
+def check_free(path: Path, out: Path) -> None:
+    """Check that the files of a scene can be written without replacing anything.
+
+    Args:
+        path: the XML file of the scene. The other files have names that begin with its
+            own.
+        out: what the user named: that file, or its folder.
+
+    Raises:
+        InputError: one of the files exists, there is a file in place of the folder, or
+            `out` is a link.
+    """
     candidates = [path]
     if path.parent.is_dir():
         candidates += path.parent.glob(f"{path.stem}-*")
     existing = [file for file in candidates if os.path.lexists(file)]
     if existing or path.parent.is_file() or os.path.islink(out):
-        raise InputError(
-            f"out: {(existing or [path.parent])[0]} is there already; "
-            "choose another name"
-        )
+        first_existing = existing[0] if existing else path.parent
+        raise InputError(f"out: {first_existing} is there already; choose another name")
 
 
 def has_haze(renderer: Any, inputs: Mapping[str, Any]) -> bool:
@@ -181,7 +200,7 @@ def write_gltf(run: str | Path, out: Path) -> list[str]:
     if out.suffix.lower() != GLB:
         raise InputError(f"out: expected the name of a .glb file, got {out}")
     adversarial = exports.AdversarialRun.load(run)
-    # the object of the scene, and the asset of it as the search left it
+    # the mesh of the object in the scene, and the object as the search left it
     part, posed_asset = adversarial.posed_object()
     description = adversarial.problem.space.scene
     metres = None if description is None else description.object.size_in_metres
