@@ -84,7 +84,7 @@ def _patches(person: Any) -> list[Patch]:
                 normals=normals[in_chart],
                 uvs=charts[in_chart],
                 faces=faces[first_face[number] : first_face[number + 1]],
-                size=tuple(map(float, data["sizes"][number])),
+                size=(float(data["sizes"][number][0]), float(data["sizes"][number][1])),
                 rest=_interpolate_chart(charts[in_chart], reference[in_chart]),
             )
         )

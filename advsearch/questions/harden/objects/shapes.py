@@ -331,7 +331,8 @@ def _grid_faces(vertices: Array, rows: int, columns: int) -> assets.IntArray:
     faces = faces.astype(np.int64)
     area = np.linalg.norm(assets.compute_area_vectors(vertices[faces]), axis=1)
     typical_area = float(np.median(area[area > 0.0]))
-    return faces[area > 1e-6 * typical_area]
+    with_area: assets.IntArray = faces[area > 1e-6 * typical_area]
+    return with_area
 
 
 def _along(curve: Array) -> tuple[Array, float]:
