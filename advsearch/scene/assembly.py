@@ -449,6 +449,7 @@ class Motion:
         n_near = len(is_visible) - len(self._far)
         is_visible[n_near:] &= ~self._hidden_by_ground(eye)
         half_size = torch.tensor(self._resolution[::-1], dtype=torch.float64) / 2.0
+        # near: up to a fifth of half a side outside
         near_frame = (positions.abs() <= 1.2 * half_size).all(dim=1)
         return positions, is_visible & near_frame
 

@@ -139,16 +139,14 @@ OPENSFM_TRANSLATED_KEYS = (
 def describe_projection(name: str) -> str:
     """Describe an unsupported model, to follow its name in an error; "" if unknown."""
     description = OTHER_PROJECTIONS.get(re.sub(r"[-\s]+", "_", name.strip().lower()))
-    return (
-        ""
-        if description is None
-        else f", {description}, another projection; {FIT_FISHEYE}"
-    )
+    if description is None:
+        return ""
+    return f", {description}, another projection; {FIT_FISHEYE}"
 
 
 def check_text_format(path: str, text: str) -> None:
     """Raise FileFormatError for a text in a known format that is not read."""
-    start = text.lstrip()[:2000]
+    start = text.lstrip()[:2000]  # where each of these formats is recognised
     for pattern, description, advice in OTHER_FORMATS:
         if re.match(pattern, start):
             raise FileFormatError(

@@ -168,6 +168,7 @@ class CameraModel:
         The points (N, 2) are in focal lengths.
         """
         radius = distorted.norm(dim=-1)
+        # 0 for the center, which has no direction
         radial_direction = distorted / radius.clamp_min(1e-300)[..., None]
         # beyond the circle of the image too, so that the margin changes sign there
         angle, converged = self._invert_radial(radius, min(self.fold_angle, math.pi))
@@ -185,6 +186,7 @@ class CameraModel:
         dimensions starts from there.
         """
         radius = distorted.norm(dim=-1)
+        # 0 for the center, which has no direction
         radial_direction = distorted / radius.clamp_min(1e-300)[..., None]
         max_visible = min(self._max_visible, MAX_RAY_TANGENT)
         undistorted_radius, converged = self._invert_radial(radius, max_visible)
@@ -412,11 +414,12 @@ class CameraModel:
         x = torch.cat([grid, grid, ones, -ones])
         y = torch.cat([ones, -ones, grid, grid])
         border = torch.stack([x, y], dim=-1) * torch.tensor(edges, dtype=torch.float64)
-        for fraction in torch.linspace(1.0, 0.02, 50).tolist():
+        for fraction in torch.linspace(1.0, 0.02, 50).tolist():  # 1, 0.98, ..., 0.02
             points = torch.cat(
                 [fraction * border, torch.ones_like(border[:, :1])], dim=-1
             )
             coordinates, is_visible = self.project(points)
+            # a point on the image's border may be outside by rounding
             is_in_image = (coordinates >= -1e-6) & (coordinates <= 1.0 + 1e-6)
             if bool((is_visible & is_in_image.all(dim=-1)).all()):
                 break
@@ -436,6 +439,7 @@ class CameraModel:
                 self._compute_border_tangent(center, axis, border)
                 for border in (0.0, 1.0)
             ]
+            # at least 1e-3, also where the axis is outside of the image
             edge_tangents.append(max(1e-3, min(MAX_TANGENT, *border_tangents)))
         return edge_tangents
 

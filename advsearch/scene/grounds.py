@@ -147,8 +147,8 @@ def load_requested_place(scene: SceneData) -> Place | None:
     has_no_ground = scene.get_number("ground.size") <= 0.0
     if has_table_settings or has_no_ground:
         return None
-    place: Place | None = scene.environment.place
-    return place
+    surroundings: Place | None = scene.environment.place
+    return surroundings
 
 
 def with_requested_ground(scene: AnyScene) -> AnyScene:

@@ -98,6 +98,7 @@ def compute_candela(kind: str, h: Float64Array, v: Float64Array) -> Float64Array
         v: degrees above the horizon, of the same shape.
     """
     below_cut_off = CUT_OFF - v
+    # candela, and the beams' widths in degrees
     narrow_beam = 14500.0 * np.exp(
         -((h / 5.0) ** 2) / 2.0 - below_cut_off.clip(0.0) / 1.5
     )
@@ -108,11 +109,9 @@ def compute_candela(kind: str, h: Float64Array, v: Float64Array) -> Float64Array
     low_beam = (narrow_beam + wide_beam) / (
         1.0 + np.exp(-(below_cut_off / 0.08).clip(-60.0, 60.0))
     )
-    high_beam = (
-        45000.0 * np.exp(-((h / 3.5) ** 2 + (v / 1.5) ** 2) / 2.0)
-        if kind == "high"
-        else 0.0
-    )
+    if kind != "high":
+        return np.asarray(low_beam)
+    high_beam = 45000.0 * np.exp(-((h / 3.5) ** 2 + (v / 1.5) ** 2) / 2.0)
     return np.asarray(low_beam + high_beam)
 
 

@@ -143,7 +143,7 @@ def _calibrate() -> tuple[Float64Array, Float64Array]:
     oversampling = 8
     size = CALIBRATION_SIZE
     grid = (np.arange(size * oversampling) + 0.5) / oversampling - size / 2.0
-    blurs = np.arange(0.0, MAX_BLUR + 0.1, 0.25)
+    blurs = np.arange(0.0, MAX_BLUR + 0.1, 0.25)  # up to `MAX_BLUR`, which counts
     measured_blurs = np.zeros(len(blurs))
     for angle in np.radians(CALIBRATION_ANGLES):
         is_bright = grid[None] * np.cos(angle) + grid[:, None] * np.sin(angle) > 0.0

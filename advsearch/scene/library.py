@@ -350,6 +350,7 @@ def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
     light_image = read_light(file)
     notes = [f"{file.name}: {note}" for note in light_image.notes]
     height, width = light_image.size
+    # one percent: a map of odd size may miss it by a row
     if abs(width / (2 * height) - 1.0) > 0.01:
         notes.append(
             f"{file.name}: expected a map twice as wide as high, got {width} "

@@ -554,7 +554,7 @@ def _parse_image(where: str, words: Sequence[str]) -> Float64Array:
         numbers = []
     w, x, y, z, *shift = _parse_numbers(where, "pose", numbers, 7, MAX_DISTANCE)
     length = math.sqrt(w * w + x * x + y * y + z * z)
-    if not 0.99 < length < 1.01:
+    if not 0.99 < length < 1.01:  # it is written with few digits
         raise FileFormatError(
             f"{where}: expected a quaternion of length 1, got one of {length:.3g}"
         )

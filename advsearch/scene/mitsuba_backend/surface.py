@@ -383,7 +383,7 @@ class ViewTracer:
             side != 0.0, 0.0, diffuse_radiance * dr.select(valid, diffuse, 1.0)
         )
 
-        is_glossy = valid & (gloss > 1e-4)
+        is_glossy = valid & (gloss > 1e-4)  # less could not be seen
         reflected = self._reflect(mitsuba_scene, si, d, n, cosine, lobe, is_glossy, lit)
         radiance += dr.select(is_glossy, gloss * reflected, 0.0)
         return radiance, diffuse, side

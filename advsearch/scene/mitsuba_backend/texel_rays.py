@@ -566,7 +566,7 @@ def _hit_point(
 
 
 def _eval_opacity(si: Any) -> Any:
-    """Return the fraction of light that a surface stops, at least 0.001."""
+    """Return the fraction of light that a surface stops, at least 0.001 to divide by."""
     return dr.maximum(1.0 - eval_transmittance(si, True), 1e-3)
 
 

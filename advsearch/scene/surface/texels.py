@@ -170,7 +170,7 @@ def _find_warp_rate(ratio: float) -> float:
     for which a grid is all but even.
     """
     lower = 1e-3
-    upper = 20.0
+    upper = 20.0  # a ratio of twelve million
     for _ in range(60):  # halved so often, the interval is below rounding
         rate = 0.5 * (lower + upper)
         if math.sinh(rate) / rate < ratio:
@@ -249,7 +249,7 @@ def _use_nearest_texel(
     """
     y, x = grid_position
     n_rows, n_columns = charts.is_covered.shape
-    is_unweighted = weights.sum(axis=1) < 1e-6
+    is_unweighted = weights.sum(axis=1) < 1e-6  # too little to divide by
     nearest_row = np.round(y[is_unweighted]).astype(int).clip(0, n_rows - 1)
     nearest_column = np.round(x[is_unweighted]).astype(int).clip(0, n_columns - 1)
     texel_index[is_unweighted, 0] = texels.texel_of_cell[
