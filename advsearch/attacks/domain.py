@@ -469,11 +469,13 @@ def project_l2_box(
     problem").
 
     u is (d,) float32, finite, and so is the centre, inside the bounds; the radius is
-    over 0. The point is rounded towards the centre, so that rounding leaves no ball.
-    Points inside come back bit for bit; projecting again changes at most the last bits.
+    over 0. The result is rounded towards the centre, so that rounding errors never put
+    it outside of the ball. Points inside come back bit for bit; projecting again
+    changes at most the last bits.
     """
-    # v_i^2 and room_i^2 in chunks, and their sums. Where u_i is within the bounds, v_i
-    # stands in for room_i, which is larger: for s up to 1 the minimum is the same.
+    # v_i^2 and room_i^2 in chunks, and their sums. room_i is found by clipping u_i,
+    # which gives |v_i| where u_i is within the bounds. That is less than the room, but
+    # does as well: for s up to 1, min(s v_i^2, v_i^2) = s v_i^2.
     squares = []
     rooms = []
     squared_distance = 0.0
@@ -485,9 +487,11 @@ def project_l2_box(
         rooms.append(u_chunk.clamp(low, high).sub_(center_chunk).square_())
         squared_distance += float(squares[-1].sum(dtype=torch.float64))
         squared_distance_in_box += float(rooms[-1].sum(dtype=torch.float64))
+    # p(1), u clipped to the box, is the solution if it lies in the ball
     if squared_distance_in_box <= (radius * (1.0 + ROUNDING_SLACK)) ** 2:
         return u.clamp(low, high)
-    # Without the box this would be the solution; with it, g is smaller there.
+    # Without the box s would be this; with it, g is smaller there, so that the solution
+    # is at least as large, as Newton's method needs it.
     initial_s = radius**2 / squared_distance
     s = _solve_multiplier(squares, rooms, radius, initial_s)
     return _move_towards(center, u, math.sqrt(s), low, high)

@@ -142,7 +142,8 @@ def compare_views(compare_view: Callable[[int], ComparedView]) -> Deviation:
     """Compare predictions with traced images over several views.
 
     At first over `N_FIRST_VIEWS`; only if these are neither clearly good nor clearly
-    bad, over all `N_VIEWS`. `compare_view` compares a single view, by its index.
+    bad, over all `N_VIEWS`. `compare_view` compares a single view, a predicted
+    image and traced ones of one configuration, by its index.
     """
     views = [compare_view(index) for index in range(N_FIRST_VIEWS)]
     first = Deviation.from_views(views)
@@ -181,7 +182,7 @@ def compare_with_traced(
             under the same conditions; None if `u` is that.
     """
     with torch.no_grad():
-        # what the search would see without a predictor
+        # what the model would see in the search without a predictor
         search_image = renderer(u, seeds.stream(seed, "rendered"), spp)
         # two images with independent noise, and the denoised image of both
         *halves, converged = renderer.render_halves(u, seed, CHECK_SPP)

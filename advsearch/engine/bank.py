@@ -138,6 +138,7 @@ class Bank(PredictedSearch):
         return entries, self._bytes
 
     def summarize_conditions(self) -> BankOfConditions:
+        """Return how the bank has grown, and what its latest comparison found."""
         return BankOfConditions(
             made=self._count_conditions(self._latest_step),
             dropped=self._n_dropped,
@@ -156,14 +157,20 @@ class Bank(PredictedSearch):
         """
         if query.kind == "search" and query.phase == "search":
             self._latest_step = query.index
-            if query.index and query.index % COMPARISON_INTERVAL == 0:
+            is_due = query.index > 0 and query.index % COMPARISON_INTERVAL == 0
+            if is_due:
                 self._compare(query.u, query.index)
         self._fill(self._latest_step)
         if query.with_image:
-            # It has the same noise whenever it is rendered.
+            # only so that the renderer for images is made, and counted, as it was when
+            # the query was evaluated
             self._render_image(query.u)
 
     def evaluate(self, query: Query) -> Evaluation:
+        """Evaluate a query by its mean over conditions of the bank.
+
+        The image of the evaluation, if it is requested, is one without conditions.
+        """
         self.replay(query)
         conditions = self._choose_conditions(query.kind, query.index)
         evaluation = self._evaluate_under(conditions, query.u, query.gradient)
@@ -183,6 +190,7 @@ class Bank(PredictedSearch):
             gradient,
             BATCH_SIZE,
         )
+        # samples per pixel of the prediction: a matrix counts as one
         return replace(evaluation, predicted=1)
 
     def _choose_conditions(self, kind: str, index: int) -> list[Condition]:
@@ -192,7 +200,7 @@ class Bank(PredictedSearch):
         others. While configurations are ranked, after the search, none is new.
         """
         count = min(self.problem.n_draws, len(self._conditions))
-        # another kind of search comes later, and finds all conditions there
+        # any other kind of search runs after "search", so that no condition is new to it
         previous_index = index - 1 if kind == "search" else self._latest_step
         size_before = self._count_conditions(previous_index)
         new = [
@@ -259,12 +267,14 @@ class Bank(PredictedSearch):
         one condition for every `DRAWS_PER_CONDITION` draws. In the second half of a
         search it does not grow.
         """
-        last_growing_index = self.steps // 2 - 1
-        index = min(index, last_growing_index)
+        last_index_of_first_half = self.steps // 2 - 1
+        index = min(index, last_index_of_first_half)
         # evaluations so far at which the bank grew
         n_growing_steps = 0
         for begin in (0, *self.growth_steps):
-            n_growing_steps += min(max(index - begin + 1, 0), COMPARISON_INTERVAL)
+            n_since_begin = max(index - begin + 1, 0)
+            # the next comparison, which ends the growth, is `COMPARISON_INTERVAL` later
+            n_growing_steps += min(n_since_begin, COMPARISON_INTERVAL)
         draws = self.problem.n_draws
         n_initial = INITIAL_CONDITIONS * draws
         return n_initial + n_growing_steps * draws // DRAWS_PER_CONDITION
@@ -276,13 +286,15 @@ class Bank(PredictedSearch):
         began to grow before this condition, or at the start.
         """
         assert self.problem.conditions is not None
-        starts = [
-            # comparisons after which this condition was added
-            begin
-            for begin in self.growth_steps
-            if self._count_conditions(begin - 1) <= number
+        # comparisons that let the bank grow and before which it lacked this condition
+        earlier_growth_steps = [
+            step
+            for step in self.growth_steps
+            if self._count_conditions(step - 1) <= number
         ]
-        u = self._grown_at[starts[-1]] if starts else self.problem.domain.start
+        u = self.problem.domain.start
+        if earlier_growth_steps:
+            u = self._grown_at[earlier_growth_steps[-1]]
         bank_seed = seeds.stream(self.problem.seed, "bank")
         condition = sample_condition(self.problem.conditions, number, bank_seed)
         seed = seeds.stream(self.problem.seed, "bank matrix", number)
@@ -296,11 +308,15 @@ class Bank(PredictedSearch):
             tick: called with the samples of each condition that is made.
         """
         size = self._count_conditions(index)
-        first_missing = self._conditions[-1].index + 1 if self._conditions else 0
+        first_missing = 0
+        if self._conditions:
+            # the newest is the last; older ones may have been dropped
+            first_missing = self._conditions[-1].index + 1
         if first_missing >= size:
             return
         with self.count_time():
-            if self._collected_until <= first_missing:
+            is_requested = first_missing < self._collected_until
+            if not is_requested:
                 self._request_light(first_missing, index)
             for number in range(first_missing, size):
                 condition = self._make_condition(number, next(self._incoming).light)
@@ -367,16 +383,7 @@ class Bank(PredictedSearch):
             seed = seeds.stream(problem.seed, "bank check", index)
             unseen_objectives = self._trace_unseen(u, seed)
             conditions = self._sample(self._conditions, N_COMPARED, "bank check", index)
-            full_configurations = [
-                torch.cat([u, condition.u]) for condition in conditions
-            ]
-            evaluated, _ = problem.evaluate_batch(
-                partial(self._predict_images, conditions),
-                full_configurations,
-                u,
-                gradient=False,
-            )
-            bank_objectives = [evaluation.objective for evaluation, _ in evaluated]
+            bank_objectives = self._predict_objectives(u, conditions)
             gap, standard_error = _compare_means(bank_objectives, unseen_objectives)
             self.gaps.append(gap)
             self.n_traced += N_COMPARED
@@ -386,7 +393,7 @@ class Bank(PredictedSearch):
             position = number % len(conditions)
             return problem.compare_view(
                 conditions[position].renderer,
-                full_configurations[position],
+                torch.cat([u, conditions[position].u]),
                 seeds.stream(seed, "view", number),
                 SPP,
             )
@@ -398,13 +405,27 @@ class Bank(PredictedSearch):
             self._grown_at[index] = u.detach().clone()
             self.growth_steps.append(index)
 
+    def _predict_objectives(
+        self, u: Tensor, conditions: Sequence[Condition]
+    ) -> list[float]:
+        """Return the objectives of predicted images of u (d,) under conditions of the
+        bank.
+        """
+        evaluated, _ = self.problem.evaluate_batch(
+            partial(self._predict_images, conditions),
+            [torch.cat([u, condition.u]) for condition in conditions],
+            u,
+            gradient=False,
+        )
+        return [evaluation.objective for evaluation, _ in evaluated]
+
     def _trace_unseen(self, u: Tensor, seed: int) -> list[float]:
         """Return the objectives of traced images of u (d,) under `N_COMPARED` new
         conditions, which are not in the bank.
         """
         objectives = []
         for index in range(N_COMPARED):
-            # of the conditions, and of the noise
+            # of both the conditions and the noise
             draw_seed = seeds.stream(seed, "draw", index)
             evaluation, _ = self.problem.evaluate_full(
                 Query(u, draw_seed),

@@ -16,6 +16,7 @@ from advsearch.attacks import Evaluation
 from advsearch.attacks.evaluation import Query
 from advsearch.engine.transport import COMPARISON_INTERVAL, PredictedSearch
 from advsearch.engine.windows import (
+    N_WINDOW_IMAGES,
     PROBE_SPP,
     FullImage,
     Windowing,
@@ -46,7 +47,7 @@ class CroppedSearch(PredictedSearch):
 
     @property
     def n_samples(self) -> int:
-        return 6 * PROBE_SPP
+        return 2 * N_WINDOW_IMAGES * PROBE_SPP  # each image has two halves
 
     @property
     def accuracy_refusal(self) -> Refusal | None:
@@ -54,8 +55,11 @@ class CroppedSearch(PredictedSearch):
 
     def measure_size(self) -> tuple[int, int]:
         height, width = self.problem.renderer.formation.resolution
-        n_images = 4 * len(self._current)  # of float32
-        return 0, 4 * 3 * height * width * n_images
+        # stored for each kind of search: the two halves of its full image, their mean,
+        # and the surroundings of the window
+        n_images = 4 * len(self._current)
+        bytes_per_pixel = 3 * 4  # three channels of float32
+        return 0, bytes_per_pixel * height * width * n_images
 
     def count_predicted(self, kind: str, evaluations: int) -> int:
         return 0  # they are rendered
@@ -71,13 +75,14 @@ class CroppedSearch(PredictedSearch):
             self.window = windowing.window
             self.deviations.append(windowing.deviation)
             tick(self.n_samples)
-            self.n_traced += 3  # the full images of `find_window`
-            self._use(windowing, "start", 0, windowing.start)
+            self.n_traced += N_WINDOW_IMAGES
+            # all searches begin with these; they belong to no query: number 0
+            self._renew_surroundings(windowing, "start", 0, windowing.start)
 
-    def _use(
+    def _renew_surroundings(
         self, windowing: Windowing, kind: str, number: int, image: FullImage
     ) -> Renderer:
-        """Render the surroundings that a kind of search has from now on.
+        """Render the surroundings of the window, for a kind of search from now on.
 
         Args:
             windowing: the window.
@@ -86,7 +91,7 @@ class CroppedSearch(PredictedSearch):
             image: full image of the configuration whose surroundings they are.
 
         Returns:
-            The renderer of the window, with these surroundings.
+            The renderer that traces the window and pastes it into these surroundings.
         """
         problem = self.problem
         seed = seeds.stream(problem.seed, f"crop {kind}", number)
@@ -99,9 +104,14 @@ class CroppedSearch(PredictedSearch):
         return renderer
 
     def get_window_renderer(self, kind: str) -> Renderer | None:
+        """Return the latest renderer of the window for a kind of search.
+
+        None if there is no window, or the search ended with full images.
+        """
         if self.windowing is None or kind in self.first_traced:
             return None
-        return self._current.get(kind, self._current["start"])[1]
+        _, renderer = self._current.get(kind, self._current["start"])
+        return renderer
 
     def replay(self, query: Query) -> None:
         self._update(query)
@@ -110,14 +120,15 @@ class CroppedSearch(PredictedSearch):
         renderer = self._update(query)
         if renderer is None:
             return self.problem.evaluate(query)
-        return self.problem.evaluate_full(query, query.u, query.seed, renderer)[0]
+        evaluation, _ = self.problem.evaluate_full(query, query.u, query.seed, renderer)
+        return evaluation
 
     def _update(self, query: Query) -> Renderer | None:
         """Return the renderer of the window for a query; None to render a full image.
 
         Every `COMPARISON_INTERVAL` queries of a search a full image is rendered, and
-        the surroundings of the window in it are compared with those in use. They are
-        renewed by it; after two comparisons in a row that differ too much, the rest of
+        the surroundings of the window in it are compared with those in use, which it
+        then replaces. After two comparisons in a row that differ too much, the rest of
         the search renders full images.
         """
         kind = query.kind
@@ -139,8 +150,10 @@ class CroppedSearch(PredictedSearch):
                 self.windowing.window, image, query.u
             )
             self.deviations.append(deviation)
+            # a single bad comparison only renews the surroundings
             if deviation.is_accepted or was_accepted:
-                self.n_renewals = (self.n_renewals or 0) + 1
-                return self._use(self.windowing, kind, number, current)
+                assert self.n_renewals is not None  # None only for a `Bank`
+                self.n_renewals += 1
+                return self._renew_surroundings(self.windowing, kind, number, current)
         self.trace_from(kind, number, f" of the {kind}")
         return None

@@ -108,7 +108,7 @@ class ParallelEvaluator:
         items: list[WorkItem] = [
             (self.key, self.problem.preparation, query) for query in queries
         ]
-        # A result has the item that was sent, the same object.
+        # a result refers to the item that was sent, which is the same object
         index_of_item = {id(item): index for index, item in enumerate(items)}
         # evaluations by index that came before those of earlier queries
         waiting = dict[int, Evaluation]()
@@ -133,7 +133,7 @@ class ParallelEvaluator:
 def make_worker_call(get_evaluator: Callable[[Any], Evaluator]) -> BatchFunction:
     """Return the function that a worker runs on queries that were sent to it.
 
-    `get_evaluator` returns the problem of a key.
+    `get_evaluator` returns the evaluator of a problem by its key (`ProblemKey`).
     """
 
     def call(items: Sequence[WorkItem]) -> list[Evaluation]:
@@ -141,10 +141,10 @@ def make_worker_call(get_evaluator: Callable[[Any], Evaluator]) -> BatchFunction
         # queries of one problem follow one another
         for key, group in groupby(items, lambda item: item[0]):
             items_of_problem = list(group)
-            # All are sent together, so that they have the same preparation.
-            _, prepared, _ = items_of_problem[0]
+            # All were sent in one call, so that they have the same preparation.
+            _, preparation, _ = items_of_problem[0]
             queries = [query for _, _, query in items_of_problem]
-            evaluations += get_evaluator(key).evaluate_all(queries, prepared)
+            evaluations += get_evaluator(key).evaluate_all(queries, preparation)
         return evaluations
 
     return call
@@ -174,14 +174,19 @@ def make_lost_evaluation(query: Query, reason: str) -> Evaluation:
     # only an evaluation of a search, which has a phase, is paid from its budget
     cost = 0 if query.phase is None else query.samples
     judgement = Judgement(
-        math.nan,
-        math.nan,
+        score=math.nan,
+        margin=math.nan,
         right=False,
-        prediction=Prediction(LOST_LABEL, None, None),
+        prediction=Prediction(LOST_LABEL),
         payload={"lost": reason},
     )
     return Evaluation(
-        math.nan, gradient, False, cost=cost, judgement=judgement, is_lost=True
+        objective=math.nan,
+        gradient=gradient,
+        success=False,
+        cost=cost,
+        judgement=judgement,
+        is_lost=True,
     )
 
 
@@ -213,6 +218,7 @@ def check_digests(
         for network in networks:
             if isinstance(network.module, RemoteNetwork):
                 network.module.store_answers_in(run.store)
+            # None for a model behind an address
             digests[f"model {network.name}"] = compute_weights_digest(network)
     for name, function in (functions or {}).items():
         if function is not None:
@@ -240,7 +246,7 @@ def compute_weights_digest(model: Model) -> str | None:
             flat = tensor.detach().cpu().contiguous().flatten()
             digest.update(flat.view(torch.uint8).numpy().tobytes())
     except (AttributeError, RuntimeError, TypeError, NotImplementedError):
-        return None
+        return None  # it has no weights that can be read, such as a user's function
     return digest.hexdigest() if tensors else None
 
 
@@ -280,10 +286,14 @@ def compute_code_digest(function: Callable[..., Any]) -> str | None:
 
 
 def _list_array_digests(holder: Any) -> list[tuple[str, Any]]:
-    """Return name and digest of each array that is an attribute of an object."""
+    """Return name and digest of each array that is an attribute of an object.
+
+    So also of an attribute of type bytes, which counts as its own digest.
+    """
     attributes = sorted(getattr(holder, "__dict__", {}).items())
     simplified = [(name, _simplify(value)) for name, value in attributes]
-    return [pair for pair in simplified if isinstance(pair[1], bytes)]
+    # of arrays `_simplify` makes digests, which are bytes
+    return [(name, digest) for name, digest in simplified if isinstance(digest, bytes)]
 
 
 def _simplify_code(code: CodeType, docstring: str | None = None) -> tuple[Any, ...]:
@@ -395,9 +405,11 @@ class Journal:
         new_evaluations = iter(evaluate(new_queries))
         for query, evaluation in zip(queries, stored, strict=True):
             started = time.perf_counter()
-            belongs_to_search = query.phase is not None  # and is no trial
+            # a query without a phase is a trial of the verification
+            belongs_to_search = query.phase is not None
             if evaluation is None:
                 evaluation = next(new_evaluations)
+                # only searches have a limit of time, which `make_time_check` checks
                 seconds = None
                 if belongs_to_search:
                     seconds = time.perf_counter() - started
@@ -407,7 +419,7 @@ class Journal:
             yield evaluation
 
     def _trials_of(self, kind: str) -> dict[int, Evaluation]:
-        """Return the trials of a kind by their numbers.
+        """Return the evaluated trials of a kind by their numbers, to add new ones to.
 
         Those of the store are read at the first call for the kind, which also counts
         those that were lost with their workers.
@@ -421,8 +433,8 @@ class Journal:
         for row in rows:
             # Rows of old runs may have no judgement.
             if row.correct is not None:
-                # a predicted image has no seed; by how many samples it was predicted is
-                # stored as spp
+                # samples per pixel of the prediction, which such a row has as its spp;
+                # 0 for a rendered image, whose row has a seed
                 predicted = 0
                 if row.seed is None:
                     predicted = row.spp or 1
@@ -439,8 +451,8 @@ class Journal:
     def _read(self, query: Query) -> Evaluation | None:
         """Return the stored evaluation of a query; None if there is none.
 
-        As a side effect the renderer counts the non-finite values that were stored with
-        the evaluation.
+        The renderer of the problem then counts the non-finite values of the gradient
+        again, as it did when the query was evaluated.
 
         Raises:
             InputError: the stored evaluation is one of another configuration.
@@ -448,7 +460,8 @@ class Journal:
         is_trial = query.phase is None
         if is_trial:
             return self._trials_of(query.kind).get(query.index)
-        if self.run is None or query.index >= self._counts.get(query.kind, 0):
+        n_stored = self._counts.get(query.kind, 0)
+        if self.run is None or query.index >= n_stored:
             return None
         stored = self.run.store.read_cached(query.kind, query.index)
         if stored is None:
@@ -497,7 +510,8 @@ class Journal:
                     trials = self._trials_of(query.kind)
                     trials[query.index] = replace(evaluation, picture=None)
             elif query.index < self._counts.get(query.kind, 0):
-                # It had a row when the run, complete by then, was opened.
+                # The run was complete when it was opened: its rows are there, without
+                # what is stored beside them.
                 continue
             else:
                 row, cached = self._row_of_search(query, evaluation)
@@ -544,12 +558,12 @@ class Journal:
         row = make_trial_row(
             query.kind,
             query.index,
-            # A predicted image has no noise of its own, and in place of the samples
-            # per pixel the count by which it was predicted.
-            None if evaluation.predicted else query.seed,
-            evaluation.predicted or query.spp,
-            evaluation.required_judgement,
-            values,
+            # a predicted image has no noise of its own, and the samples per pixel of
+            # the prediction instead of those of a render
+            seed=None if evaluation.predicted else query.seed,
+            spp=evaluation.predicted or query.spp,
+            judgement=evaluation.required_judgement,
+            values=values,
             has_success=query.has_success,
         )
         return replace(
@@ -572,8 +586,8 @@ class Journal:
             query.kind,
             query.index,
             query.seed,
-            # samples and renders of a predicted image are none
-            None if is_predicted else problem.spp * query.samples,
+            # a predicted image was not rendered: it has neither samples nor renders
+            spp=None if is_predicted else problem.spp * query.samples,
             objective=evaluation.objective if is_finite else math.nan,
             success=evaluation.success and is_finite,
             values=problem.describe(query.u),
@@ -627,13 +641,15 @@ class Journal:
             else:
                 has_ranking = True
         seconds_left = seconds - math.fsum(search_seconds)
+        n_stored = len(search_seconds)
         started = time.perf_counter()
 
         def is_out_of_time(n_evaluations: int) -> bool:
             nonlocal started
-            is_from_store = n_evaluations < len(search_seconds)
+            is_from_store = n_evaluations < n_stored
             if is_from_store:
-                # the clock starts after the last one, so reading takes none of the time
+                # the clock starts again until the last one is read, so that reading
+                # takes none of the time
                 started = time.perf_counter()
                 return False
             return has_ranking or time.perf_counter() - started >= seconds_left

@@ -229,8 +229,9 @@ def add_visible_things(judgement: Judgement, things: JsonObject | None) -> Judge
     """Return a judgement whose payload has what the image shows of each thing.
 
     `things` are those of `find_visible_things`, which has every thing of the scene,
-    visible or not. What the task states of a thing itself wins. A judgement of a NaN
-    prediction stays as it is.
+    visible or not; None if there is only the object. They complete what the task itself
+    has stated of things, which is not replaced. The judgement of an output that is NaN
+    stays as it is.
     """
     if things is None or judgement.is_non_finite:
         return judgement
@@ -299,7 +300,8 @@ def _unbatch(output: Output, truth: Truth) -> tuple[Any, Any]:
     For several models both are tuples with one item for each model.
     """
     first_output = output[0]
-    if isinstance(first_output, (tuple, list)):
+    is_of_several_models = isinstance(first_output, (tuple, list))
+    if is_of_several_models:
         pairs = [
             _unbatch(model_output, model_truth)
             for model_output, model_truth in zip(first_output, truth, strict=True)
@@ -463,13 +465,20 @@ def find_label_warnings(
 
 
 def _has_disjoint_classes(models: Sequence[Model], first: str, second: str) -> bool:
-    """Return whether a model has classes for both labels, and none in common."""
+    """Return whether any model has classes for both labels, and none in common.
+
+    `first` is an object's own label, which a model may lack.
+
+    Raises:
+        InputError: a model lacks `second`, the label that the user states.
+    """
     for model in models:
         try:
             first_classes = set(model.label_set(first).indices)
         except InputError:
             continue
-        if not first_classes & set(model.label_set(second).indices):
+        second_classes = set(model.label_set(second).indices)
+        if not first_classes & second_classes:
             return True
     return False
 
@@ -560,7 +569,7 @@ class ConfigurationInputs:
         self.used = False
 
     def __call__(self, name: str) -> Any:
-        """Return an input of the objective by its name.
+        """Return an input of the objective by its name, for all N configurations.
 
         - "u": (N, d) of the searched controls;
         - "texture": (N, h, w, 3) display-referred sRGB in [0, 1], the searched colors
@@ -639,7 +648,8 @@ def mean_variation(colors: Tensor) -> Tensor:
         # the step's first pixel is masked at the end, its second one here
         right = right * mask[:, 1:]
         down = down * mask[1:]
-    # zero for the last column and the last row, which have no neighbor
+    # Zeros are added for the last column and the last row, which have no neighbor. `pad`
+    # takes the zeros before and after, from the last axis (color) to the first.
     squared_right = F.pad(right.square(), (0, 0, 0, 1))
     squared_down = F.pad(down.square(), (0, 0, 0, 0, 0, 1))
     squared = squared_right + squared_down
@@ -773,13 +783,23 @@ def make_objective(
         return _make_ensemble_objective(requested, task, ensemble), ""
     if not needs_features:
         return get_objective(requested, task), ""
-    # A task that reads no logits compares the output of the model itself.
+    return _make_feature_objective(requested, task, model, renderer, seed)
+
+
+def _make_feature_objective(
+    requested: AnyObjective, task: Task, model: Model, renderer: Renderer, seed: int
+) -> tuple[Objective, str]:
+    """Return an objective that compares features of an image with those of the clean
+    image; arguments and results are those of `make_objective`.
+
+    The remark says what the features are if they are not those before the last layer.
+    """
+    # if the task reads no logits, the output of the model itself is compared
     features = features_of(model) if task.reads_logits else None
     with torch.no_grad():
         clean_image = renderer(renderer.start, seed=seed, spp=CLEAN_SPP)
     remark = ""
     if features is not None and not features.penultimate:
-        # they are not those before the last layer: says what they are instead
         remark = features.source
     objective = get_objective(
         requested, task, features=features or model, clean=clean_image
@@ -791,6 +811,7 @@ def _make_ensemble_objective(
     requested: AnyObjective, task: EnsembleTask, ensemble: EnsembleReduction | None
 ) -> Objective:
     """Return the objective of several models; arguments as of `make_objective`."""
+    # unless the user chooses one for all models, each has that of its own task
     uses_task_objectives = requested == EnsembleTask.objective
     objectives = [
         get_objective(part.objective if uses_task_objectives else requested, part)

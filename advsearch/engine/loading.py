@@ -368,11 +368,11 @@ def _put_into_photographs(
         has_environment: whether the user chose the light. If not, the scene in each
             photograph of a folder is lit by the map beside the photograph.
     """
-    is_single_photograph = not is_photograph_folder(spec)
-    if is_single_photograph:
-        return put_into_photograph(
-            description, read_photograph_view(spec), camera, occluder
-        )
+    is_folder = is_photograph_folder(spec)
+    if not is_folder:
+        # its light was chosen when the scene was loaded
+        view = read_photograph_view(spec)
+        return put_into_photograph(description, view, camera, occluder)
     if occluder is not None:
         raise InputError(
             f"`backdrop={spec}` and `occluder` contradict each other: a mask belongs to "
@@ -419,7 +419,8 @@ def _array_to_texels(texture: npt.ArrayLike | Tensor) -> Float32Array:
     )
     max_level = 255.0 if array.dtype == np.uint8 else 1.0
     texels: Float32Array = array.astype(np.float32) / max_level
-    if texels.ndim != 3 or texels.shape[2] != 3 or not texels.size:
+    is_image = texels.ndim == 3 and texels.shape[2] == 3
+    if not is_image or texels.size == 0:
         raise InputError(
             "texture: expected a picture (h, w, 3), got an array of shape "
             f"{array.shape}"
@@ -549,6 +550,15 @@ def _height_and_width(resolution: int | tuple[int, int]) -> tuple[int, int]:
     return resolution
 
 
+def _check_is_lit(description: SceneDescription) -> None:
+    """Raise InputError for a scene without any light."""
+    if not description.is_lit:
+        raise InputError(
+            "environment: the scene has neither a map nor a lamp, so that every "
+            "picture is black; give it one of the two, such as `controls=light`"
+        )
+
+
 def make_renderer(
     description: SceneDescription,
     space: Space,
@@ -584,11 +594,7 @@ def make_renderer(
     size = _height_and_width(resolution)
     # a control may have changed the scene, as one that chooses the photograph does
     description = space.scene or description
-    if not description.is_lit:
-        raise InputError(
-            "environment: the scene has neither a map nor a lamp, so that every "
-            "picture is black; give it one of the two, such as `controls=light`"
-        )
+    _check_is_lit(description)
     formation = ImageFormation(
         denoiser=denoise,
         sampler=sampler,
@@ -605,7 +611,7 @@ def make_renderer(
     motion = None
     if differentiated or has_exposure_time:
         motion = Motion(description, size, scene.assembly)
-    # of the exposure, whose images make up one with motion blur
+    # moments of the exposure; their images together are one with motion blur
     moments: tuple[Moment, ...] = ()
     if has_exposure_time and motion is not None:
         moments = choose_moments(space, motion, scene.assembly, size[0])
@@ -725,13 +731,13 @@ def _measure_max_motion(
 def controls_to_settings(controls: Controls) -> dict[str, dict[str, object]]:
     """Return settings by name, as a file holds them, for controls in any form.
 
-    An instance of a control is written with all of its settings. Otherwise a control
-    has the settings that the caller stated.
+    An instance of a control is written with all of its settings, a name with those that
+    the caller stated.
     """
     control_by_name = normalize_controls(controls)
     if not isinstance(controls, Mapping):
-        # only checks them: a name may be unknown. Settings of a mapping are checked
-        # when controls are made.
+        # The result is dropped: this only raises errors, as for an unknown name.
+        # Settings of a mapping are checked later, when its controls are made.
         make_controls(control_by_name)
     return {
         name: control.to_settings() if isinstance(control, Control) else dict(control)
@@ -816,7 +822,7 @@ def _read_control_mapping(controls: Mapping[str, object]) -> dict[str, object]:
             )
         if isinstance(control, Control):
             control_by_name[name] = control
-        # a mapping with such a key is the value of one parameter
+        # a mapping with one of these keys is the value of a single parameter
         elif isinstance(control, Mapping) and not control.keys() & SINGLE_VALUE_KEYS:
             control_by_name[name] = {
                 key: distribution_to_setting(value) for key, value in control.items()

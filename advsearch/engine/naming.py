@@ -396,7 +396,8 @@ def _select_settings(
     A setting of the run may be a mapping by the names of controls.
     """
     selected: dict[str, object] = {}
-    for choice in _list_choices(qualified_name, control_settings) or ():
+    choices = _list_choices(qualified_name, control_settings)
+    for choice in choices or ():  # None of a control that is not known
         value = run_settings.get(choice.run_setting)
         if isinstance(value, Mapping):
             _, instance_name = parse_control_name(qualified_name, control_settings)
@@ -459,7 +460,8 @@ def check_run_settings(config: SceneConfig) -> None:
         if isinstance(value, Mapping):
             _check_named_controls(setting, value, controls, rejecting_kinds)
             continue
-        # A curve, which has several values, needs all controls; a single value any.
+        # A curve (several values, one for each run) has to be taken by all controls; a
+        # single value by any of them.
         is_curve = isinstance(value, tuple)
         is_rejected_by_all = len(rejecting_kinds) == len(controls)
         if rejecting_kinds and (is_curve or is_rejected_by_all):
@@ -514,9 +516,9 @@ def _list_choices(
     qualified_name: str, control_settings: Mapping[str, object]
 ) -> list[Choice] | None:
     """List the active choices of a control; None if its kind is not known."""
-    ((name, settings),) = merge_control_settings(
-        {qualified_name: control_settings}
-    ).items()
+    # a name may have a parameter behind it ("camera.azimuth"), which becomes a setting
+    merged = merge_control_settings({qualified_name: control_settings})
+    ((name, settings),) = merged.items()
     kind, _ = parse_control_name(name, settings)
     if kind not in CONTROLS:
         return None
@@ -532,12 +534,12 @@ def _list_active_choices(
     searched: it is set to a number, another choice fixes it, or it has no default range
     and none is set.
     """
-    # names of parameters: by a choice, or by a number
+    # names of the parameters that a choice fixes, or that are set to a number
     fixed = {
         choice.fixes for choice in kind.choices if settings.get(choice.name) is not None
     }
     fixed |= {name for name, value in settings.items() if Parameter.is_number(value)}
-    # those with a default range, and those with a range of their own
+    # those with a default range, and those for which a range is set
     searched = {
         parameter.name for parameter in kind.parameters if parameter.search is not None
     }
@@ -554,12 +556,15 @@ def _make_unsupported_error(setting: str, name: str, kind: str) -> InputError:
     """Return the error of a setting that a control does not take."""
     if setting == "epsilon":
         choices = CONTROLS[kind].choices if kind in CONTROLS else ()
-        bounded = [
+        # parameters that an epsilon would bound if they were searched
+        bounded_parameters = [
             choice.bounds
             for choice in choices
             if choice.run_setting == "epsilon" and choice.bounds
         ]
-        instead = f", or search {bounded[0]} with it" if bounded else ""
+        instead = ""
+        if bounded_parameters:
+            instead = f", or search {bounded_parameters[0]} with it"
         return InputError(
             f"`epsilon` {name}: the control has ranges and no epsilon; give its "
             f"ranges, as in `controls` '{name}={{PARAMETER: [LOW, HIGH]}}'{instead}"

@@ -173,7 +173,9 @@ class Problem:
             for group in plan.groups
             if group.control in condition_names
         }
-        self.renderer.plan = plan.force_estimators(estimator_by_group, VARIES_BY_CHANCE)
+        self.renderer.plan = plan.force_estimators(
+            estimator_by_group, reason=VARIES_BY_CHANCE
+        )
         self.domain = make_domain(
             searched, gradient_cost=self.renderer.plan.renders, partial_gradients=True
         )
@@ -270,13 +272,13 @@ class Problem:
     ) -> list[Judgement]:
         """Judge images that the model sees in one batch, without an objective.
 
-        A margin that is not finite becomes NaN.
+        If a margin is infinite or NaN, its judgement is that of a NaN output.
 
         Args:
             images: (N, H, W, 3).
             full_configurations: N full configurations.
             stated_values: N mappings of values that replace those of the
-                configurations, as for `truth`.
+                configurations, as for `find_truth`.
         """
         with torch.no_grad():
             output = self.model(images)
@@ -284,15 +286,16 @@ class Problem:
                 truths = [
                     self.find_truth(full_u, values)
                     for full_u, values in zip(
-                        full_configurations, stated_values, strict=False
+                        full_configurations, stated_values, strict=True
                     )
                 ]
             else:
-                truths = [self.find_truth()]
+                truths = [self.find_truth()]  # one that holds for all images
             judged = self._judge_outputs(output, images, truths, full_configurations)
         judgements_without_objective = []
         for judgement in judged:
-            # `of` makes a margin NaN that is not finite, and leaves the metrics out
+            # `of` checks that the margin is finite; it takes no metrics, which are
+            # added below
             without_objective = Judgement.of(
                 judgement.score,
                 judgement.margin,
@@ -402,8 +405,9 @@ class Problem:
         if full_u is None or not self.task.varies:
             return self._start_truth
         # A truth may depend on what the camera sees, which base colors do not change.
-        # So it is cached by the other coordinates, if these are few, unless the task
-        # has read the configuration's numbers.
+        # So it is cached by the other coordinates, if these are few. It is not cached
+        # if the task has read the configuration's numbers, which may include colors, or
+        # if values are stated that the coordinates do not tell.
         geometric_u = full_u.detach()[self._is_geometric]
         key = geometric_u.numpy().tobytes()
         if not stated_values and key in self._truths:
@@ -449,8 +453,11 @@ class Problem:
         color_inputs = find_linear_inputs(self.renderer)
         is_geometric = torch.ones(len(self.space.start), dtype=torch.bool)
         for group in self.space.groups:
+            # the inputs of the scene that the group changes; None if it changes none,
+            # but the finished image
             route = self.renderer.routes.get(group.name)
-            is_geometric[group.coordinates] = not route or not route <= color_inputs
+            only_colors = bool(route and route <= color_inputs)
+            is_geometric[group.coordinates] = not only_colors
         return is_geometric
 
     def make_objective_inputs(
@@ -480,11 +487,12 @@ class Problem:
         )
 
     def _compute_step_in_unit(self, group: Group) -> tuple[float | None, str]:
-        """Return the step of a single coordinate in its parameter's unit, and the unit.
+        """Return a group's step of finite differences in its parameter's unit, such as
+        degrees, and the unit.
 
         It is half the difference of the values one step above and below the middle of
         the range. (None, "") for a group of several coordinates, without a step, or
-        without a number as its value.
+        whose value is no number.
         """
         if not group.step_reason or group.size != 1:
             return None, ""
@@ -698,7 +706,7 @@ class Problem:
             gradient,
             judgement.success,
             renderer.non_finite - non_finite_before,
-            # a renderer that predicts counts no renders: an evaluation costs 1 at least
+            # 1 at least, since a renderer that predicts counts no renders
             cost=max(1, renderer.renders - renders_before) * query.samples,
             judgement=judgement,
             picture=round_to_8_bit(image) if query.with_image else None,
@@ -822,16 +830,15 @@ class Problem:
         u: Tensor,
         gradient: Tensor | None = None,
     ) -> Evaluation:
-        """Return the mean over conditions.
+        """Return the evaluation of u (d,) that is the mean over conditions.
+
+        It is a success if enough of the evaluations are (`OVER_CONDITIONS`). A cost of
+        1 stands for an image under every condition, so that costs are not added up.
 
         Args:
             evaluated: an evaluation and the model's output for each condition.
             u: (d,) the searched coordinates.
             gradient: (d,) of the mean, where the evaluations have none.
-
-        Returns:
-            The mean. Its cost is counted in evaluations, each of which takes an image
-            for every draw.
         """
         evaluations, outputs = zip(*evaluated, strict=True)
         # of the searched coordinates only, which come first
@@ -849,7 +856,6 @@ class Problem:
         ]
         judgement = self._average_judgements(judged, outputs)
         n_successes = sum(evaluation.success for evaluation in evaluations)
-        # the percentage of conditions under which a success must hold
         n_needed = OVER_CONDITIONS.count_percent(len(evaluations))
         total_objective = sum(evaluation.objective for evaluation in evaluations)
         return Evaluation(
@@ -890,10 +896,11 @@ class Problem:
 
 
 def _differentiate_by_inputs(objective: Tensor, variable_u: Tensor) -> Tensor:
-    """Return the derivative (d,) of an objective by u past the image, through what it
-    reads of the configuration; a zero if there is none.
+    """Return the derivative (d,) of an objective by u that does not go through the
+    image; a zero without axes if the objective does not depend on u otherwise.
 
-    It is exact, whatever the plan does with the image.
+    An objective may read the configuration itself (`ConfigurationInputs`). This part of
+    the derivative is exact, whatever the plan does with the image.
     """
     if objective.requires_grad:
         (gradient,) = torch.autograd.grad(

@@ -43,24 +43,23 @@ class RunState:
     clean_trials: tuple[Judgement, ...] = ()  # the control group's trials
     verification: Verification | None = None
     baseline_verification: Verification | None = None
-    # Unprinted of the policy without print terms, where the search has them.
+    # search by the policy without print terms, where that of the run has them
     unprinted: SearchResult | None = None
     unprinted_verification: Verification | None = None
-    # Outdone verification of what the policy found, where the random search's is worse
-    # for the model and the run's adversarial scene instead.
+    # verification of what the policy found, where the random search found a scene that
+    # is worse for the model, which then is the adversarial scene of the run
     outdone_verification: Verification | None = None
-    # Failure verifications of the first of the different failures that the policy
-    # found.
+    # verifications of the first different failures that the policy found
     failure_verifications: tuple[Verification, ...] = ()
-    # Ambient verifications of a projector's picture in other light, by lux.
+    # verifications of a projector's image in brighter or darker rooms, by lux
     ambient_verifications: dict[float, Verification] = field(default_factory=dict)
     # trials of configurations drawn from the whole space
     random_trials: tuple[Judgement, ...] = ()
     bracket: Bracket | None = None
-    # Trial images of the first trials, (H, W, 3) with 8-bit values in [0, 1], by kind
-    # and number; of a run that goes on only its own.
+    # images of the first trials, (H, W, 3) with 8-bit values in [0, 1], by kind and
+    # number; of a resumed run only those that it rendered itself
     trial_images: dict[tuple[str, int], Tensor] = field(default_factory=dict)
-    # Frames of the search, (H, W, 3) 8-bit values in [0, 1], numpy.
+    # images of the search in its order, numpy (H, W, 3) with 8-bit values in [0, 1]
     frames: list[Any] = field(default_factory=list)
     interrupted: bool = False
     # what predicted the pictures of the searches, if anything did
@@ -90,6 +89,8 @@ class RunState:
             crop = str(self.crop_refusal) if self.crop_refusal else None
             return LinearTransport(used=False, reason=reason, crop=crop)
         summary = self.predictor.summarize()
+        # why a better predictor was not used: this one has a reason of its own only if
+        # it was given up
         refusal = self.predictor_refusal or self.surface_light_refusal
         if summary.reason or not refusal:
             return summary
@@ -133,6 +134,7 @@ def make_trial_row(
         has_success: whether a search seeks some prediction; else the row has no
             success.
     """
+    # a trial costs one render, unless the caller replaces that
     row = Row(
         kind,
         number,
@@ -154,6 +156,7 @@ def add_judgement(row: Row, judgement: Judgement) -> Row:
         score=_none_if_nan(judgement.score),
         correct=judgement.right,
         margin=_none_if_nan(judgement.margin),
+        # None where the output was NaN: its index and probability are None by themselves
         label=None if judgement.is_non_finite else prediction.label,
         label_index=prediction.index,
         probability=prediction.probability,
@@ -170,17 +173,18 @@ def _none_if_nan(value: float | None) -> float | None:
 def read_judgement(row: Row) -> Judgement:
     """Return the judgement that a row has, the inverse of `add_judgement`.
 
-    A row without a label is that of an output that was not a number.
+    A row has None where the judgement has NaN; without a label it is the row of an
+    output that was NaN itself.
     """
     prediction = Prediction(row.label or NOT_A_NUMBER, row.label_index, row.probability)
     return Judgement(
         math.nan if row.score is None else row.score,
         math.nan if row.margin is None else row.margin,
-        bool(row.correct),
-        prediction,
-        row.payload,
-        row.objective,
-        row.metrics or None,
+        right=bool(row.correct),
+        prediction=prediction,
+        payload=row.payload,
+        objective=row.objective,
+        metrics=row.metrics or None,
     )
 
 
@@ -229,7 +233,7 @@ def make_control_group(trials: Sequence[Judgement], spp: int) -> ControlGroup:
 
 
 def _rate_fields(rate: Trials, trials: Sequence[Judgement]) -> dict[str, Any]:
-    """Return the fields that all rates of a result have."""
+    """Return the fields that all rates of a result have, from counts and trials."""
     n_not_a_number = sum(trial.is_non_finite for trial in trials)
     return {
         "trials": rate.trials,

@@ -393,8 +393,10 @@ def render(
 
 
 def _list_view_warnings(rendered_views: Sequence[_RenderedView]) -> list[str]:
-    """Return a sentence if no truth could be drawn into a view, and the first remarks
-    of the task.
+    """Return the warnings of the task about some views, as sentences.
+
+    They are why no truth could be drawn into a view, if so, and the task's remarks on
+    the first view that has any.
     """
     sentences = list[str]()
     truth_errors = [
@@ -424,7 +426,10 @@ def _check_azimuth_is_free(controls: Sequence[Control]) -> None:
 def _render_view(
     description: SceneDescription, model: Model, task: Task, settings: _ViewSettings
 ) -> _RenderedView:
-    """Render one view, and predict with the model what it shows."""
+    """Render one view, and predict with the model what it shows.
+
+    The truth is only found if it depends on the configuration (`Task.varies`).
+    """
     description = fit_camera(description, settings.size)
     space = compose(settings.controls, description)
     renderer = make_renderer(
@@ -561,8 +566,8 @@ def make_facts(
     Args:
         description: the scene.
         name: name of its object.
-        label: right label of the thing that is judged; where all are, of the object.
-            All others have the labels of their own.
+        label: right label of the thing that is judged, or of the object if all things
+            are; None for its own label, which all others have.
         describe: describes the configuration; other parameters have the values of the
             scene.
         render_surfaces: renders what the camera sees; it is called once at most.
@@ -580,6 +585,7 @@ def make_facts(
     def make_thing_facts(mesh: str) -> Facts:
         """Return the facts of a single thing, the object or another one."""
         labelled_mesh = OBJECT if judge == ALL_THINGS else judge
+        # None: its own label is right
         right_label = label if mesh == labelled_mesh else None
         sight = None
         if cached_render is not None:
@@ -653,7 +659,8 @@ def find_visible_things(renderer: Renderer, u: Tensor) -> JsonObject | None:
         return None
     names = (OBJECT, *description.things)
     labels = {name: description.meshes[name].label for name in names}
-    # as for a thing that the image does not show, until it is found there
+    # At first as for things that the image does not show; those that are found in it
+    # are replaced below.
     things: JsonObject = {
         name: {
             "label": labels[name],

@@ -23,6 +23,7 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.transport import PredictedSearch
 from advsearch.runs.results import BankOfConditions
 from advsearch.scene.color import round_to_8_bit
+from advsearch.scene.gradients import Group
 from advsearch.scene.mitsuba_backend.surface import RAYS_PER_PIXEL
 from advsearch.scene.predictor import Refusal, RefusalCause
 from advsearch.scene.surface import renderer as surface_renderer
@@ -118,7 +119,8 @@ class SurfaceLight(PredictedSearch):
     # coordinates of the conditions of the bank
     _bank_conditions: list[Tensor] = field(default_factory=list)
     _n_lights: int = 0
-    _next_comparison: int = 0
+    # index of the evaluation before which predictions are compared again
+    _next_comparison: int = COMPARISON_INTERVAL
     # what cameras see, by index of the conditions and begin of the batch
     _stored_views: dict[tuple[int, int], list[LitCameraView]] = field(
         default_factory=dict
@@ -177,38 +179,42 @@ class SurfaceLight(PredictedSearch):
     def _find_light_conditions(self) -> Tensor:
         """Return which coordinates of the full space need new light, (d,) bool.
 
-        They are those that change the environment in more than its brightness. For the
-        conditions two maps at different coordinates are compared: if one is a multiple
-        of the other, the same light serves both.
+        They are those that change the environment. Under conditions, where the light of
+        many environments is stored, those that only scale its brightness are left out:
+        the same light serves both.
         """
-        problem = self.problem
         needs_new_light = self._find_coordinates(frozenset({ENVIRONMENT_INPUT}))
-        if problem.conditions is None:
+        if self.problem.conditions is None:
             return needs_new_light
-        start = problem.add_conditions(problem.domain.start)
-        for group in problem.space.groups:
+        for group in self.problem.space.groups:
             changes_environment = bool(needs_new_light[group.coordinates].all())
-            if changes_environment:
-                lower = start.clone()
-                upper = start.clone()
-                # any two different values within the range, off its ends
-                lower[group.coordinates] = 0.3
-                upper[group.coordinates] = 0.8
-                lower_map = MapFingerprint.compute(
-                    self._compute_inputs(lower)[ENVIRONMENT_INPUT]
-                )
-                upper_map = MapFingerprint.compute(
-                    self._compute_inputs(upper)[ENVIRONMENT_INPUT]
-                )
-                is_multiple = lower_map.find_factor(upper_map) is not None
-                needs_new_light[group.coordinates] = not is_multiple
+            if changes_environment and self._only_scales_environment(group):
+                needs_new_light[group.coordinates] = False
         return needs_new_light
+
+    def _only_scales_environment(self, group: Group) -> bool:
+        """Return whether a group only changes how bright the environment is.
+
+        Two environment maps are compared, at different values of all coordinates of the
+        group: one is a multiple of the other.
+        """
+        start = self.problem.add_conditions(self.problem.domain.start)
+        fingerprints = []
+        # any two different values within the range, off its ends
+        for value in (0.3, 0.8):
+            full_u = start.clone()
+            full_u[group.coordinates] = value
+            environment = self._compute_inputs(full_u)[ENVIRONMENT_INPUT]
+            fingerprints.append(MapFingerprint.compute(environment))
+        first_map, second_map = fingerprints
+        return first_map.find_factor(second_map) is not None
 
     @property
     def n_samples(self) -> int:
         return N_LIGHTS
 
     def summarize_conditions(self) -> BankOfConditions | None:
+        """Return the state of the bank of lights; None without conditions."""
         if self.problem.conditions is None:
             return None
         return BankOfConditions(
@@ -225,6 +231,9 @@ class SurfaceLight(PredictedSearch):
         return Refusal(f"light on surfaces is {self.deviations[0].reason}")
 
     def count_predicted(self, kind: str, evaluations: int) -> int:
+        """Return how many of the first evaluations of a search were predicted: none, if
+        an earlier search has given predictions up.
+        """
         if "search" in self.first_traced and kind != "search":
             # another search is later, and is traced from its first evaluation on
             return 0
@@ -244,15 +253,7 @@ class SurfaceLight(PredictedSearch):
             self._renderer = SurfaceRenderer(
                 problem.renderer, full_u, seeds.stream(problem.seed, "surface light")
             )
-            self._bank_conditions = [full_u[problem.domain.dim :]]
-            if problem.conditions is not None:
-                seed = seeds.stream(problem.seed, "bank")
-                # where no condition needs a light of its own, one light serves all
-                n_conditions = N_LIGHTS if bool(self._needs_new_light.any()) else 1
-                self._bank_conditions = [
-                    sample_condition(problem.conditions, index, seed)
-                    for index in range(n_conditions)
-                ]
+            self._bank_conditions = self._sample_bank_conditions()
             for condition in self._bank_conditions:
                 inputs = self._compute_inputs(torch.cat([u, condition]))
                 self._renderer.get_light(inputs)  # computes it, and stores it
@@ -261,6 +262,22 @@ class SurfaceLight(PredictedSearch):
             n_stored = len(self._renderer.stored_lights)
             self._n_lights = n_stored + self._renderer.n_dropped
         self._compare(u, index=0)
+
+    def _sample_bank_conditions(self) -> list[Tensor]:
+        """Return the conditions (k,) of the bank, each of which gets its light.
+
+        Without conditions it is a single one, which has no coordinates.
+        """
+        problem = self.problem
+        if problem.conditions is None:
+            return [torch.empty(0)]
+        seed = seeds.stream(problem.seed, "bank")
+        # where no condition needs a light of its own, one light serves all
+        n_conditions = N_LIGHTS if bool(self._needs_new_light.any()) else 1
+        return [
+            sample_condition(problem.conditions, index, seed)
+            for index in range(n_conditions)
+        ]
 
     @property
     def renderer(self) -> SurfaceRenderer:
@@ -294,22 +311,28 @@ class SurfaceLight(PredictedSearch):
             yield self.evaluate(query, predicted_images.get(position))
 
     def _must_trace(self, query: Query) -> bool:
-        """Return whether a query is beyond those that are predicted."""
-        costs_renders = self.problem.domain.gradient_cost > 0
-        if query.gradient is True and costs_renders:
+        """Return whether a query is beyond those that are predicted.
+
+        So is one whose gradient takes differences of rendered images.
+        """
+        takes_differences = self.problem.domain.gradient_cost > 0
+        if query.gradient is True and takes_differences:
             return True
         return self.count_predicted(query.kind, query.index + 1) <= query.index
 
     def evaluate(self, query: Query, image: Tensor | None = None) -> Evaluation:
         """Evaluate a query, with its image (H, W, 3) if that is predicted already."""
-        if query.phase is None:
+        is_trial = query.phase is None
+        if is_trial:
             return self._evaluate_trial(query, image)
         if image is not None:
             return self._evaluate_image(query, image)
         return self._evaluate_over_conditions(query)
 
     def _evaluate_trial(self, query: Query, image: Tensor | None) -> Evaluation:
-        """Evaluate a trial: judge the predicted image as a file would hold it.
+        """Evaluate a trial, a test of a configuration outside of the search.
+
+        The predicted image is judged as a file would hold it, rounded to 8 bits.
 
         `image` is that image; None to predict it here.
         """
@@ -319,20 +342,20 @@ class SurfaceLight(PredictedSearch):
         return Evaluation.from_judgement(
             self.problem.judge(rounded, full_u),
             cost=0,  # nothing is rendered
-            predicted=RAYS_PER_PIXEL,
+            predicted=RAYS_PER_PIXEL,  # samples per pixel of a predicted image
             picture=rounded if query.with_image else None,
         )
 
     def _evaluate_image(self, query: Query, image: Tensor) -> Evaluation:
         """Evaluate a query of a search by its predicted image, without derivative."""
         evaluated, _ = self.problem.evaluate_batch(
-            lambda u: image[None], [query.u], query.u, False
+            lambda u: image[None], [query.u], query.u, gradient=False
         )
-        ((evaluation, _),) = evaluated
+        evaluation, _ = evaluated[0]  # of a batch of one image
         return replace(
             evaluation,
             cost=query.samples,
-            predicted=RAYS_PER_PIXEL,
+            predicted=RAYS_PER_PIXEL,  # samples per pixel of a predicted image
             picture=round_to_8_bit(image) if query.with_image else None,
         )
 
@@ -342,13 +365,13 @@ class SurfaceLight(PredictedSearch):
         """
         problem = self.problem
         # A random search ("baseline") uses few sets of conditions in turn, for which
-        # what cameras see is stored.
+        # what cameras see is stored, if nothing that is searched moves.
         reuses_conditions = (
             query.kind == "baseline"
             and problem.conditions is not None
             and not self._has_moving
         )
-        index = query.index
+        index = query.index  # of the set of conditions
         if reuses_conditions:
             index = query.index % N_CONDITION_SETS
         conditions = self._choose_conditions(query.kind, index, problem.n_draws)
@@ -368,20 +391,24 @@ class SurfaceLight(PredictedSearch):
         if not query.with_image:
             return evaluation
         with torch.no_grad():
-            images = self._predict_images([problem.add_conditions(query.u)], query.u)
+            # without a seed, with conditions that leave the scene unchanged
+            clean_conditions = problem.add_conditions(query.u)
+            images = self._predict_images([clean_conditions], query.u)
             return replace(evaluation, picture=round_to_8_bit(images[0]))
 
     def _choose_conditions(self, kind: str, number: int, count: int) -> list[Tensor]:
-        """Return `count` conditions of an evaluation: new cameras under lights of the
-        bank.
+        """Return `count` conditions (k,) of an evaluation: new cameras under lights of
+        the bank.
 
         Each takes the coordinates that need new light from a random condition of the
-        bank, and all others from a new sample. Without conditions it is the only one of
-        the bank.
+        bank, and all others from a new sample. `kind` and `number` of the evaluation
+        give the seed.
         """
         problem = self.problem
         if problem.conditions is None:
-            return self._bank_conditions * count
+            return (
+                self._bank_conditions * count
+            )  # the bank has one, without coordinates
         generator = torch.Generator().manual_seed(
             seeds.stream(problem.seed, f"surface {kind}", number)
         )
@@ -396,11 +423,11 @@ class SurfaceLight(PredictedSearch):
     def _compute_inputs(self, full_u: Tensor) -> dict[str, Tensor]:
         """Return the scene inputs of a full configuration.
 
-        If no searched control moves anything, only those of the conditions are
-        computed, which are the last coordinates: the base color is then missing.
+        If no searched control moves anything, only the inputs that conditions set are
+        computed: those of base colors are then missing.
         """
         with torch.no_grad():
-            # all coordinates, or those of the conditions, which are the last
+            # all coordinates, or those of the conditions, which are the last ones
             first = len(full_u) - len(self._input_space.start)
             inputs = self._input_space.inputs(full_u[first:])
             return self.problem.renderer.scene.assembly(inputs)
@@ -423,7 +450,7 @@ class SurfaceLight(PredictedSearch):
         inputs = [self._compute_inputs(full_u) for full_u in full_configurations]
         views: Iterable[LitCameraView]
         if key is None:
-            views = self.renderer.trace_views(inputs)
+            views = self.renderer.trace_views(inputs)  # lazily, one at a time
         else:
             if key not in self._stored_views:
                 self._stored_views[key] = list(self.renderer.trace_views(inputs))
@@ -433,18 +460,22 @@ class SurfaceLight(PredictedSearch):
         )
 
     def replay(self, query: Query) -> None:
-        """Compare predictions with traced images if that is due, and draw the
-        consequences.
+        """Compare predictions with traced images if that is due, and renew the light or
+        give predictions up if they are too far off.
 
-        It is due every `COMPARISON_INTERVAL` evaluations if base colors are searched,
-        since their light gets old; else the interval doubles as long as predictions are
-        accurate. If they are not, the light is computed again for the present colors,
-        if these are searched. After two such comparisons in a row, all further images
-        are traced.
+        A comparison is due every `COMPARISON_INTERVAL` evaluations if base colors are
+        searched, since their light gets old; else the interval doubles as long as
+        predictions are accurate. After the first inaccurate comparison the light is
+        computed again for the present colors, if these are searched. After two in a
+        row, all further images are traced.
         """
-        if query.kind != "search" or query.phase != "search" or self.tracing_reason:
-            return
-        if query.index < (self._next_comparison or COMPARISON_INTERVAL):
+        is_of_search = query.kind == "search" and query.phase == "search"
+        predictions_failed = self.tracing_reason is not None
+        if (
+            not is_of_search
+            or predictions_failed
+            or query.index < self._next_comparison
+        ):
             return
         was_accurate = self.deviations[-1].is_accepted
         is_accurate = self._compare(query.u, query.index).is_accepted
@@ -460,32 +491,35 @@ class SurfaceLight(PredictedSearch):
         elif self._searches_colors:
             with self.count_time():
                 self.renderer.update_base_color(self.problem.add_conditions(query.u))
-            self.n_renewals = (self.n_renewals or 0) + 1
+            assert self.n_renewals is not None  # None only for a `Bank`
+            self.n_renewals += 1
 
     def _compare(self, u: Tensor, index: int) -> Deviation:
         """Compare predicted images with traced ones, and store the deviation.
 
         The first view is that of u (d,). In the others, searched cameras and
-        environments are random, and conditions are new in all.
+        environments are random, and conditions are new in all. `index` is that of the
+        evaluation, for the seed.
         """
         problem = self.problem
         kind = "surface check"
         seed = seeds.stream(problem.seed, kind, index)
         with self.count_time():
             generator = torch.Generator().manual_seed(seed)
-            samples = problem.domain.sample(generator, N_VIEWS)  # (N_VIEWS, d)
-            # of each view: random where something moves, else as searched
-            configurations = torch.where(self._moving, samples, u)
+            random_configurations = problem.domain.sample(generator, N_VIEWS)
+            # (N_VIEWS, d): random where something moves, else as searched
+            configurations = torch.where(self._moving, random_configurations, u)
             configurations[0] = u
             conditions = self._choose_conditions(kind, index, N_VIEWS)
             full_configurations = [
                 torch.cat([view_u, condition])
                 for view_u, condition in zip(configurations, conditions, strict=True)
             ]
+            # A margin may be off by a fraction of what the search has changed, which
+            # random coordinates have no part in.
             is_random = self._moving
             if not self._searches_colors:
-                # Only cameras and environments are searched, which are random here:
-                # nothing of the margin's change is due to the search.
+                # only cameras and environments are searched: the search has no part
                 is_random = torch.ones_like(self._moving)
 
         def compare_view(number: int) -> ComparedView:

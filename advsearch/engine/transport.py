@@ -26,6 +26,7 @@ from advsearch.attacks.evaluation import Query
 from advsearch.engine.acceptance import ComparedView, Deviation, compare_views
 from advsearch.engine.problem import Problem
 from advsearch.engine.windows import (
+    N_WINDOW_IMAGES,
     FullImage,
     Windowing,
     find_window,
@@ -70,7 +71,8 @@ ADVICE = {
 def find_matrix_refusal(
     problem: Problem, steps: int | None, specialise: bool
 ) -> Refusal | None:
-    """Return why a search is not predicted by matrices; None if it is.
+    """Return why the images of a search are rendered, and not predicted by matrices of
+    light transport; None if they are predicted.
 
     Args:
         problem: problem of the search.
@@ -93,8 +95,12 @@ def find_matrix_refusal(
         conditions = problem.space.controls[problem.n_searched :]
         condition_names = [control.name for control in conditions]
     refusal = find_refusal(problem.renderer, condition_names)
-    if refusal is not None or problem.conditions is not None or steps is None:
+    if refusal is not None:
         return refusal
+    # under conditions there are no basis images, and without a number of steps any
+    # number of them pays
+    if problem.conditions is not None or steps is None:
+        return None
     # before the first prediction an image is rendered for each light
     min_steps = MIN_STEPS_PER_LIGHT * count_lights(problem.renderer)
     if steps < min_steps:
@@ -217,7 +223,10 @@ class PredictedSearch(ABC):
             yield from trace(queries)
             return
         for query in queries:
-            yield self.problem.evaluate_full(query, query.u, query.seed, renderer)[0]
+            evaluation, _ = self.problem.evaluate_full(
+                query, query.u, query.seed, renderer
+            )
+            yield evaluation
 
     @abstractmethod
     def measure_size(self) -> tuple[int, int]:
@@ -255,7 +264,11 @@ class PredictedSearch(ABC):
         return current, measure_outside(self.problem, window, before, [current])
 
     def trace_from(self, kind: str, number: int, where: str = "") -> None:
-        """Trace images from an evaluation of a kind of search on."""
+        """Trace the images of a kind of search from the evaluation with an index on.
+
+        `where` completes "evaluation 20" in the reason for the user, such as " of the
+        search"; of several reasons the first one stays.
+        """
         self.first_traced[kind] = number
         reason = (
             f"pictures are rendered from evaluation {number}{where} on: predicted "
@@ -323,17 +336,27 @@ class Transport(PredictedSearch):
         return count_samples(self.problem.renderer)
 
     def prepare(self, tick: ProgressCallback = lambda samples: None) -> None:
+        """Choose the window, and compute the matrix of the clean configuration.
+
+        The matrix is computed only if no search with the same window has done so.
+        `tick` is called with samples per pixel as they are traced.
+        """
         if not self._is_prepared:
             with self.count_time():
                 windowing = find_window(self.problem)
+            # else it is the reason why there is no window: full images are predicted
             if isinstance(windowing, Windowing):
                 self.window = windowing.window
                 self._full_images["start"] = windowing.start
-                self.n_traced += 3
+                self.n_traced += N_WINDOW_IMAGES
             self._is_prepared = True
         if self.window not in self.clean_matrix.predictors:
-            u = self.problem.domain.start
-            predictor = self._make_predictor(u, "start", 0, tick)
+            predictor = self._make_predictor(
+                self.problem.domain.start,
+                "start",
+                number=0,  # it belongs to no query
+                tick=tick,
+            )
             self.clean_matrix.predictors[self.window] = predictor
 
     @property
@@ -343,6 +366,9 @@ class Transport(PredictedSearch):
         return self.clean_matrix.predictors[self.window]
 
     def measure_size(self) -> tuple[int, int]:
+        """Return the entries of the clean matrix, for one color channel, and its
+        bytes.
+        """
         return self.start.n_entries, self.start.n_bytes
 
     def _make_predictor(
@@ -364,6 +390,7 @@ class Transport(PredictedSearch):
             seed = seeds.stream(self.problem.seed, f"transport {kind}", number)
             renderer = self.problem.renderer
             if self.window is not None:
+                # only the window is predicted: what surrounds it is rendered once
                 base_seed = seeds.stream(seed, "surroundings")
                 renderer = renderer.crop_to(self.window, u, base_seed, SURROUNDINGS_SPP)
                 self.n_traced += 1
@@ -372,6 +399,10 @@ class Transport(PredictedSearch):
         return predictor
 
     def get_window_renderer(self, kind: str) -> Renderer | None:
+        """Return what traces paths in the window, in the latest surroundings.
+
+        None if there is no window, or the search ended with full images.
+        """
         if self.window is None or kind in self.first_traced:
             return None
         predictor = self._current.get(kind, self.start)
@@ -381,12 +412,16 @@ class Transport(PredictedSearch):
         self._update_predictor(query)
 
     def evaluate(self, query: Query) -> Evaluation:
+        """Evaluate a query by its predicted image, or by a traced one where predictions
+        are not used.
+        """
         predictor = self._update_predictor(query)
         if predictor is None:
             return self.problem.evaluate(query)
         evaluation, _ = self.problem.evaluate_full(
             query, query.u, query.seed, predictor.renderer
         )
+        # samples per pixel of the prediction: a matrix counts as one
         return replace(evaluation, predicted=1)
 
     def _update_predictor(self, query: Query) -> Predictor | None:
@@ -400,7 +435,8 @@ class Transport(PredictedSearch):
         """
         kind = query.kind
         number = query.index
-        if query.phase != "search" or number >= self.count_predicted(kind, self.steps):
+        n_predicted = self.count_predicted(kind, self.steps)
+        if query.phase != "search" or number >= n_predicted:
             return None
         predictor = self._current.setdefault(kind, self.start)
         is_due = number > 0 and number % COMPARISON_INTERVAL == 0
@@ -420,7 +456,8 @@ class Transport(PredictedSearch):
         self._current[kind] = self._make_predictor(query.u, kind, number)
         if current is not None:
             self._full_images[kind] = current
-        self.n_renewals = (self.n_renewals or 0) + 1
+        assert self.n_renewals is not None  # None only for a `Bank`
+        self.n_renewals += 1
         return self._current[kind]
 
     def _compare_predictor(self, predictor: Predictor, query: Query) -> Deviation:
@@ -468,7 +505,9 @@ class Transport(PredictedSearch):
     def update_score_bias(self, u: Tensor, scores: Sequence[float]) -> None:
         """Update the bias of predicted scores from those of a configuration's trials.
 
-        The bias is the predicted score minus the lower end of the trials' scores.
+        The bias is the predicted score minus the lower end of the trials' scores. From
+        few trials, or where a score is not finite, no end can be estimated: then the
+        bias stays.
         """
         if len(scores) >= MIN_SCORES and all(map(math.isfinite, scores)):
             mean = statistics.fmean(scores)

@@ -116,14 +116,16 @@ class Verifier:
         in_samples: bool = False,
         predictor: PredictedSearch | None = None,
     ) -> Iterator[Evaluation]:
-        """Evaluate trials in order, store their images, and count each once.
+        """Evaluate trials lazily and in order; store their images, and count renders.
+
+        A trial whose image is rendered counts once, however often it is evaluated.
 
         Args:
             queries: the trials.
             in_samples: whether the progress bar counts samples per pixel, and not
                 trials.
-            predictor: evaluates what it can instead of renders. Only renders are
-                counted as such.
+            predictor: predicts the images that it can; the others are rendered. None to
+                render all.
         """
         evaluate = None
         if predictor is not None:
@@ -163,7 +165,7 @@ class Verifier:
         ladder = self.ladder
         has_choice = len(ladder) > 1
         n_trials = self.looks[0]
-        # for the progress: samples of every render at every sample count
+        # `max_samples`, for the progress: samples of every render at every sample count
         if has_conditions:
             choose: Callable[..., SampleCount] = choose_rate_spp
             if has_choice:
@@ -173,14 +175,7 @@ class Verifier:
             choose = partial(choose_spp, trials=n_trials)
             max_samples = count_max_samples(len(candidates), ladder, n_trials)
         if len(ladder) > 1:
-            hint = (
-                "more and more samples a pixel until noise no longer moves the result "
-                "(counted in samples a pixel); `verify_spp=NUMBER` leaves it out"
-            )
-            title = "finding how many samples the check needs"
-            self.stages.begin(
-                "verification", title, max_samples, hint=hint, at_most=True
-            )
+            self._begin_sample_count_stage(max_samples)
         evaluate = partial(self.evaluate_all, in_samples=True)
         margins = {
             name: make_margin_function(
@@ -194,26 +189,41 @@ class Verifier:
         }
         self.state.sample_count = choose(margins, seed=self.problem.seed, ladder=ladder)
 
+    def _begin_sample_count_stage(self, max_samples: int) -> None:
+        """Begin the stage of the progress in which the sample count is chosen.
+
+        `max_samples` are the samples per pixel of all its renders, at most.
+        """
+        self.stages.begin(
+            "verification",
+            "finding how many samples the check needs",
+            max_samples,
+            hint="more and more samples a pixel until noise no longer moves the result "
+            "(counted in samples a pixel); `verify_spp=NUMBER` leaves it out",
+            at_most=True,
+        )
+
     def _condition_ladder(
-        self, n_candidates: int, searched: int | None
+        self, n_candidates: int, search_samples: int | None
     ) -> Sequence[int]:
         """Return the sample counts to choose from where conditions vary.
 
-        `searched` are the samples that the searches took: counts that would make the
-        verification more expensive than that are left out. None for no such limit.
+        `search_samples` are the samples that the searches took: counts that would make
+        the verification more expensive than that are left out. None for no such limit.
         """
-        if searched is None:
+        if search_samples is None:
             return OVER_LADDER
-        n_trials = (n_candidates + 1) * self.n_trials
-        return limit_ladder(OVER_LADDER, n_trials, searched)
+        n_groups = n_candidates + 1  # a group of trials for each, and the control group
+        return limit_ladder(OVER_LADDER, n_groups * self.n_trials, search_samples)
 
     def try_clean(self) -> None:
         """Run the trials of the clean configuration, the control group, if they are
         missing at this sample count.
 
-        They have the same seeds as those of the adversarial configuration. If the model
-        seemed to be wrong about the start, they are run before the search, at a sample
-        count of their own, and once more after it.
+        They have the same seeds as those of the adversarial configuration. Where the
+        model seems to be wrong about the clean configuration already, they are run
+        before the search, under another kind and at a sample count of their own, and
+        once more after it.
         """
         if self.has_clean_trials:
             return
@@ -257,6 +267,7 @@ class Verifier:
             with_new_trials: whether both groups get new trials, numbered after all
                 others.
         """
+        clean_trials = () if with_new_trials else self.state.clean_trials
         verification = verify(
             self.evaluate_all,
             self.problem.domain,
@@ -265,7 +276,7 @@ class Verifier:
             spp=self.state.spp,
             seed=self.problem.seed,
             trials=self.looks,
-            clean=() if with_new_trials else self.state.clean_trials,
+            clean=clean_trials,
             rule=self.problem.rule,
             kind=kind,
             control_kind=self._clean_kind,
@@ -298,7 +309,7 @@ class Verifier:
         queries = list[Query]()
         for number, u in configurations.items():
             seed = seeds.stream(problem.seed, kind, number)
-            # those of a texture would fill the store
+            # for the row of the trial; those of a texture would fill the store
             values: dict[str, Any] = {}
             if problem.domain.dim <= MAX_DESCRIBED_COORDINATES:
                 values = problem.describe(u, seed)
@@ -385,9 +396,8 @@ class RetrialCondition:
         name: name of the condition.
         problem: judges its images.
         spp: samples per pixel.
-        image_key: conditions of equal source share the rendered image of a trial, (H,
-            W,
-            3) sRGB in [0, 1].
+        image_key: conditions with equal keys share the rendered image of a trial,
+            (H, W, 3) sRGB in [0, 1].
         change_image: from the rendered image and the seed of the trial to the model's
             image; None for the image itself.
         radiance_key: conditions of equal light share the linear radiance of a trial, as
@@ -485,8 +495,8 @@ class Retrials:
     ) -> Verification:
         """Try a configuration (d,) under one condition, compared with the clean scene.
 
-        Nothing is claimed, so that nothing is confirmed. Its rows have the kind "KIND
-        under CONDITION".
+        Only rates are compared: the search claims nothing under this condition, which
+        trials could confirm. The rows have the kind "KIND under CONDITION".
         """
         return verify(
             partial(self._evaluate_trials, kind, condition),
@@ -531,27 +541,36 @@ class Retrials:
             for query, key in zip(queries, keys, strict=True)
             if key not in self._images
         ]
-        evaluator = self._journals[condition.name].evaluator
-        # a single image is rendered here, where its radiance can be shared
-        has_workers = evaluator.executor is not None and len(missing) > 1
-        # in the order of `missing`; empty without workers
-        from_workers = iter(evaluator(missing) if has_workers else ())
+        # in the order of `missing`
+        from_workers = self._render_on_workers(condition, missing)
         for query, key in zip(queries, keys, strict=True):
-            machine = None
+            machine = None  # that rendered the image, if it was a worker
             if key not in self._images:
                 rendered = next(from_workers, None)
                 if rendered is None or rendered.picture is None:
-                    image = self._render(condition, query.u, query.seed)
+                    self._images[key] = self._render(condition, query.u, query.seed)
                 else:
-                    image = rendered.picture
+                    self._images[key] = rendered.picture
                     machine = rendered.machine
-                self._images[key] = image
             image = self._images[key]
             if condition.change_image is not None:
                 image = condition.change_image(image, query.seed)
             full_u = problem.add_conditions(query.u, query.seed)
             judgement = problem.judge(round_to_8_bit(image), full_u)
             yield Evaluation.from_judgement(judgement, machine=machine)
+
+    def _render_on_workers(
+        self, condition: RetrialCondition, queries: Sequence[Query]
+    ) -> Iterator[Evaluation]:
+        """Yield the images of queries, rendered by workers; none without workers.
+
+        None either for a single query: its image is rendered in this process, where its
+        radiance can be shared.
+        """
+        evaluator = self._journals[condition.name].evaluator
+        if evaluator.executor is not None and len(queries) > 1:
+            return iter(evaluator(queries))
+        return iter(())
 
     def _render(self, condition: RetrialCondition, u: Tensor, seed: int) -> Tensor:
         """Return the image (H, W, 3) of u (d,), as `Problem.picture` does.
@@ -560,6 +579,7 @@ class Retrials:
         formation of the image from it differs.
         """
         problem = condition.problem
+        # how many conditions have this light; 0 without a key, which is never shared
         is_light_shared = self._n_conditions_of_light[condition.radiance_key] >= 2
         if not is_light_shared:
             return problem.picture(u, seed, condition.spp)

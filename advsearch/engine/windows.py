@@ -46,6 +46,7 @@ PROBE_SPP = 2
 
 Few are enough: images of one seed have nearly the same noise.
 """
+N_WINDOW_IMAGES = 3  # full images that `find_window` renders
 MOVING_SUFFIXES = (".vertices", ".normals")
 
 
@@ -83,7 +84,8 @@ def find_window(problem: Problem) -> Windowing | Refusal:
 
     The box around what is searched is grown by each of `MARGINS` in turn. Outside of
     the window, the images of the smallest and of the largest values of all coordinates
-    must look like that of the start. This takes three full images of few samples.
+    must look like that of the start. This takes `N_WINDOW_IMAGES` full images of few
+    samples.
 
     Returns:
         The window with the image of the start, or why there is none.
@@ -136,10 +138,11 @@ def find_crop_refusal(problem: Problem) -> Refusal | None:
 
 
 def _find_searched_refusal(problem: Problem) -> Refusal | None:
-    """Return why what is searched shows in more than a part of the image.
+    """Return why it is not enough to trace a part of the image, by what is searched.
 
-    None if it shows in a part only: it changes the surface of a mesh, which stays where
-    it is.
+    None if it is enough: what is searched are surfaces of meshes that stay where they
+    are, so that the image changes there. If nothing changes that is traced, there is no
+    such part either, which is a refusal as well.
     """
     light_inputs = find_light_inputs(problem.renderer)
     input_names = _find_searched_inputs(problem)  # such as "mug.bsdf.reflectance"
@@ -147,7 +150,7 @@ def _find_searched_refusal(problem: Problem) -> Refusal | None:
         return Refusal("nothing that is searched needs a render")
     mesh_names = problem.renderer.surfaces(problem.renderer.start).names
     for name in sorted(input_names):
-        part = name.partition(".")[0]
+        part = name.partition(".")[0]  # "mug": the mesh or light that has the input
         if name in light_inputs:
             return Refusal(f"{part} is light, which shows everywhere")
         if name.endswith(MOVING_SUFFIXES):
@@ -173,13 +176,16 @@ def _find_box(problem: Problem) -> Window | None:
 
 
 def render_full(problem: Problem, u: Tensor) -> FullImage:
-    """Render the full image of u (d,) that is compared with others.
+    """Render the full image of u (d,), to compare it with that of another u.
 
-    It is traced twice with independent noise (`halves`), which is the same for each u.
+    It is traced twice with independent noise (`halves`); `radiance` is the mean of
+    both, denoised. The two seeds are the same for every u, so that most of the noise
+    cancels in the difference of two images.
     """
+    noise_seed = seeds.stream(problem.seed, "crop")
     with torch.no_grad(), problem.renderer.scene.limit_depth(problem.search_depth):
         halves, radiance = problem.renderer.trace_halves(
-            _compute_inputs(problem, u), seeds.stream(problem.seed, "crop"), PROBE_SPP
+            _compute_inputs(problem, u), noise_seed, PROBE_SPP
         )
     return FullImage(u.detach().clone(), halves, radiance)
 

@@ -662,8 +662,10 @@ def read_logits(output: Any, count: int, classes: int | None, name: str) -> Tens
 
 
 def _check_is_classifier(output: Any, tensor: Tensor | None, expected: str) -> None:
-    """Raise ModelError for an output that looks like that of another task, of training,
-    or after an argmax.
+    """Raise ModelError for an output that is clearly not that of a classifier.
+
+    It has losses (the network is in training mode), class indices instead of scores
+    (an argmax was taken), or what networks of another task return.
 
     Args:
         output: output of the network.
@@ -675,10 +677,10 @@ def _check_is_classifier(output: Any, tensor: Tensor | None, expected: str) -> N
         got = describe_output(output if tensor is None else tensor)
         raise ModelError(f"{expected}, got {got}; {advice}")
     likely_task = _guess_task(output)
-    has_other_task = likely_task in ("detection", "segmentation", "depth", "similarity")
+    other_tasks = ("detection", "segmentation", "depth", "similarity")
     # A map of scores for each pixel gets the caller's advice on its shape instead.
     is_map = tensor is not None and tensor.dim() == 4
-    if likely_task and has_other_task and not is_map:
+    if likely_task in other_tasks and not is_map:
         raise ModelError(
             f"{expected}, got {describe_output(output)}; "
             f"{_advise_other_task(likely_task)}"
@@ -789,16 +791,21 @@ def _guess_task(returned: Any) -> str | None:
 
 
 def _looks_like_boxes(returned: Any) -> bool:
-    """Return whether an output has boxes: a field with their name, in it or in its
-    first element, or boxes (N, K, 4) before other elements.
+    """Return whether an output of a network looks like boxes of a detector.
+
+    Detectors return one of these: a tuple that begins with boxes (N, K, 4) and goes on
+    with scores; or a mapping or an object with a field "boxes" or "pred_boxes", by
+    itself or for each image, as the elements of a list.
     """
     is_sequence = isinstance(returned, (tuple, list))
     first = returned[0] if is_sequence and returned else returned
     if isinstance(first, Tensor):
         is_boxes = first.dim() == 3 and first.shape[2] == 4
-        return is_sequence and len(returned) > 1 and is_boxes
-    names = first if isinstance(first, Mapping) else dir(first)
-    return "boxes" in names or "pred_boxes" in names
+        has_more = is_sequence and len(returned) > 1  # boxes alone have no scores
+        return has_more and is_boxes
+    # keys of a mapping, or attributes of an object
+    field_names = first if isinstance(first, Mapping) else dir(first)
+    return "boxes" in field_names or "pred_boxes" in field_names
 
 
 def _advise_other_task(name: str) -> str:

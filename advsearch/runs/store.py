@@ -163,7 +163,8 @@ class Store:
 
         Args:
             rows: rows of evaluations.
-            cached: what the search was told of the last of them that no row has.
+            cached: what a search needs to be resumed and the last row does not have,
+                such as the gradient of its evaluation; None if there is nothing.
         """
         check_not_moved(self.path)
         start_time = time.monotonic()
@@ -474,7 +475,7 @@ def _decode_json_columns(by_name: dict[str, Any]) -> str | None:
     if by_name["metrics"] is None:
         by_name["metrics"] = {}
     else:
-        by_name["metrics"] = _parse_named(by_name["metrics"], _is_metric)
+        by_name["metrics"] = _parse_named(by_name["metrics"], _is_number_or_none)
     if by_name["metrics"] is None:
         return "metrics_json"
     if by_name["payload"] is not None:
@@ -521,8 +522,9 @@ def _parse_named(text: str, fits: Callable[[Any], bool]) -> dict[str, Any] | Non
 
 
 def _is_value(entry: object) -> bool:
-    """Return whether an entry is the value of a parameter: a text, a finite number or a
-    list of such, with a unit.
+    """Return whether an entry is the value of a parameter, `{"value": ..., "unit": ...}`.
+
+    The value is a text, None, a finite number, or a list of such.
     """
     if (
         not isinstance(entry, dict)
@@ -531,10 +533,11 @@ def _is_value(entry: object) -> bool:
     ):
         return False
     values = entry["value"] if isinstance(entry["value"], list) else [entry["value"]]
-    return all(isinstance(value, str) or _is_metric(value) for value in values)
+    return all(isinstance(value, str) or _is_number_or_none(value) for value in values)
 
 
-def _is_metric(value: object) -> bool:
+def _is_number_or_none(value: object) -> bool:
+    """Return whether a value is None or a number as rows have them, which is finite."""
     return value is None or (
         isinstance(value, (int, float)) and -MAX_NUMBER <= value <= MAX_NUMBER
     )

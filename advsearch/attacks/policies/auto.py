@@ -360,7 +360,7 @@ class Auto(Policy[AutoState]):
         return NO_COUNTS if state.ascent is None else state.ascent.counts
 
     def _choose_next_point(self, state: AutoState) -> tuple[Tensor, AutoState]:
-        """Return the point (k,) of the box to evaluate next.
+        """Return the point (k,) of the unit box [0, 1]^k to evaluate next.
 
         It is the candidate with the largest upper confidence bound of the surrogate; a
         random point as long as no objective is finite.
@@ -368,7 +368,9 @@ class Auto(Policy[AutoState]):
         box = state.box
         generator = seeded(state.seed, len(state.observations.values))
         if not state.observations.has_finite:
-            return box.normalize(torch.rand(box.count, generator=generator)), state
+            random_point = torch.rand(box.count, generator=generator)
+            # `normalize` moves discrete choices to the centers of their options
+            return box.normalize(random_point), state
         surrogate, observations = state.observations.fit_surrogate()
         candidates = _sample_candidates(surrogate, generator)
         mean, std = surrogate.predict(candidates)

@@ -451,13 +451,18 @@ class Choices(RacingPolicy[ChoicesState]):
         return super().update(state, inner_evaluated)
 
     def distribution(self, state: ChoicesState) -> Distribution | None:
-        """Return the distribution of the leading search, with its options fixed."""
+        """Return the distribution (d,) of the leading search, with its options fixed.
+
+        The search itself has only the k numbers: its mean is completed by its choices,
+        which have no deviation.
+        """
         inner_distribution = super().distribution(state)
         if inner_distribution is None:
             return None
         deviation = torch.zeros_like(state.domain.start)
-        deviation[state.numbers] = inner_distribution.deviation
-        mean = state.join_choices(inner_distribution.mean, state.leader)
+        number_indices = state.numbers
+        deviation[number_indices] = inner_distribution.deviation
+        mean = state.join_choices(inner_distribution.mean, combination=state.leader)
         return Distribution(mean, deviation)
 
     def failures(self, state: ChoicesState) -> None:

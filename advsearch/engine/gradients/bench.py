@@ -59,7 +59,7 @@ def restrict_plan(
 ) -> GradientPlan:
     """Return the plan with only the named groups differentiated.
 
-    They have the given estimator, or that of the plan.
+    `estimator` is that of all of these; None for the one that the plan has for each.
     """
     groups = []
     for group in plan.groups:

@@ -21,16 +21,15 @@ from advsearch.engine.gradients.bench import Bench, Loss, restrict_plan
 from advsearch.runs.results import GradientStatus, Measured
 from advsearch.scene.gradients import STEP_RANGE, Group, select_compared
 
-# share of a control's largest derivative that each of its derivatives counts as, at
-# least
+# size that a derivative has at least for the limits below, as a fraction of the largest
+# derivative of its control
 MIN_SIZE_FRACTION = 0.1
 MAX_SINGLE_PROBES = 8  # groups of at most this many coordinates are probed one by one
 MIXED_STEP = 0.03  # along a direction through more than 64 coordinates
 # relative error that the mean of an estimator may have beyond the noise
 MAX_BIAS = 0.05
-MAX_NOISE = (
-    0.2  # noise of one gradient, relative to its size, from which it is called noisy
-)
+# noise of one gradient, relative to its size, from which on it is called noisy
+MAX_NOISE = 0.2
 # standard error of a reference, relative to its size, from which on it gets no more
 # seeds
 MAX_REFERENCE_ERROR = 0.02
@@ -103,7 +102,7 @@ def make_smooth_loss(resolution: tuple[int, int], seed: int = 0) -> Loss:
     columns = torch.linspace(-1.0, 1.0, width)[None, :, None]
     weights = torch.zeros(height, width, 3)
     for _ in range(N_WAVES):
-        # for each channel, uniform in [-1, 1]
+        # each has a number for every channel, uniform in [-1, 1]
         x_frequency, y_frequency, phase, amplitude = (
             torch.rand(3, generator=generator) * 2.0 - 1.0 for _ in range(4)
         )
@@ -233,8 +232,9 @@ def list_attempts(group: Group) -> list[tuple[str, float]]:
         name for name in ("differences", "secant") if (name, 1.0) in attempts
     ]
     steps = {group.step}
-    for factor in FACTORS[1:]:
-        step = min(factor * group.step, STEP_RANGE[1])
+    _, max_step = STEP_RANGE
+    for factor in FACTORS[1:]:  # the first factor is 1
+        step = min(factor * group.step, max_step)
         # beyond the largest step, wider ones are all the same
         if step not in steps:
             steps.add(step)
@@ -251,18 +251,25 @@ def find_probes(bench: Bench) -> list[Probe]:
     """
     probes = []
     for group in bench.renderer.plan.groups:
-        if group.estimator == "none":
-            continue
-        if group.size > MAX_SINGLE_PROBES:
+        is_differentiated = group.estimator != "none"
+        if is_differentiated and group.size > MAX_SINGLE_PROBES:
+            # the planned step of a larger group is for one coordinate, not all at once
             step = group.step if group.size <= MAX_COMMON_STEP_SIZE else MIXED_STEP
             direction = _make_mixed_direction(bench, group)
             probes.append(Probe(group, group.name, direction, step))
-            continue
-        for position in range(group.size):
-            direction = torch.zeros_like(bench.u)
-            direction[group.begin + position] = 1.0
-            name = group.name if group.size == 1 else f"{group.name}.{position}"
-            probes.append(Probe(group, name, direction, group.step))
+        elif is_differentiated:
+            probes += _make_single_probes(bench, group)
+    return probes
+
+
+def _make_single_probes(bench: Bench, group: Group) -> list[Probe]:
+    """Return a probe for each coordinate of a group, with the planned step."""
+    probes = []
+    for position in range(group.size):
+        direction = torch.zeros_like(bench.u)
+        direction[group.begin + position] = 1.0
+        name = group.name if group.size == 1 else f"{group.name}.{position}"
+        probes.append(Probe(group, name, direction, group.step))
     return probes
 
 
@@ -305,8 +312,8 @@ def measure_reference(
         probe: direction along which the derivative is taken.
         repeats: smallest and largest number of seeds.
         factors: factors on the probe's step, tried in turn with the smallest number of
-            seeds, until one is sure enough. If none is, seeds are added to that with
-            the least noise.
+            seeds, until the standard error of one is small enough. If none is, seeds
+            are added for the factor with the least noise.
     """
     min_repeats, max_repeats = repeats
     pairs_of_factor: dict[float, list[DifferencePair]] = {}
@@ -354,7 +361,9 @@ def _measure_pair(
 
     `number` is the index of the pair, from which its seed follows.
     """
-    step = probe.step if factor == 1.0 else min(STEP_RANGE[1], factor * probe.step)
+    # a wider step stays within the largest one; the planned step is taken as it is
+    _, max_step = STEP_RANGE
+    step = probe.step if factor == 1.0 else min(max_step, factor * probe.step)
     noise_seed = seeds.stream(bench.seed, "reference", number)
     return DifferencePair(
         coarse=_compute_difference(bench, probe, step, noise_seed),
@@ -373,18 +382,20 @@ def _compute_standard_error(pairs: Sequence[DifferencePair]) -> float:
 
 
 def _extrapolate(pairs: Sequence[DifferencePair], factor: float) -> Reference:
-    """Return the reference that is the mean of pairs with a factor on the step.
+    """Return the reference that is the mean of pairs, extrapolated to a step of 0.
 
-    Its noise is the standard error, and a quarter of what the step changes.
+    Its noise is the standard error of that mean, together with a quarter of the
+    difference between both steps, for what the extrapolation leaves of their error.
+    `factor` is that on the probe's step.
     """
     coarse_mean = statistics.fmean(pair.coarse for pair in pairs)
     fine_mean = statistics.fmean(pair.fine for pair in pairs)
     step_noise = 0.25 * (coarse_mean - fine_mean)
     return Reference(
-        statistics.fmean(pair.extrapolated for pair in pairs),
-        math.hypot(_compute_standard_error(pairs), step_noise),
-        (coarse_mean, fine_mean),
-        factor,
+        value=statistics.fmean(pair.extrapolated for pair in pairs),
+        noise=math.hypot(_compute_standard_error(pairs), step_noise),
+        steps=(coarse_mean, fine_mean),
+        factor=factor,
     )
 
 
@@ -401,7 +412,8 @@ def _compute_difference(bench: Bench, probe: Probe, step: float, seed: int) -> f
     else:
         above = (bench.u + move).clamp(0.0, 1.0)
         below = (bench.u - move).clamp(0.0, 1.0)
-        if probe.group.size <= MAX_SINGLE_PROBES:
+        is_single = probe.group.size <= MAX_SINGLE_PROBES
+        if is_single:
             # less than two steps if a bound of the range has cut one off
             width = float((above - below) @ probe.direction)
     with torch.no_grad():
@@ -490,9 +502,9 @@ def measure_derivatives(
         )
         stage(f"gradients for {control}", n_tries)
         for members in probe_sets.values():
-            yield from _try_estimators(
-                bench, members, references, list_tries(members[0].group), repeats
-            )
+            # the groups of a set have the same estimators: any of them stands for all
+            tries = list_tries(members[0].group)
+            yield from _try_estimators(bench, members, references, tries, repeats)
 
 
 def _load_reference(
@@ -533,7 +545,7 @@ def _try_estimators(
         references: references by the names of all the control's probes.
         tries: estimators, each with a factor on the planned step. Those with the factor
             1 come first, for all probes; others are for probes that were not `ok`.
-        repeats: number of gradients with the factor 1, and with another one.
+        repeats: number of gradients with the factor 1, and with any other factor.
     """
     ok_names: set[str] = set()
     all_references = list(references.values())
@@ -545,7 +557,7 @@ def _try_estimators(
         else:
             tried_probes = [probe for probe in probes if probe.name not in ok_names]
             count = other_repeats
-        if not tried_probes:
+        if not tried_probes:  # all are ok, and only other factors follow
             break
         probe_names = ",".join(probe.name for probe in tried_probes)
         stored = bench.store(

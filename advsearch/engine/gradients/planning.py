@@ -15,6 +15,7 @@ import math
 import statistics
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -67,7 +68,7 @@ def rate_cosine(cosine: float, agreement: float) -> GradientStatus:
     `agreement`, the smallest cosine of two converged gradients, is below
     `MIN_AGREEMENT`, or if both it and the cosine are below the goal.
     """
-    if not agreement >= MIN_AGREEMENT:
+    if not agreement >= MIN_AGREEMENT:  # also if it is NaN
         return "reference unusable"
     if cosine >= GOAL_COSINE:
         return "ok"
@@ -184,6 +185,7 @@ def _score_estimators(
     renders stands for the seconds.
     """
     group_names = {group.name for group in groups}
+    # of each estimator
     gradients_of = dict[str, Tensor]()
     seconds_of = dict[str, float]()
     noise_of = dict[str, float]()
@@ -344,8 +346,8 @@ def _measure_cosines(
     converged, agreement = _converged_gradient(bench, plan, label, converged_spp)
     for spp in counts:
         needs_samples = agreement < GOAL_COSINE or spp > CONVERGED_SPP
-        is_first_converged = converged_spp == CONVERGED_SPP
-        if needs_samples and is_first_converged:
+        was_repeated = converged_spp != CONVERGED_SPP
+        if needs_samples and not was_repeated:
             converged_spp = CONVERGED_SPP_FACTOR * CONVERGED_SPP
             converged, agreement = _converged_gradient(
                 bench, plan, label, converged_spp
@@ -398,9 +400,10 @@ def _cosine(gradient_a: Tensor, gradient_b: Tensor) -> float:
 def choose_steps(
     plan: GradientPlan, table: Sequence[Measured]
 ) -> tuple[GradientPlan, int | None]:
-    """Return the plan with each control's step chosen from measured cosines.
+    """Return the plan with each control's step of differences chosen from cosines with
+    the converged gradient, as `measure_cosines` measures them.
 
-    Of the settings (width and sample count) that reach the goal, the one with the
+    Of the settings (step and sample count) that reach `GOAL_COSINE`, the one with the
     fewest samples wins, since all take as many renders; of equal ones, that with the
     greatest cosine. If none reaches it, the one with the greatest cosine wins, and the
     reason of the group says so.
@@ -410,6 +413,7 @@ def choose_steps(
         was measured.
     """
     sample_counts = []
+    # each row with its cosine, where that is a number
     measured = [
         (row, row.cosine)
         for row in table
@@ -423,15 +427,24 @@ def choose_steps(
             f"cosine {cosine:.2f} with the converged gradient at {best.spp} samples "
             f"and {best.factor:g} x the step{_describe_shortfall(best)}"
         )
-        scaled_groups = plan.scale_steps(best.factor).groups
-        groups = tuple(
-            replace(group, step=scaled.step, reason=f"{group.reason}; {remark}")
-            if group.control == control
-            else group
-            for group, scaled in zip(plan.groups, scaled_groups, strict=True)
-        )
-        plan = replace(plan, groups=groups)
+        plan = _scale_steps_of_control(plan, control, best.factor, remark)
     return plan, max(sample_counts) if sample_counts else None
+
+
+def _scale_steps_of_control(
+    plan: GradientPlan, control: str, factor: float, remark: str
+) -> GradientPlan:
+    """Return the plan with the steps of one control multiplied by a factor.
+
+    `remark` is added to the reason of each of its groups.
+    """
+    groups = []
+    for group, scaled in zip(plan.groups, plan.scale_steps(factor).groups, strict=True):
+        if group.control == control:
+            reason = f"{group.reason}; {remark}"
+            group = replace(group, step=scaled.step, reason=reason)
+        groups.append(group)
+    return replace(plan, groups=tuple(groups))
 
 
 def _choose_setting(
@@ -439,12 +452,18 @@ def _choose_setting(
 ) -> tuple[Measured, float]:
     """Return the cheapest setting that reaches the goal, or the one nearest to it.
 
-    Rows come with their cosines, which are numbers.
+    Settings are rows, each with its cosine, which is not NaN. Of equally cheap ones the
+    one with the greatest cosine is returned.
     """
+
+    def get_cost(row_with_cosine: tuple[Measured, float]) -> tuple[int, float]:
+        row, cosine = row_with_cosine
+        return row.spp, -cosine
+
     good_rows = [(row, cosine) for row, cosine in rows if row.status == "ok"]
     if good_rows:
-        return min(good_rows, key=lambda pair: (pair[0].spp, -pair[1]))
-    return max(rows, key=lambda pair: pair[1])
+        return min(good_rows, key=get_cost)
+    return max(rows, key=itemgetter(1))  # the greatest cosine
 
 
 def _describe_shortfall(row: Measured) -> str:
@@ -472,10 +491,11 @@ def measure_path_length(
     bound: float = MAX_CHANGE,
     tick: Callable[[], None] = lambda: None,
 ) -> PathLength:
-    """Measure the shortest light paths whose images agree with those of full length.
+    """Measure how short light paths may be for images to agree with those of full
+    length.
 
-    All images have the same noise. Path lengths are tried from the full one downwards,
-    to the first whose image differs by more than the bound.
+    Images of all lengths have the same noise. Lengths are tried from the full one
+    downwards, to the first whose image differs by more than the bound.
 
     Args:
         renderer: renders the images.
@@ -491,6 +511,7 @@ def measure_path_length(
     noise_seeds = [seeds.stream(seed, "half", half) for half in range(2)]
 
     def render_twice(u: Tensor, depth: int) -> list[_Rendering]:
+        """Render u (d,) with both seeds."""
         renderings = []
         for noise_seed in noise_seeds:
             renderings.append(_render_with_depth(renderer, u, noise_seed, spp, depth))
@@ -569,7 +590,7 @@ def _explain_depth(cuts: Sequence[PathCut], depth: int, full_depth: int) -> str:
     """
     texts = []
     for cut in cuts:
-        if cut.depth == depth:
+        if cut.depth == depth:  # none, if all segments are needed
             texts.append(
                 f"paths of {depth} segments leave out {cut.light:.2%} of the light, "
                 "which moves the picture by "
@@ -601,9 +622,10 @@ def count_bounce_images(problem: Problem) -> int:
 def measure_problem_bounces(
     problem: Problem, seed: int, tick: Callable[[], None] = lambda: None
 ) -> PathLength:
-    """Measure the bounces of light that a problem's search needs.
+    """Measure how many bounces of light the images of a problem's search need.
 
-    It is measured on the clean configuration and random ones of its domain.
+    This is measured on the clean configuration and `N_RANDOM_CONFIGURATIONS` random
+    ones of its domain. `tick` is called after each image.
     """
     full_configurations = [problem.add_conditions(problem.domain.start)]
     for index in range(N_RANDOM_CONFIGURATIONS):

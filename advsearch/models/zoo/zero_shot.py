@@ -47,22 +47,18 @@ def make_zero_shot_source(loaded: LoadedNetwork) -> models.Source:
     """
     check_takes_pictures(loaded.network, loaded.spec)
     name = loaded.name
-    names = loaded.purpose.require_names(
-        loaded.name, "compares a picture with texts", "classification"
-    )
+    names = _require_several_names(loaded)
     prompts = models.get_patterns(loaded.purpose.prompts)
-    if len(names) < 2:
-        raise InputError(
-            f"labels: expected two names at least, of which model {name} "
-            f"chooses one, got {names[0]!r}"
-        )
     tokenizer = loaded.load_part("AutoTokenizer")
     words = get_spoken_names(names)
+    # one text for each name, to check scores and to find names with equal texts: the
+    # first prompt is enough for both
     texts = [prompts[0].replace("{}", word) for word in words]
     with (
         models.translate_errors(f"model {name}: cannot embed the names of `labels`"),
         torch.no_grad(),
     ):
+        # a copy, so that the loaded network itself stays in its mode
         network: Any = models.copy_sharing_weights(loaded.network).eval()
         embeddings = embed_words(network, tokenizer, words, prompts)
         head = _make_head(network, embeddings)
@@ -78,6 +74,23 @@ def make_zero_shot_source(loaded: LoadedNetwork) -> models.Source:
             "margins are differences of logits"
         )
     return source
+
+
+def _require_several_names(loaded: LoadedNetwork) -> tuple[str, ...]:
+    """Return the names that the user states for a network to choose from.
+
+    Raises:
+        InputError: fewer than two.
+    """
+    names = loaded.purpose.require_names(
+        loaded.name, "compares a picture with texts", "classification"
+    )
+    if len(names) < 2:
+        raise InputError(
+            f"labels: expected two names at least, of which model {loaded.name} "
+            f"chooses one, got {names[0]!r}"
+        )
+    return names
 
 
 def _make_head(network: Any, embeddings: Tensor) -> nn.Linear:
