@@ -80,7 +80,7 @@ class BodyControl(Control):
             return clips[0] if clips and plays_time else None
         index = -1  # of no animation
         # a number may be given as text
-        if Parameter.is_number(requested) or str(requested).isdigit():
+        if Parameter.is_number(requested) or str(requested).isdecimal():
             index = int(requested)
         if requested not in clips and not 0 <= index < len(clips):
             raise errors.UnknownNameError(

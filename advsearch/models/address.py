@@ -713,7 +713,7 @@ class AddressModel(models.RemoteNetwork):
         with error:
             reason = self._explain_status(error)
         retry_after = error.headers.get("Retry-After", "")
-        seconds = float(retry_after) if retry_after.isdigit() else 0.0
+        seconds = float(retry_after) if retry_after.isdecimal() else 0.0
         return _Failure(reason, status in RETRY_STATUSES, seconds)
 
     def _explain_connection_error(self, error: Exception, *, first: bool) -> _Failure:

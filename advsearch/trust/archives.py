@@ -305,7 +305,7 @@ def _hides_character(escape: str) -> bool:
         escape: what stands behind the backslash: octal digits, as torch writes them for
             bytes of other languages; or the beginning of another escape, such as x1b.
     """
-    if not escape.isdigit():
+    if not escape.isdecimal():
         return True
     code = int(escape, 8)
     is_ascii = code < 128

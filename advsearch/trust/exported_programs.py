@@ -110,7 +110,7 @@ def _check(node: ast.expr, depth: int, power: int) -> None:
             _check_number(number)
         case ast.Name(id=name):
             # symbols are numbered by torch: s0, u12
-            is_numbered_symbol = is_symbol(name) and name[-1].isdigit()
+            is_numbered_symbol = is_symbol(name) and name[-1].isdecimal()
             if name not in NAMES and not is_numbered_symbol:
                 raise ValueError(f"the name {name[:40]!r}")
         case ast.Call(func=ast.Name(id="Symbol")):

@@ -243,7 +243,7 @@ def _make_lock_error(folder: Path, error: OSError, pid: str) -> Exception:
         pid: the process number in the lock, perhaps damaged.
     """
     if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
-        owner = f"process {pid}" if pid.isdigit() else "another process"
+        owner = f"process {pid}" if pid.isdecimal() else "another process"
         return InputError(
             f"{folder}: {owner} is working on this run; wait for it or choose "
             "another name with `run`"

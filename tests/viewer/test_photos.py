@@ -121,7 +121,7 @@ def test_what_is_no_photograph_is_refused(data: bytes, text: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["..", "../run", "3/../../run.yaml", "%2e%2e", "99", "-1", "difference", "\0", "3\n", ""]
+    "name", ["..", "../run", "3/../../run.yaml", "%2e%2e", "99", "-1", "difference", "\0", "3\n", "", "²"]
 )
 def test_a_rendering_is_found_by_its_own_name_only(run: Path, name: str) -> None:
     with pytest.raises(InputError):

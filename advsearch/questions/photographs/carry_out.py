@@ -417,7 +417,7 @@ class _PhotoEvaluator:
         Raises:
             InputError: the results have no row of a sweep's rendering.
         """
-        is_of_sweep = rendering.isdigit()
+        is_of_sweep = rendering.isdecimal()
         if is_of_sweep:
             # Each image has a row for each model.
             step = int(rendering) * self.n_models + self.index
@@ -546,7 +546,7 @@ def _find_attack_truth(
     # A trial has the conditions of its seed, others those that the scene comes with.
     _, _, trial_number = (rendering or "").rpartition("verification-")
     seed = None
-    if trial_number.isdigit():
+    if trial_number.isdecimal():
         seed = seeds.stream(problem.seed, "verification", int(trial_number))
     configuration = problem.add_conditions(u, seed)
     facts = problem.make_facts(

@@ -99,7 +99,7 @@ def find_rendering(run: Path, name: str) -> Path:
     """
     file = None
     if _NAME.fullmatch(name):
-        is_of_sweep = name.isdigit()
+        is_of_sweep = name.isdecimal()
         if is_of_sweep:
             file = markup.find_thumbnail(run, int(name))
         else:
