@@ -181,6 +181,7 @@ def _group_annotations(
     annotations_of_image = defaultdict[Any, list[Any]](list)
     for annotation in coco["annotations"]:
         is_known = annotation["category_id"] in label_of_category
+        # The box of a crowd is not that of a single thing.
         if is_known and not annotation.get("iscrowd"):
             annotations_of_image[annotation["image_id"]].append(annotation)
     return annotations_of_image

@@ -268,13 +268,14 @@ def _make_rendered_lessons(
 def _sample_lesson_configurations(
     problem: Problem, seed: int, n_tries: int | None
 ) -> list[Tensor]:
-    """Sample the configurations (d,) of a lesson, that of the plain image first.
+    """Sample the configurations (d,) of a lesson, the one with the least change first.
 
     Args:
         problem: problem of the scene.
         seed: seed of the samples.
-        n_tries: number of further configurations after the start. None for two
-            configurations only: a random control changed by itself, and all of them.
+        n_tries: number of random configurations after that of the clean scene. None
+            for two configurations only, both changed: one random control by itself,
+            and all controls.
     """
     domain = problem.domain
     generator = torch.Generator().manual_seed(seed)

@@ -414,7 +414,8 @@ class Rounds:
             if self.is_allowed(score.clean):
                 allowed_scores[interpolation] = score
             robust = [allowed_score.robust for allowed_score in allowed_scores.values()]
-            if robust and robust[-1] < max(robust):
+            has_fallen = bool(robust) and robust[-1] < max(robust)
+            if has_fallen:
                 break
         if allowed_scores:
             best = max(allowed_scores, key=lambda key: allowed_scores[key].robust)

@@ -276,12 +276,13 @@ def apply_sensor(
 def blender_condition(problem: Problem, spp: int) -> ReplayCondition:
     """Return the condition that renders with Cycles, available or not."""
     renderer = problem.renderer
+    description, _ = renderer.scene.definition
     condition = ReplayCondition(
         "blender", "Cycles, Blender's renderer", lambda: problem, spp
     )
     try:
         cycles = Cycles(
-            renderer.scene.definition[0],
+            description,
             renderer.formation.resolution,
             max_depth=renderer.scene.max_depth,
             denoise=renderer.formation.denoiser != "none",

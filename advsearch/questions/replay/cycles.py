@@ -265,6 +265,7 @@ class Cycles:
         if scene.environment is not None:
             radiance = np.asarray(scene.environment.radiance, np.float32)
         if "environment.padded" in values:
+            # An environment that is searched has one more column on both sides.
             radiance = values["environment.padded"][:, 1:-1].numpy()
 
         blender_settings = self._make_settings(

@@ -371,7 +371,8 @@ def search_scene(
     def margin(image: Tensor) -> Tensor:
         return LOGIT_SCALE * (loss(image) - loss_at_start) - 1.0
 
-    # counted in renders, of which a gradient takes several
+    # Steps count renders: each evaluation takes the image and those of its gradient.
+    # One more is left for an image without a gradient.
     steps = evaluations * (1 + gradient_cost) + 1
     return run_search(
         renderer, margin, steps, spp=spp, start=start, candidates=1, repeats=1

@@ -567,8 +567,9 @@ def _add_test_case(
         output = ElementTree.SubElement(case, "system-out")
         output.text = _escape_xml(f"{claim.statement}\n{claim.reason}")
         return
+    # "error" of a claim without a verdict
     tag = "failure" if claim.answer == FAILED else "error"
-    if claim.accepted:
+    if claim.accepted:  # as it was expected to be
         tag = "skipped"
     message = _escape_xml(f"{claim.answer}: {claim.reason}")
     outcome = ElementTree.SubElement(case, tag, {"message": message})

@@ -30,6 +30,7 @@ MAX_VIEWS = 100_000  # objects in photographs of one run
 MAX_IMAGE_DIGITS = 12  # of an image's number in BOP's form
 MAX_OBJECT_NUMBER = 999_999  # in BOP's form: file names have six digits
 MAX_TEXT = 200  # letters of a frame, label or condition; the rest is cut
+MAX_NUMBER = 1e9  # of a pose or a camera, in any unit
 MAX_ROTATION_ERROR = 0.02  # of an entry of R R^T against the identity
 PINHOLE_KIND = "brown-conrady"  # of camera models, with distortion 0
 MAX_SKEW = 1e-6  # of a camera's focal length; a larger one is refused
@@ -452,18 +453,29 @@ def _read_row_camera(
 
 
 def _to_numbers(value: Any, where: str, *counts: int) -> Float64Array:
-    """Return finite numbers of a list, or of a text with blanks between them."""
+    """Return finite numbers of a list, or of a text with blanks between them.
+
+    Args:
+        value: what a file has, of any type.
+        where: place in the file, for messages.
+        *counts: how many numbers there may be.
+
+    Raises:
+        FileFormatError: it is something else.
+    """
     words: Sequence[Any] = value.split() if isinstance(value, str) else value
     expected = " or ".join(map(str, counts))
     try:
-        if len(words) not in counts or any(isinstance(word, bool) for word in words):
+        # `float` takes true for 1.
+        has_booleans = any(isinstance(word, bool) for word in words)
+        if len(words) not in counts or has_booleans:
             raise ValueError
         numbers = np.array([float(word) for word in words], np.float64)
     except (TypeError, ValueError):
         raise errors.FileFormatError(
             f"{where}: expected {expected} numbers, got {str(value)[:60]}"
         ) from None
-    if not np.isfinite(numbers).all() or np.abs(numbers).max() > 1e9:
+    if not np.isfinite(numbers).all() or np.abs(numbers).max() > MAX_NUMBER:
         raise errors.FileFormatError(f"{where}: expected finite numbers")
     return numbers
 

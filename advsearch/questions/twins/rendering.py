@@ -216,7 +216,10 @@ class LayerRenderer:
         inputs = renderer.scene.assembly(make_camera_inputs(item, self._asset, window))
         seed = seeds.stream(self._seed, "layer", number)
         with torch.no_grad():
-            rendered = renderer.render_radiance(inputs, seed, self._spp, True)
+            # with an alpha channel, since the environment is hidden
+            rendered = renderer.render_radiance(
+                inputs, seed, self._spp, hide_environment=True
+            )
             surfaces = renderer.scene.find_surfaces(inputs)
             size = (window.height, window.width)
             rendered = resize(rendered, size)
@@ -277,7 +280,9 @@ class SurroundedRenderer:
         inputs = renderer.scene.assembly(make_camera_inputs(item, self._asset, window))
         seed = seeds.stream(self._seed, "surrounded", number)
         with torch.no_grad():
-            radiance = renderer.render_radiance(inputs, seed, self._spp, False)
+            radiance = renderer.render_radiance(
+                inputs, seed, self._spp, hide_environment=False
+            )
             image: Tensor = renderer.formation.display(radiance)
         return image
 

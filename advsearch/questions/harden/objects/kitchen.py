@@ -399,6 +399,7 @@ def _pan_handle(
     scale = np.stack(
         [max_thickness * relative_thickness, max_width * relative_width], axis=1
     )
+    # Sections reach from -1 to 1; `scale` makes them as wide as the handle.
     if sampler.chance(0.5, canonical=True):
         section = shapes.ellipse(1.0, 1.0, count=20)
     else:

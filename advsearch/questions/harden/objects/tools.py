@@ -273,6 +273,7 @@ def _hammer_handle(
     scale[0] *= 0.9  # a bevel at the head
     top = half_head * 1.18  # x of the end that sticks out of the head
     path = np.stack([top - (length + top) * t, 0 * t, 0 * t], axis=1)
+    # Sections reach from -1 to 1; `scale` makes them as wide as the handle.
     if sampler.chance(0.6, canonical=True):
         section = shapes.ellipse(1.0, 1.0, count=24)
     else:
