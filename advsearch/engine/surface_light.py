@@ -119,8 +119,9 @@ class SurfaceLight(PredictedSearch):
     # coordinates of the conditions of the bank
     _bank_conditions: list[Tensor] = field(default_factory=list)
     _n_lights: int = 0
-    # index of the evaluation before which predictions are compared again
-    _next_comparison: int = COMPARISON_INTERVAL
+    # index of the evaluation before which predictions are compared again; 0 at first,
+    # which stands for `COMPARISON_INTERVAL`
+    _next_comparison: int = 0
     # what cameras see, by index of the conditions and begin of the batch
     _stored_views: dict[tuple[int, int], list[LitCameraView]] = field(
         default_factory=dict
@@ -471,11 +472,9 @@ class SurfaceLight(PredictedSearch):
         """
         is_of_search = query.kind == "search" and query.phase == "search"
         predictions_failed = self.tracing_reason is not None
-        if (
-            not is_of_search
-            or predictions_failed
-            or query.index < self._next_comparison
-        ):
+        next_comparison = self._next_comparison or COMPARISON_INTERVAL
+        is_due = query.index >= next_comparison
+        if not is_of_search or predictions_failed or not is_due:
             return
         was_accurate = self.deviations[-1].is_accepted
         is_accurate = self._compare(query.u, query.index).is_accepted
