@@ -132,17 +132,17 @@ def find_crop_refusal(problem: Problem) -> Refusal | None:
         return Refusal("the camera has a lens of its own")
     if renderer.formation.denoiser != "oidn":
         return NOISE
-    return _find_searched_refusal(problem)
+    return find_searched_refusal(problem)
 
 
-def _find_searched_refusal(problem: Problem) -> Refusal | None:
+def find_searched_refusal(problem: Problem) -> Refusal | None:
     """Return why what is searched shows in more than a part of the image.
 
     None if it shows in a part only: it changes the surface of a mesh, which stays where
     it is.
     """
     light_inputs = find_light_inputs(problem.renderer)
-    names = _find_searched_inputs(problem)
+    names = find_searched_inputs(problem)
     if not names:
         return Refusal("nothing that is searched needs a render")
     shapes = problem.renderer.surfaces(problem.renderer.start).names
@@ -157,7 +157,7 @@ def _find_searched_refusal(problem: Problem) -> Refusal | None:
     return None
 
 
-def _find_searched_inputs(problem: Problem) -> frozenset[str]:
+def find_searched_inputs(problem: Problem) -> frozenset[str]:
     """Return the scene inputs that are searched."""
     names = [control.name for control in problem.searched_space.controls]
     return find_changed_inputs(problem.renderer, names) - IMAGE_INPUTS
@@ -167,7 +167,7 @@ def _find_box(problem: Problem) -> Window | None:
     """Return the box of all that is searched, at the start; None if it is not seen."""
     surfaces = problem.renderer.surfaces(problem.domain.start)
     mask = torch.zeros(problem.renderer.formation.resolution, dtype=torch.bool)
-    for name in _find_searched_inputs(problem):
+    for name in find_searched_inputs(problem):
         mask |= surfaces.visible_mask(name.partition(".")[0])
     return Window.from_mask(mask)
 
