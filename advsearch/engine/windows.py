@@ -177,8 +177,13 @@ def render_full(problem: Problem, u: Tensor) -> FullImage:
 
     It has the same noise for each u.
     """
-    with torch.no_grad(), problem.renderer.scene.limit_depth(problem.search_depth):
-        halves, radiance = problem.renderer.trace_halves(
+    renderer = problem.renderer
+    with (
+        torch.no_grad(),
+        renderer.scene.limit_depth(problem.search_depth),
+        renderer.share_paths(problem.shared_paths),
+    ):
+        halves, radiance = renderer.trace_halves(
             _compute_inputs(problem, u), seeds.stream(problem.seed, "crop"), PROBE_SPP
         )
     return FullImage(u.detach().clone(), halves, radiance)

@@ -686,6 +686,7 @@ class MitsubaScene:
                 spp,
                 projector,
                 self._find_plane(),
+                self.roulette_depth,
             )
             size = self.parameters[key].shape[:2]
             surface = None

@@ -33,6 +33,7 @@ from advsearch.scene.mitsuba_backend.variant import dr, mi
 
 # how much the base color is changed for the derivative of a BSDF with respect to it
 COLOR_STEP = 0.0625
+MAX_SURVIVAL = 0.95  # probability to survive Russian roulette, as in Mitsuba
 ROUNDING_ERROR = 1e-4  # relative change of a BSDF that counts as no change
 
 
@@ -94,6 +95,7 @@ def collect_paths(
     spp: int,
     projector: Any,
     unseen: Any = None,
+    roulette_depth: int | None = None,
 ) -> Paths:
     """Trace one pass of light paths and collect their vertices.
 
@@ -112,11 +114,15 @@ def collect_paths(
         spp: samples per pixel.
         projector: Mitsuba's projector whose image `key` is; None for a base color.
         unseen: Mitsuba's shape that camera rays see nothing of, nor behind it.
+        roulette_depth: bounces from which on Russian roulette may end a path; None
+            where it never does.
     """
     ray, weight = _sample_camera_rays(scene.sensors()[0], noise, size, spp)
     if unseen is not None:
         weight = dr.select(_find_hits(scene, ray, unseen), 0.0, weight)
-    first_hit, emitted, bounces = _trace_paths(scene, ray, weight, noise, depth)
+    first_hit, emitted, bounces = _trace_paths(
+        scene, ray, weight, noise, depth, roulette_depth or depth
+    )
 
     # The BSDFs are evaluated once more with the base color larger by `COLOR_STEP`:
     # their differences are the derivatives. For a projector, its light is evaluated
@@ -191,7 +197,7 @@ def _accumulate_radiance(
     for bounce, emitted_next, (slope_em, slope_bsdf) in zip(
         bounces[::-1], emitted[:0:-1], slopes[::-1], strict=True
     ):
-        incoming = emitted_next + L
+        incoming = (emitted_next + L) * bounce.next_weight
         weight = bounce.throughput * (
             slope_em * bounce.em_weight + slope_bsdf * incoming
         )
@@ -278,7 +284,7 @@ def _fetch_vertices(uv: Any, weight: Any, sharp: Any, mask: Any, spp: int) -> Ve
     )
 
 
-@dataclass(frozen=True)
+@dataclass
 class Bounce:
     """One vertex of all paths."""
 
@@ -295,6 +301,7 @@ class Bounce:
     active_bsdf: Any  # active bsdf in which lanes it has a density
     # the same for the path's direction over its density: the throughput of the vertex
     bsdf_weight: Any
+    next_weight: Any = 1.0  # of what arrives from the next vertex, by Russian roulette
 
     def compute_slopes(self) -> tuple[Any, Any]:
         """Return the derivatives of both BSDF values by the base color.
@@ -367,12 +374,13 @@ def _has_cut_outs(scene: Any) -> bool:
 
 
 def _trace_paths(
-    scene: Any, ray: Any, weight: Any, noise: Any, depth: int
+    scene: Any, ray: Any, weight: Any, noise: Any, depth: int, roulette_depth: int
 ) -> tuple[list[Any], list[Any], list[Bounce]]:
     """Trace paths from camera rays; rays of weight 0 see nothing.
 
     Emission that the vertex before has sampled too counts by its MIS weight. All paths
-    have `depth` segments at most; there is no Russian roulette.
+    have `depth` segments at most. From `roulette_depth` bounces on a path goes on with
+    the probability of its throughput, `MAX_SURVIVAL` at most.
 
     Returns:
         What the camera sees, channel by channel in the order of the images of `Paths`
@@ -431,6 +439,11 @@ def _trace_paths(
         is_delta = mi.has_flag(sampled_type, mi.BSDFFlags.Delta)
         throughput = throughput * bounce.bsdf_weight
         active &= active_next
+        if roulette_depth <= segment + 1 < depth - 1:
+            survival = dr.minimum(dr.max(throughput), MAX_SURVIVAL)
+            active &= noise.next_1d(active) < survival
+            bounce.next_weight = dr.select(active, dr.rcp(survival), 0.0)
+            throughput = throughput * bounce.next_weight
         sharp = sharp & is_delta
         prev_si = si
         prev_pdf = bounce.bsdf_sample.pdf
