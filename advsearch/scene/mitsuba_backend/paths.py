@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 from advsearch.scene.mitsuba_backend.variant import dr, mi
 
@@ -45,7 +45,7 @@ class PathSamples:
         is_stratified: as the attribute.
     """
 
-    DRJIT_STRUCT = {
+    DRJIT_STRUCT: ClassVar[dict[str, Any]] = {
         "rng": mi.PCG32,
         "permutation": mi.UInt32,
         "index": mi.UInt32,
@@ -132,6 +132,147 @@ def sample_rays(sensor: Any, numbers: PathSamples, sample: Any) -> Any:
     return sensor.sample_ray(0.0, 0.0, position, mi.Point2f(0.5))[0]
 
 
+class LightPath:
+    """Light paths on their way from the camera, with what they have collected.
+
+    Attributes:
+        ray: the next segment.
+        throughput: throughput up to there.
+        eta: relative index of refraction there.
+        depth: number of surfaces that were met.
+        vertex: the last vertex.
+        pdf: density of the direction in which the path left it.
+        is_delta: whether no other direction was possible.
+        active: whether the path goes on.
+        radiance: radiance since the first changed surface, or since the camera.
+        radiance_before: radiance up to that surface.
+        has_met: whether the path has met a changed surface.
+        has_met_first: whether that was the first hit.
+        albedo: reflectance of the first hit.
+        normal: shading normal of the first hit.
+    """
+
+    DRJIT_STRUCT: ClassVar[dict[str, Any]] = {
+        "ray": mi.Ray3f,
+        "throughput": mi.Spectrum,
+        "eta": mi.Float,
+        "depth": mi.UInt32,
+        "vertex": mi.Interaction3f,
+        "pdf": mi.Float,
+        "is_delta": mi.Bool,
+        "active": mi.Bool,
+        "radiance": mi.Spectrum,
+        "radiance_before": mi.Spectrum,
+        "has_met": mi.Bool,
+        "has_met_first": mi.Bool,
+        "albedo": mi.Color3f,
+        "normal": mi.Normal3f,
+    }
+
+    def __init__(self, ray: Any = None) -> None:
+        """Start at the camera; Dr.Jit calls it without arguments."""
+        if ray is None:
+            return
+        self.ray = mi.Ray3f(ray)
+        self.throughput = mi.Spectrum(1.0)
+        self.eta = mi.Float(1.0)
+        self.depth = mi.UInt32(0)
+        self.vertex = dr.zeros(mi.Interaction3f)
+        self.pdf = mi.Float(1.0)
+        self.is_delta = mi.Bool(True)
+        self.active = mi.Bool(True)
+        self.radiance = mi.Spectrum(0.0)
+        self.radiance_before = mi.Spectrum(0.0)
+        self.has_met = mi.Bool(False)
+        self.has_met_first = mi.Bool(False)
+        self.albedo = mi.Color3f(0.0)
+        self.normal = mi.Normal3f(0.0)
+
+    def add_emission(self, scene: Any, si: Any) -> None:
+        """Add what is emitted where the path arrives, by its weight."""
+        ds = mi.DirectionSample3f(scene, si, self.vertex)
+        emitter_pdf = scene.pdf_emitter_direction(self.vertex, ds, ~self.is_delta)
+        emitted = ds.emitter.eval(si, self.pdf > 0.0)
+        emitted *= _compute_weight(self.pdf, emitter_pdf)
+        self.radiance = dr.fma(self.throughput, emitted, self.radiance)
+
+    def meet(self, si: Any, bsdf: Any, changed: Sequence[Any]) -> None:
+        """Note whether a surface is of one of the changed shapes, and its guides.
+
+        What guides the denoiser is noted of the first hit.
+        """
+        is_changed = si.is_valid() & _is_among(si.shape, changed)
+        is_new = is_changed & ~self.has_met
+        self.radiance_before = dr.select(is_new, self.radiance, self.radiance_before)
+        self.radiance = dr.select(is_new, 0.0, self.radiance)
+        self.has_met |= is_changed
+
+        is_first = (self.depth == 0) & si.is_valid()
+        albedo = bsdf.eval_diffuse_reflectance(si, is_first)
+        self.albedo = dr.select(is_first, albedo, self.albedo)
+        self.normal = dr.select(is_first, si.sh_frame.n, self.normal)
+        self.has_met_first |= is_first & is_changed
+
+    def reflect(
+        self, scene: Any, si: Any, bsdf: Any, numbers: PathSamples, max_depth: int
+    ) -> None:
+        """Add the light of an emitter that a surface reflects, and leave the surface.
+
+        The path ends there if it has `max_depth` segments, or has left the scene.
+        """
+        self.active = (self.depth + 1 < max_depth) & si.is_valid()
+        is_lit = self.active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        ds, light = scene.sample_emitter_direction(si, numbers.next_2d(), True, is_lit)
+        is_lit &= ds.pdf != 0.0
+        choice = numbers.next_1d()
+        value, pdf, sample, weight = bsdf.eval_pdf_sample(
+            mi.BSDFContext(),
+            si,
+            si.to_local(ds.d),
+            choice,
+            numbers.next_2d(),
+            self.active,
+        )
+        light *= dr.select(ds.delta, 1.0, _compute_weight(ds.pdf, pdf))
+        radiance = dr.fma(self.throughput, value * light, self.radiance)
+        self.radiance = dr.select(is_lit, radiance, self.radiance)
+
+        self.ray = si.spawn_ray(si.to_world(sample.wo))
+        self.throughput *= weight
+        self.eta *= sample.eta
+        self.vertex = mi.Interaction3f(si)
+        self.pdf = sample.pdf
+        self.is_delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+        self.depth = dr.select(si.is_valid(), self.depth + 1, self.depth)
+
+    def survive(self, numbers: PathSamples, roulette_depth: int) -> None:
+        """End paths by Russian roulette from a number of bounces on."""
+        largest = dr.max(self.throughput)
+        survival = dr.minimum(largest * dr.square(self.eta), MAX_SURVIVAL)
+        has_roulette = self.depth >= roulette_depth
+        survives = ~has_roulette | (numbers.next_1d() < survival)
+        self.throughput = dr.select(
+            has_roulette, self.throughput * dr.rcp(survival), self.throughput
+        )
+        self.active &= survives & (largest != 0.0)
+
+    def list_channels(self) -> tuple[list[Any], list[Any]]:
+        """Return the channels without and with a changed surface, nine of each.
+
+        They are radiance, albedo and normal.
+        """
+        guides = [*self.albedo, *self.normal]
+        unchanged = [
+            *dr.select(self.has_met, self.radiance_before, self.radiance),
+            *(dr.select(self.has_met_first, 0.0, channel) for channel in guides),
+        ]
+        changing = [
+            *dr.select(self.has_met, self.radiance, 0.0),
+            *(dr.select(self.has_met_first, channel, 0.0) for channel in guides),
+        ]
+        return unchanged, changing
+
+
 @dr.syntax  # type: ignore[untyped-decorator]
 def trace_paths(
     scene: Any,
@@ -156,93 +297,18 @@ def trace_paths(
         and shading normal of the first hit. The same that do. And whether a path has
         met one of them.
     """
-    context = mi.BSDFContext()
-    ray = mi.Ray3f(ray)
-    throughput = mi.Spectrum(1.0)
-    radiance = mi.Spectrum(0.0)
-    before = mi.Spectrum(0.0)  # radiance of the vertices before the first changed one
-    has_met = mi.Bool(False)
-    eta = mi.Float(1.0)
-    depth = mi.UInt32(0)
-    previous = dr.zeros(mi.Interaction3f)
-    previous_pdf = mi.Float(1.0)
-    is_previous_delta = mi.Bool(True)
-    active = mi.Bool(True)
-    albedo = mi.Color3f(0.0)
-    normal = mi.Normal3f(0.0)
-    is_first_changed = mi.Bool(False)
-
-    while dr.hint(active, max_iterations=max_depth, label="Paths of an image"):
-        si = scene.ray_intersect(ray, mi.RayFlags.All, depth == 0)
-
-        # emission of what is hit
-        ds = mi.DirectionSample3f(scene, si, previous)
-        emitter_pdf = scene.pdf_emitter_direction(previous, ds, ~is_previous_delta)
-        weight = _weigh(previous_pdf, emitter_pdf)
-        emitted = ds.emitter.eval(si, previous_pdf > 0.0)
-        radiance = dr.fma(throughput, emitted * weight, radiance)
-
-        is_changed = si.is_valid() & _is_one_of(si.shape, changed)
-        is_first = is_changed & ~has_met
-        before = dr.select(is_first, radiance, before)
-        radiance = dr.select(is_first, 0.0, radiance)
-        has_met |= is_changed
-
-        active_next = (depth + 1 < max_depth) & si.is_valid()
-        bsdf = si.bsdf(ray)
-
-        # what guides the denoiser
-        is_camera_hit = (depth == 0) & si.is_valid()
-        reflectance = bsdf.eval_diffuse_reflectance(si, is_camera_hit)
-        albedo = dr.select(is_camera_hit, reflectance, albedo)
-        normal = dr.select(is_camera_hit, si.sh_frame.n, normal)
-        is_first_changed |= is_camera_hit & is_changed
-        # light of an emitter
-        active_em = active_next & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        ds, emitter_weight = scene.sample_emitter_direction(
-            si, numbers.next_2d(), True, active_em
-        )
-        active_em &= ds.pdf != 0.0
-        direction = si.to_local(ds.d)
-
-        choice = numbers.next_1d()
-        point = numbers.next_2d()
-        bsdf_value, bsdf_pdf, bsdf_sample, bsdf_weight = bsdf.eval_pdf_sample(
-            context, si, direction, choice, point, active_next
-        )
-        weight = dr.select(ds.delta, 1.0, _weigh(ds.pdf, bsdf_pdf))
-        direct = bsdf_value * emitter_weight * weight
-        radiance = dr.select(active_em, dr.fma(throughput, direct, radiance), radiance)
-
-        # the next segment
-        ray = si.spawn_ray(si.to_world(bsdf_sample.wo))
-        throughput *= bsdf_weight
-        eta *= bsdf_sample.eta
-        previous = mi.Interaction3f(si)
-        previous_pdf = bsdf_sample.pdf
-        is_previous_delta = mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
-        depth = dr.select(si.is_valid(), depth + 1, depth)
-
-        largest = dr.max(throughput)
-        survival = dr.minimum(largest * dr.square(eta), MAX_SURVIVAL)
-        has_roulette = depth >= roulette_depth
-        survives = numbers.next_1d() < survival
-        throughput = dr.select(has_roulette, throughput * dr.rcp(survival), throughput)
-        active = active_next & (~has_roulette | survives) & (largest != 0.0)
-
-    guides = [*albedo, *normal]
-    unchanged = [
-        *dr.select(has_met, before, radiance),
-        *(dr.select(is_first_changed, 0.0, channel) for channel in guides),
-    ]
-    changing = [
-        *dr.select(has_met, radiance, 0.0),
-        *(dr.select(is_first_changed, channel, 0.0) for channel in guides),
-    ]
-    return unchanged, changing, has_met
+    path = LightPath(ray)
+    while dr.hint(path.active, max_iterations=max_depth, label="Paths of an image"):
+        si = scene.ray_intersect(path.ray, mi.RayFlags.All, path.depth == 0)
+        bsdf = si.bsdf(path.ray)
+        path.add_emission(scene, si)
+        path.meet(si, bsdf, changed)
+        path.reflect(scene, si, bsdf, numbers, max_depth)
+        path.survive(numbers, roulette_depth)
+    return *path.list_channels(), path.has_met
 
 
-def _is_one_of(shape: Any, changed: Sequence[Any]) -> Any:
+def _is_among(shape: Any, changed: Sequence[Any]) -> Any:
     """Return whether each shape is one of several."""
     result = mi.Bool(False)
     for candidate in changed:
@@ -250,7 +316,7 @@ def _is_one_of(shape: Any, changed: Sequence[Any]) -> Any:
     return result
 
 
-def _weigh(pdf: Any, other_pdf: Any) -> Any:
+def _compute_weight(pdf: Any, other_pdf: Any) -> Any:
     """Return the power heuristic's weight of a sample (Veach 1997, section 9.2)."""
     square = pdf * pdf
     weight = square / dr.fma(other_pdf, other_pdf, square)

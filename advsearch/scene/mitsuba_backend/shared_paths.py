@@ -207,9 +207,7 @@ def _divide_samples(n_pixels: int, spp: int) -> Iterator[Any]:
         yield samples
 
 
-def _add_samples(
-    sums: Float64Array, samples: Any, channels: Any, spp: int
-) -> None:
+def _add_samples(sums: Float64Array, samples: Any, channels: Any, spp: int) -> None:
     """Add values of samples to their pixels.
 
     Args:
