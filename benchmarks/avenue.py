@@ -188,13 +188,11 @@ class AttackCost(NamedTuple):
 
 def _compare_attacks(distance: float, args: argparse.Namespace) -> None:
     """Print what whole attacks at a distance take in each place."""
-    costs = {}
-    for place in PLACES:
-        costs[place] = [
-            _attack_in_process(place, distance, seed, args)
-            for seed in range(args.seeds)
-        ]
-        for seed, cost in enumerate(costs[place]):
+    costs: dict[str, list[AttackCost]] = {place: [] for place in PLACES}
+    for seed in range(args.seeds):
+        for place in PLACES:  # in turn, as other programs may slow the machine
+            cost = _attack_in_process(place, distance, seed, args)
+            costs[place].append(cost)
             print(
                 f"  {distance:.0f} m, {place}, seed {seed}: {cost.seconds:.1f} "
                 f"processor seconds, {cost.memory:.0f} MB, {cost.ending} "

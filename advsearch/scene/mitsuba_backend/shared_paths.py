@@ -44,7 +44,7 @@ class StoredPaths:
     @property
     def n_bytes(self) -> int:
         """Memory that it takes."""
-        return self.sums.nbytes + 4 * sum(map(dr.width, self.samples))
+        return int(self.sums.nbytes + 4 * sum(map(dr.width, self.samples)))
 
 
 class SharedPaths:
@@ -155,7 +155,7 @@ class SharedPaths:
 
         def trace(
             scene: Any, sensor: Any, changed: Any, seed: Any, samples: Any
-        ) -> tuple[Any, Any, Any]:
+        ) -> Any:
             numbers = paths.PathSamples(seed, samples, spp, is_stratified)
             ray = paths.sample_rays(sensor, numbers, samples)
             return paths.trace_paths(
@@ -165,7 +165,7 @@ class SharedPaths:
         changed = [
             shape for shape in self.scene.mitsuba_shapes if shape.id() in self._shapes
         ]
-        key = ("shared paths", spp, depth)
+        key = ("shared paths", *sorted(self._shapes), spp, depth, roulette_depth)
         traced: tuple[Any, Any, Any] = self.scene.run_recorded(
             key, trace, changed, dr.opaque(mi.UInt32, seed), samples
         )
