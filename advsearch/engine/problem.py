@@ -41,6 +41,7 @@ from advsearch.runs.results import GroupDerivative, PlannedGradient
 from advsearch.scene.color import round_to_8_bit
 from advsearch.scene.description import NO_ENVIRONMENT
 from advsearch.scene.gradients import GradientPlan, Group
+from advsearch.scene.mitsuba_backend.shared_paths import SharedPaths
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.lights import find_refusal
 from advsearch.scene.transport.matrix import (
@@ -124,6 +125,8 @@ class Problem:
         aovs: ground truth that is stored of the clean and the adversarial scene
             (`formation.AOVS`).
         metrics: user functions whose values are stored with every image.
+        shared_paths: traces what trials of one seed have in common once; None where
+            each is traced in full.
         domain: the domain of the searched controls.
         conditions: the domain of the conditions; None if there are none.
     """
@@ -142,6 +145,7 @@ class Problem:
     search_depth: int | None = None
     aovs: tuple[str, ...] = ()
     metrics: Metrics = field(default_factory=dict)
+    shared_paths: SharedPaths | None = None
     domain: Domain = field(init=False)
     conditions: Domain | None = field(init=False)
 
@@ -244,7 +248,7 @@ class Problem:
             (H, W, 3) sRGB in [0, 1], rounded to 8 bits.
         """
         full_u = self.add_conditions(u, seed if with_conditions else None)
-        with torch.no_grad():
+        with torch.no_grad(), self.renderer.share_paths(self.shared_paths):
             return round_to_8_bit(self.renderer(full_u, seed=seed, spp=spp))
 
     def judge(self, image: Tensor, full_u: Tensor) -> Judgement:

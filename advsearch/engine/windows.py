@@ -134,10 +134,10 @@ def find_crop_refusal(problem: Problem) -> Refusal | None:
         return Refusal("the camera has a lens of its own")
     if renderer.formation.denoiser != "oidn":
         return NOISE
-    return _find_searched_refusal(problem)
+    return find_searched_refusal(problem)
 
 
-def _find_searched_refusal(problem: Problem) -> Refusal | None:
+def find_searched_refusal(problem: Problem) -> Refusal | None:
     """Return why it is not enough to trace a part of the image, by what is searched.
 
     None if it is enough: what is searched are surfaces of meshes that stay where they
@@ -145,7 +145,7 @@ def _find_searched_refusal(problem: Problem) -> Refusal | None:
     such part either, which is a refusal as well.
     """
     light_inputs = find_light_inputs(problem.renderer)
-    input_names = _find_searched_inputs(problem)  # such as "mug.bsdf.reflectance"
+    input_names = find_searched_inputs(problem)  # such as "mug.bsdf.reflectance"
     if not input_names:
         return Refusal("nothing that is searched needs a render")
     mesh_names = problem.renderer.surfaces(problem.renderer.start).names
@@ -160,7 +160,7 @@ def _find_searched_refusal(problem: Problem) -> Refusal | None:
     return None
 
 
-def _find_searched_inputs(problem: Problem) -> frozenset[str]:
+def find_searched_inputs(problem: Problem) -> frozenset[str]:
     """Return the scene inputs that are searched."""
     names = [control.name for control in problem.searched_space.controls]
     return find_changed_inputs(problem.renderer, names) - IMAGE_INPUTS
@@ -170,7 +170,7 @@ def _find_box(problem: Problem) -> Window | None:
     """Return the box of all that is searched, at the start; None if it is not seen."""
     surfaces = problem.renderer.surfaces(problem.domain.start)
     mask = torch.zeros(problem.renderer.formation.resolution, dtype=torch.bool)
-    for name in _find_searched_inputs(problem):
+    for name in find_searched_inputs(problem):
         mask |= surfaces.visible_mask(name.partition(".")[0])
     return Window.from_mask(mask)
 
@@ -182,9 +182,14 @@ def render_full(problem: Problem, u: Tensor) -> FullImage:
     both, denoised. The two seeds are the same for every u, so that most of the noise
     cancels in the difference of two images.
     """
+    renderer = problem.renderer
     noise_seed = seeds.stream(problem.seed, "crop")
-    with torch.no_grad(), problem.renderer.scene.limit_depth(problem.search_depth):
-        halves, radiance = problem.renderer.trace_halves(
+    with (
+        torch.no_grad(),
+        renderer.scene.limit_depth(problem.search_depth),
+        renderer.share_paths(problem.shared_paths),
+    ):
+        halves, radiance = renderer.trace_halves(
             _compute_inputs(problem, u), noise_seed, PROBE_SPP
         )
     return FullImage(u.detach().clone(), halves, radiance)

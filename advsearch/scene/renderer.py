@@ -15,8 +15,8 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from typing import Any, NamedTuple, Protocol
 
@@ -46,6 +46,7 @@ from advsearch.scene.gradients import (
 from advsearch.scene.image_quality import blur_image
 from advsearch.scene.mitsuba_backend.denoise import denoise_image
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
+from advsearch.scene.mitsuba_backend.shared_paths import SharedPaths
 from advsearch.scene.rig import Mount
 from advsearch.scene.scene_data import cache_per_scene
 from advsearch.scene.window import Window
@@ -119,6 +120,7 @@ class Renderer:
         routes: which scene inputs each group of coordinates reaches, by
             `control.parameter`.
         crop: what is rendered of each image; None for all of it.
+        shared_paths: renders full images instead of the scene; None for none.
         renders: number of primal renders so far, those of differences included.
         gradients: number of adjoint renders so far.
         non_finite: number of pixels and gradient entries that were NaN or infinite and
@@ -156,6 +158,7 @@ class Renderer:
         self._source: Source | None = None
         self._predict: Predict | None = None
         self.crop: Crop | None = None
+        self.shared_paths: SharedPaths | None = None
         self.renders = self.gradients = self.non_finite = 0
         self._left_out: frozenset[str] = frozenset()
         groups = space.groups
@@ -224,6 +227,20 @@ class Renderer:
         other._predict = predict or self._predict
         other.crop = crop or self.crop
         return other
+
+    @contextmanager
+    def share_paths(self, paths: SharedPaths | None) -> Iterator[None]:
+        """Trace what images of one seed have in common once inside the `with`.
+
+        Each image is traced in full with None, or the paths of another scene.
+        """
+        paths_before = self.shared_paths
+        is_of_scene = paths is not None and paths.scene is self.scene
+        self.shared_paths = paths if is_of_scene else None
+        try:
+            yield
+        finally:
+            self.shared_paths = paths_before
 
     @property
     def window(self) -> Window | None:
@@ -872,10 +889,11 @@ class _Radiance(torch.autograd.Function):
             if denoised and renderer.formation.denoiser == "oidn":
                 guide_seed = seeds.stream(renderer.root_seed, "guides", seed)
                 image_seeds["guides"] = guide_seed
+            source: MitsubaScene | SharedPaths = renderer.scene
+            if renderer.shared_paths is not None and ctx.window is None:
+                source = renderer.shared_paths
             with renderer.scene.limit_window(ctx.window):
-                rendered, *guides = renderer.scene.render_images(
-                    inputs, image_seeds, spp
-                )
+                rendered, *guides = source.render_images(inputs, image_seeds, spp)
         rendered = renderer.replace_non_finite(rendered)
         # one image of guides if the result is to be denoised, otherwise none
         for guide in guides:

@@ -41,6 +41,7 @@ from advsearch.engine.loading import Controls, Scene, fit_camera
 from advsearch.engine.naming import AnyModel, list_models, load_models
 from advsearch.engine.problem import Problem
 from advsearch.engine.rendering import make_facts
+from advsearch.engine.shared_paths import find_shared_paths
 from advsearch.engine.transport import CleanMatrix, find_matrix_refusal
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
@@ -445,6 +446,8 @@ def make_problem(parts: AttackParts, *, differentiated: bool = True) -> Problem:
         aovs=parse_aovs(config.aov),
         metrics=parts.metrics,
     )
+    if config.specialise:
+        problem.shared_paths = find_shared_paths(problem)
     _check_objective_inputs(parts, problem)
     problem.steps, problem.n_draws = choose_search_size(config, problem)
     return problem

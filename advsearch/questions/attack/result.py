@@ -348,9 +348,10 @@ class StoredImage:
             seed = seeds.stream(problem.seed, "verification", trial)
             configuration = problem.add_conditions(u, seed)
             spp = findings.spp
-        with torch.no_grad():
-            radiance = problem.renderer.radiance(configuration, seed, spp)
-            display = problem.renderer.formation.display(radiance)
+        renderer = problem.renderer
+        with torch.no_grad(), renderer.share_paths(problem.shared_paths):
+            radiance = renderer.radiance(configuration, seed, spp)
+            display = renderer.formation.display(radiance)
             image = round_to_8_bit(problem.space.apply_to_image(configuration, display))
         return cls(
             full_configuration=configuration,

@@ -417,6 +417,21 @@ class MitsubaScene:
                 images.append(image)
             return images
 
+    @property
+    def mitsuba_shapes(self) -> list[Any]:
+        """Mitsuba's shapes."""
+        return list(self._scene.shapes())
+
+    def run_recorded(self, key: Any, function: Callable[..., Any], *args: Any) -> Any:
+        """Return `function(scene, camera, *args)` of Mitsuba's objects.
+
+        It is recorded at the first call with a key, and replayed later.
+        """
+        if self._freeze:
+            media = population.list_media() if self.is_volumetric else []
+            function = self._recorded.get_or_record(key, function, media)
+        return function(self._scene, self._sensor, *args)
+
     def render_radiance(
         self, inputs: Mapping[str, Tensor], seed: int, spp: int
     ) -> Tensor:
@@ -681,6 +696,7 @@ class MitsubaScene:
                 spp,
                 projector,
                 self._find_plane(),
+                self.roulette_depth,
             )
             # Coordinates are converted to those of a repeating texture, which a
             # principled surface of ours has already.

@@ -34,6 +34,7 @@ from advsearch.scene.mitsuba_backend.variant import dr, mi
 
 # how much the base color is changed for the derivative of a BSDF with respect to it
 COLOR_STEP = 0.0625
+MAX_SURVIVAL = 0.95  # probability to survive Russian roulette, as in Mitsuba
 ROUNDING_ERROR = 1e-4  # relative change of a BSDF that counts as no change
 
 
@@ -95,6 +96,7 @@ def collect_paths(
     spp: int,
     projector: Any,
     unseen: Any = None,
+    roulette_depth: int | None = None,
 ) -> Paths:
     """Trace one pass of light paths and collect their vertices.
 
@@ -113,11 +115,15 @@ def collect_paths(
         spp: samples per pixel.
         projector: Mitsuba's projector whose image `key` is; None for a base color.
         unseen: Mitsuba's shape that camera rays see nothing of, nor behind it.
+        roulette_depth: bounces from which on Russian roulette may end a path; None
+            where it never does.
     """
     ray, weight = _sample_camera_rays(scene.sensors()[0], noise, size, spp)
     if unseen is not None:
         weight = dr.select(_find_hits(scene, ray, unseen), 0.0, weight)
-    first_hit, emitted, bounces = _trace_paths(scene, ray, weight, noise, depth)
+    first_hit, emitted, bounces = _trace_paths(
+        scene, ray, weight, noise, depth, roulette_depth or depth
+    )
 
     if projector is None:
         slopes = _compute_slopes(parameters, key, bounces)
@@ -219,7 +225,7 @@ def _accumulate_radiance(
     for bounce, emitted_next, (slope_em, slope_bsdf) in zip(
         bounces[::-1], emitted[:0:-1], slopes[::-1], strict=True
     ):
-        incoming = emitted_next + L
+        incoming = (emitted_next + L) * bounce.next_weight
         weight = bounce.throughput * (
             slope_em * bounce.em_weight + slope_bsdf * incoming
         )
@@ -306,7 +312,7 @@ def _fetch_vertices(uv: Any, weight: Any, sharp: Any, mask: Any, spp: int) -> Ve
     )
 
 
-@dataclass(frozen=True)
+@dataclass
 class Bounce:
     """One vertex of all paths."""
 
@@ -323,6 +329,7 @@ class Bounce:
     active_bsdf: Any  # in which lanes it has a density
     # the same for the path's direction over its density: the throughput of the vertex
     bsdf_weight: Any
+    next_weight: Any = 1.0  # of what arrives from the next vertex, by Russian roulette
 
     def compute_slopes(self) -> tuple[Any, Any]:
         """Return the derivatives of both BSDF values by the base color.
@@ -395,11 +402,12 @@ def _has_cut_outs(scene: Any) -> bool:
 
 
 def _trace_paths(
-    scene: Any, ray: Any, weight: Any, noise: Any, depth: int
+    scene: Any, ray: Any, weight: Any, noise: Any, depth: int, roulette_depth: int
 ) -> tuple[list[Any], list[Any], list[Bounce]]:
     """Trace paths from camera rays; rays of weight 0 see nothing.
 
-    All paths have `depth` segments at most; there is no Russian roulette.
+    All paths have `depth` segments at most. From `roulette_depth` bounces on a path goes
+    on with the probability of its throughput, `MAX_SURVIVAL` at most.
 
     Returns:
         What the camera sees, channel by channel in the order of the images of `Paths`
@@ -451,6 +459,11 @@ def _trace_paths(
         is_delta = mi.has_flag(sampled_type, mi.BSDFFlags.Delta)
         throughput = throughput * bounce.bsdf_weight
         active &= active_next
+        if roulette_depth <= segment + 1 < depth - 1:
+            survival = dr.minimum(dr.max(throughput), MAX_SURVIVAL)
+            active &= noise.next_1d(active) < survival
+            bounce.next_weight = dr.select(active, dr.rcp(survival), 0.0)
+            throughput = throughput * bounce.next_weight
         sharp = sharp & is_delta
         prev_si = si
         prev_pdf = bounce.bsdf_sample.pdf

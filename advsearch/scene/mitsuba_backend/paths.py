@@ -1,0 +1,323 @@
+"""Trace light paths of an image one by one, and tell which ones meet some surfaces.
+
+`trace_paths` is Mitsuba's integrator `path` (next-event estimation and BSDF sampling,
+weighted by the power heuristic) with two additions. It takes the indices of the samples
+of an image that it traces: each sample has the random numbers that it has in the full
+image. And it returns the part of a sample that depends on the surfaces of some shapes
+apart from the rest: what a path carries from its first vertex on such a shape on.
+
+So an image in which only these surfaces have changed needs only those samples again
+that have met them (`advsearch.scene.mitsuba_backend.shared_paths`).
+
+Import this only where a Mitsuba scene is built, which needs the variant.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+from advsearch.scene.mitsuba_backend.variant import dr, mi
+
+MAX_SURVIVAL = 0.95  # largest probability to survive Russian roulette, as in Mitsuba
+
+
+class PathSamples:
+    """Random numbers of some samples of an image, those of Mitsuba's samplers.
+
+    It is the sampler `multijitter` (Kensler 2013), or `independent`, for samples whose
+    indices in the image are given; Mitsuba's own begin at the first.
+
+    Attributes:
+        rng: random-number generator of each sample.
+        permutation: seed of the permutations of each sample's pixel.
+        index: index of each sample in its pixel.
+        dimension: how many numbers or pairs were drawn.
+        spp: samples per pixel.
+        is_stratified: whether it is `multijitter`.
+
+    Args:
+        seed: seed of the image, a number of Dr.Jit.
+        sample: indices of the samples in the image; those of a pixel follow one
+            another.
+        spp: samples per pixel, rounded for the sampler.
+        is_stratified: as the attribute.
+    """
+
+    DRJIT_STRUCT: ClassVar[dict[str, Any]] = {
+        "rng": mi.PCG32,
+        "permutation": mi.UInt32,
+        "index": mi.UInt32,
+        "dimension": mi.UInt32,
+        "spp": int,
+        "is_stratified": bool,
+    }
+
+    def __init__(
+        self,
+        seed: Any = None,
+        sample: Any = None,
+        spp: int = 1,
+        is_stratified: bool = True,
+    ) -> None:
+        """Seed the generators; Dr.Jit calls it without arguments."""
+        if sample is None:
+            return
+        state, increment = mi.sample_tea_32(seed, sample)
+        self.rng = mi.PCG32(initstate=state, initseq=increment)
+        self.index = sample % spp
+        # the seed of a pixel is that of its first sample
+        self.permutation = mi.sample_tea_32(0, sample - self.index + seed)[0]
+        self.dimension = mi.UInt32(0)
+        self.spp = spp
+        self.is_stratified = is_stratified
+
+    def next_1d(self) -> Any:
+        """Draw a number in [0, 1) for each sample."""
+        if not self.is_stratified:
+            return self.rng.next_float32()
+        seed = self._next_permutation()
+        stratum = mi.permute_kensler(self.index, self.spp, seed * 0x45FBE943)
+        return (mi.Float(stratum) + self.rng.next_float32()) * (1.0 / self.spp)
+
+    def next_2d(self) -> Any:
+        """Draw a point in [0, 1)^2 for each sample."""
+        if not self.is_stratified:
+            x = self.rng.next_float32()
+            return mi.Point2f(x, self.rng.next_float32())
+        columns, rows = self.strata
+        seed = self._next_permutation()
+        stratum = mi.permute_kensler(self.index, self.spp, seed * 0x51633E2D)
+        y = stratum // columns
+        x = stratum - y * columns
+        jitter_x = mi.permute_kensler(x, columns, seed * 0x68BC21EB)
+        jitter_y = mi.permute_kensler(y, rows, seed * 0x02E5BE93)
+        fine_x = (mi.Float(jitter_y) + self.rng.next_float32()) * (1.0 / rows)
+        fine_y = (mi.Float(jitter_x) + self.rng.next_float32()) * (1.0 / columns)
+        return mi.Point2f(
+            (mi.Float(x) + fine_x) * (1.0 / columns),
+            (mi.Float(y) + fine_y) * (1.0 / rows),
+        )
+
+    @property
+    def strata(self) -> tuple[int, int]:
+        """Columns and rows of the strata of a pixel."""
+        rows = math.isqrt(self.spp)
+        return math.ceil(self.spp / rows), rows
+
+    def _next_permutation(self) -> Any:
+        """Return the seed of the next permutation of each pixel."""
+        seed = self.permutation + self.dimension
+        self.dimension += 1
+        return seed
+
+
+def sample_rays(sensor: Any, numbers: PathSamples, sample: Any) -> Any:
+    """Sample the camera rays of some samples of an image, as Mitsuba's `render` does.
+
+    Args:
+        sensor: pinhole camera, whose film has a box filter.
+        numbers: random numbers of the samples.
+        sample: indices of the samples in the image.
+
+    Returns:
+        The rays, all of weight 1.
+    """
+    width, height = sensor.film().crop_size()
+    pixel = sample // numbers.spp
+    row = pixel // width
+    corner = mi.Point2f(mi.Float(pixel - row * width), mi.Float(row))
+    position = (corner + numbers.next_2d()) / mi.Point2f(width, height)
+    return sensor.sample_ray(0.0, 0.0, position, mi.Point2f(0.5))[0]
+
+
+class LightPath:
+    """Light paths on their way from the camera, with what they have collected.
+
+    Attributes:
+        ray: the next segment.
+        throughput: throughput up to there.
+        eta: relative index of refraction there.
+        depth: number of surfaces that were met.
+        vertex: the last vertex.
+        pdf: density of the direction in which the path left it.
+        is_delta: whether no other direction was possible.
+        active: whether the path goes on.
+        radiance: radiance since the first changed surface, or since the camera.
+        radiance_before: radiance up to that surface.
+        has_met: whether the path has met a changed surface.
+        has_met_first: whether that was the first hit.
+        albedo: reflectance of the first hit.
+        normal: shading normal of the first hit.
+    """
+
+    DRJIT_STRUCT: ClassVar[dict[str, Any]] = {
+        "ray": mi.Ray3f,
+        "throughput": mi.Spectrum,
+        "eta": mi.Float,
+        "depth": mi.UInt32,
+        "vertex": mi.Interaction3f,
+        "pdf": mi.Float,
+        "is_delta": mi.Bool,
+        "active": mi.Bool,
+        "radiance": mi.Spectrum,
+        "radiance_before": mi.Spectrum,
+        "has_met": mi.Bool,
+        "has_met_first": mi.Bool,
+        "albedo": mi.Color3f,
+        "normal": mi.Normal3f,
+    }
+
+    def __init__(self, ray: Any = None) -> None:
+        """Start at the camera; Dr.Jit calls it without arguments."""
+        if ray is None:
+            return
+        self.ray = mi.Ray3f(ray)
+        self.throughput = mi.Spectrum(1.0)
+        self.eta = mi.Float(1.0)
+        self.depth = mi.UInt32(0)
+        self.vertex = dr.zeros(mi.Interaction3f)
+        self.pdf = mi.Float(1.0)
+        self.is_delta = mi.Bool(True)
+        self.active = mi.Bool(True)
+        self.radiance = mi.Spectrum(0.0)
+        self.radiance_before = mi.Spectrum(0.0)
+        self.has_met = mi.Bool(False)
+        self.has_met_first = mi.Bool(False)
+        self.albedo = mi.Color3f(0.0)
+        self.normal = mi.Normal3f(0.0)
+
+    def add_emission(self, scene: Any, si: Any) -> None:
+        """Add what is emitted where the path arrives, by its weight."""
+        ds = mi.DirectionSample3f(scene, si, self.vertex)
+        emitter_pdf = scene.pdf_emitter_direction(self.vertex, ds, ~self.is_delta)
+        emitted = ds.emitter.eval(si, self.pdf > 0.0)
+        emitted *= _compute_weight(self.pdf, emitter_pdf)
+        self.radiance = dr.fma(self.throughput, emitted, self.radiance)
+
+    def meet(self, si: Any, bsdf: Any, changed: Sequence[Any]) -> None:
+        """Note whether a surface is of one of the changed shapes, and its guides.
+
+        What guides the denoiser is noted of the first hit.
+        """
+        is_changed = si.is_valid() & _is_among(si.shape, changed)
+        is_new = is_changed & ~self.has_met
+        self.radiance_before = dr.select(is_new, self.radiance, self.radiance_before)
+        self.radiance = dr.select(is_new, 0.0, self.radiance)
+        self.has_met |= is_changed
+
+        is_first = (self.depth == 0) & si.is_valid()
+        albedo = bsdf.eval_diffuse_reflectance(si, is_first)
+        self.albedo = dr.select(is_first, albedo, self.albedo)
+        self.normal = dr.select(is_first, si.sh_frame.n, self.normal)
+        self.has_met_first |= is_first & is_changed
+
+    def reflect(
+        self, scene: Any, si: Any, bsdf: Any, numbers: PathSamples, max_depth: int
+    ) -> None:
+        """Add the light of an emitter that a surface reflects, and leave the surface.
+
+        The path ends there if it has `max_depth` segments, or has left the scene.
+        """
+        self.active = (self.depth + 1 < max_depth) & si.is_valid()
+        is_lit = self.active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        ds, light = scene.sample_emitter_direction(si, numbers.next_2d(), True, is_lit)
+        is_lit &= ds.pdf != 0.0
+        choice = numbers.next_1d()
+        value, pdf, sample, weight = bsdf.eval_pdf_sample(
+            mi.BSDFContext(),
+            si,
+            si.to_local(ds.d),
+            choice,
+            numbers.next_2d(),
+            self.active,
+        )
+        light *= dr.select(ds.delta, 1.0, _compute_weight(ds.pdf, pdf))
+        radiance = dr.fma(self.throughput, value * light, self.radiance)
+        self.radiance = dr.select(is_lit, radiance, self.radiance)
+
+        self.ray = si.spawn_ray(si.to_world(sample.wo))
+        self.throughput *= weight
+        self.eta *= sample.eta
+        self.vertex = mi.Interaction3f(si)
+        self.pdf = sample.pdf
+        self.is_delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+        self.depth = dr.select(si.is_valid(), self.depth + 1, self.depth)
+
+    def survive(self, numbers: PathSamples, roulette_depth: int) -> None:
+        """End paths by Russian roulette from a number of bounces on."""
+        largest = dr.max(self.throughput)
+        survival = dr.minimum(largest * dr.square(self.eta), MAX_SURVIVAL)
+        has_roulette = self.depth >= roulette_depth
+        survives = ~has_roulette | (numbers.next_1d() < survival)
+        self.throughput = dr.select(
+            has_roulette, self.throughput * dr.rcp(survival), self.throughput
+        )
+        self.active &= survives & (largest != 0.0)
+
+    def list_channels(self) -> tuple[list[Any], list[Any]]:
+        """Return the channels without and with a changed surface, nine of each.
+
+        They are radiance, albedo and normal.
+        """
+        guides = [*self.albedo, *self.normal]
+        unchanged = [
+            *dr.select(self.has_met, self.radiance_before, self.radiance),
+            *(dr.select(self.has_met_first, 0.0, channel) for channel in guides),
+        ]
+        changing = [
+            *dr.select(self.has_met, self.radiance, 0.0),
+            *(dr.select(self.has_met_first, channel, 0.0) for channel in guides),
+        ]
+        return unchanged, changing
+
+
+@dr.syntax  # type: ignore[untyped-decorator]
+def trace_paths(
+    scene: Any,
+    ray: Any,
+    numbers: PathSamples,
+    changed: Sequence[Any],
+    max_depth: int,
+    roulette_depth: int,
+) -> Any:
+    """Trace radiance, and what guides the denoiser, in two parts.
+
+    Args:
+        scene: scene without media and cut-outs, whose emitters are not hidden.
+        ray: camera rays.
+        numbers: random numbers of the paths.
+        changed: shapes whose surfaces may have changed.
+        max_depth: longest path in segments.
+        roulette_depth: bounces from which on Russian roulette may end a path.
+
+    Returns:
+        Nine channels that do not depend on the changed surfaces: radiance, and albedo
+        and shading normal of the first hit. The same that do. And whether a path has
+        met one of them.
+    """
+    path = LightPath(ray)
+    while dr.hint(path.active, max_iterations=max_depth, label="Paths of an image"):
+        si = scene.ray_intersect(path.ray, mi.RayFlags.All, path.depth == 0)
+        bsdf = si.bsdf(path.ray)
+        path.add_emission(scene, si)
+        path.meet(si, bsdf, changed)
+        path.reflect(scene, si, bsdf, numbers, max_depth)
+        path.survive(numbers, roulette_depth)
+    return *path.list_channels(), path.has_met
+
+
+def _is_among(shape: Any, changed: Sequence[Any]) -> Any:
+    """Return whether each shape is one of several."""
+    result = mi.Bool(False)
+    for candidate in changed:
+        result |= shape == mi.ShapePtr(candidate)
+    return result
+
+
+def _compute_weight(pdf: Any, other_pdf: Any) -> Any:
+    """Return the power heuristic's weight of a sample (Veach 1997, section 9.2)."""
+    square = pdf * pdf
+    weight = square / dr.fma(other_pdf, other_pdf, square)
+    return dr.detach(dr.select(dr.isfinite(weight), weight, 0.0))
