@@ -80,7 +80,10 @@ or its instance, and ``mitsuba:KEY`` a range.
 
 Texture = str | Path | npt.ArrayLike | Tensor
 
-PHOTOGRAPH_SETTINGS = ("ground.level", "backdrop.noise", "backdrop.blur")
+PHOTOGRAPH_SETTINGS = (
+    *("ground.level", "ground.gloss", "ground.roughness"),
+    *("backdrop.noise", "backdrop.blur"),
+)
 """Settings that only a scene has which is rendered into a photograph."""
 
 SINGLE_VALUE_KEYS = {"distribution", "choices", "range"}

@@ -507,6 +507,25 @@ GROUND = (
         default=0.0,
         description="Height of the ground that takes the shadow in a photograph (`backdrop`).",
     ),
+    Parameter(
+        "gloss",
+        shape=(),
+        unit="1",
+        low=0.0,
+        high=1.0,
+        default=0.0,
+        description="What a coat on that ground reflects at a right angle: 0 is matt, 0.02 "
+        "water, 0.04 varnish, 1 a mirror.",
+    ),
+    Parameter(
+        "roughness",
+        shape=(),
+        unit="1",
+        low=0.05,
+        high=1.0,
+        default=0.2,
+        description="Roughness of the coat: 0.05 is polished, 1 blurs all.",
+    ),
     *Parameter.colors(
         "of the table.", defaults=(0.55, 0.45, 0.37), estimators=("differences",)
     ),
