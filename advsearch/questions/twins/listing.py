@@ -83,6 +83,7 @@ class PhotographedObject:
         visible_mask: file of what is visible of it; None without.
         visible: fraction of the silhouette that is visible; None if it is not known.
         box: x, y, width and height of the silhouette in pixels, by the data set.
+        where: file and entry that name it, for messages.
     """
 
     photograph: Path
@@ -98,6 +99,7 @@ class PhotographedObject:
     visible_mask: Path | None = None
     visible: float | None = None
     box: tuple[float, float, float, float] | None = None
+    where: str = ""
 
 
 @dataclass(frozen=True)
@@ -206,6 +208,7 @@ def _read_scene(scene: Path, models: Path, condition: str) -> Listing:
                     visible_mask=_find_mask(scene, "mask_visib", image, index),
                     visible=_get_fraction(info),
                     box=_get_box(info),
+                    where=where,
                     **_read_bop_object(where, entry, models),
                 )
             )
@@ -357,6 +360,7 @@ def _read_row(row: Mapping[str, Any], path: Path, where: str) -> PhotographedObj
         label=str(row.get("label") or "")[:200],
         condition=str(row.get("condition") or "")[:200],
         mask=_get_file(row, "mask", path, where) if "mask" in row else None,
+        where=where,
     )
 
 
