@@ -8,7 +8,7 @@ light are carried there from the others:
     camera = T . camera of the other;   light is turned about the vertical by T
 
 so that controls of the object mean the same in each. T has to leave the plane that
-takes the shadow where it is.
+takes the shadow level; its height is carried there too.
 """
 
 from __future__ import annotations
@@ -34,8 +34,9 @@ from advsearch.scene.geometry import camera_to_world, object_to_world
 from advsearch.scene.scene_data import cache_per_scene
 from advsearch.scene.settings import Parameter
 
-# of a pose, in object sizes and of a cosine: how far the plane may be off
-PLANE_TOLERANCE = 1e-3
+PLANE_TOLERANCE = 1e-3  # of a cosine: how far the plane may be from level
+# settings of the plane that have one value in a scene
+PLANE_SURFACE = ("ground.size", "ground.gloss", "ground.roughness")
 
 
 class BackdropControl(Control):
@@ -94,7 +95,7 @@ class BackdropControl(Control):
                 raise InputError(
                     f"`controls` {self.name}: {name} has a {lens.kind} lens and "
                     f"{allowed[0]} a {lenses[0].kind} one; choose among photographs "
-                    f"of one kind, with {self.name}.which"
+                    f"of one kind, with {self.name}.which, or sweep over all"
                 )
             _check_compatible(name, scenes[name], first)
         has_model = any(scenes[name].camera_model is not None for name in allowed)
@@ -169,6 +170,8 @@ def _compute_view_inputs(scene: SceneDescription, index: int) -> dict[str, Tenso
         inputs["camera.lens"] = torch.tensor(_get_lens(view).numbers)
     else:
         inputs["camera.fov"] = torch.tensor([view.get_number("camera.fov")])
+    if has_plane(scene):
+        inputs["ground.to_world"] = _compute_plane_pose(view, carry)
     if scene.environment is not None:
         radiance = torch.from_numpy(scene.environment.radiance.copy())
         # the turn about the vertical axis, the only one that `carry` may have
@@ -181,6 +184,18 @@ def _compute_carry(view: SceneDescription, first: SceneDescription) -> Float64Ar
     """Return the map (4, 4) by which an object in a view stands as in the first."""
     carry: Float64Array = object_to_world(first) @ np.linalg.inv(object_to_world(view))
     return carry
+
+
+def _compute_plane_pose(view: SceneDescription, carry: Float64Array) -> Tensor:
+    """Return the pose (4, 4) of the plane of a view, at the height to which it is
+    carried.
+
+    `carry` is as in `_compute_carry`. The plane is a square with a side of 2 before.
+    """
+    half_size = view.get_number("ground.size") / 2.0
+    pose = torch.diag(torch.tensor([half_size, half_size, half_size, 1.0]))
+    pose[2, 3] = view.get_number("ground.level") + float(carry[2, 3])
+    return pose
 
 
 def _get_lens(view: SceneDescription) -> CameraModel:
@@ -209,15 +224,19 @@ def _check_compatible(
     # how far z is from staying z
     up_change = carry[2, :3] - [0.0, 0.0, 1.0]
     is_level = np.abs(up_change).max() <= PLANE_TOLERANCE and carry[2, 2] > 0.0
-    level_change = (
-        carry[2, 3] + view.get_number("ground.level") - first.get_number("ground.level")
+    same_surface = all(
+        view.get_number(setting) == first.get_number(setting)
+        for setting in PLANE_SURFACE
     )
-    same_plane = has_plane(view) == has_plane(first) and (
-        not has_plane(first) or abs(level_change) <= PLANE_TOLERANCE
+    if not is_level:
+        reason = "the object stands with another side down"
+    elif has_plane(view) != has_plane(first):
+        reason = "the camera is on another side of the plane, or it has another size,"
+    elif not same_surface:
+        reason = f"the plane has another size or gloss ({', '.join(PLANE_SURFACE)})"
+    else:
+        return
+    raise InputError(
+        f"`controls` backdrop: in {name} {reason} than in the first photograph; leave "
+        "it out of backdrop.which, or sweep over the photographs"
     )
-    if not (is_level and same_plane):
-        raise InputError(
-            f"`controls` backdrop: the object stands in {name} with another side down, "
-            "or at another height above its plane, than in the first photograph; leave "
-            f"it out of backdrop.which, or sweep over the photographs"
-        )

@@ -637,11 +637,14 @@ def _check_film(photograph: BackdropPhotograph, resolution: tuple[int, int]) -> 
     left = photograph.crop[0] + (width - part_width) // 2
     top = photograph.crop[1] + (height - part_height) // 2
     path = photograph.spec.partition("#")[0]
+    # the photograph's shape, with the larger side of the film
+    shrinking = max(film_width, film_height) / max(width, height)
+    fitting = f"{max(round(height * shrinking), 1)}x{max(round(width * shrinking), 1)}"
     raise InputError(
         f"backdrop: {photograph.spec} has {width} x {height} pixels (width x height) "
         f"and the rendered picture {film_width} x {film_height}, which is another "
         f"shape; give a part of the photograph, such as {path}#{left},{top},"
-        f"{part_width},{part_height}, or another `resolution`"
+        f"{part_width},{part_height}, or another `resolution`, such as {fitting}"
     )
 
 

@@ -669,13 +669,14 @@ def resolve_settings(settings: SettingValues) -> dict[str, float | None]:
                     name, str(value), setting.options, "Write it as `set` NAME=VALUE."
                 )
             value = setting.options.index(str(value))
+        unit = "" if setting.unit == "1" else f" ({setting.unit})"
+        allowed_range = f"{setting.low:g} to {setting.high:g}{unit}"
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise InputError(
-                f"`set` {name}: expected a number in {setting.unit}, got {value!r}"
+                f"`set` {name}: expected a number from {allowed_range}, got {value!r}"
             )
         values[name] = float(value)
         if not setting.low <= value <= setting.high:  # NaN is not, either
-            allowed_range = f"{setting.low:g} to {setting.high:g} ({setting.unit})"
             raise InputError(
                 f"`set` {name}: expected a number from {allowed_range}, got {value:g}"
             )

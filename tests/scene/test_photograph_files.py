@@ -82,9 +82,15 @@ def test_the_first_photograph_is_the_clean_scene_and_one_is_chosen(folder: Path)
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("ground", [{"set": {"ground.size": 0.0}}, {}], ids=["object", "shadow"])
-def test_a_photograph_of_a_folder_is_as_that_photograph_alone(tmp_path: Path, ground: dict[str, Any]) -> None:
-    folder = samples.write_photograph_folder(tmp_path / "desk", **ground)
+@pytest.mark.parametrize("ground", ["none", "below the object", "at several heights"])
+def test_a_photograph_of_a_folder_is_as_that_photograph_alone(tmp_path: Path, ground: str) -> None:
+    folder = samples.write_photograph_folder(tmp_path / "desk", set={"ground.size": 0.0 if ground == "none" else 12.0})
+    if ground == "at several heights":
+        for place, name in enumerate(NAMES):  # and with focal lengths of their own
+            file = (folder / name).with_suffix(".json")
+            matrix = json.loads(file.read_text("utf-8"))["camera_matrix"]
+            matrix[0][0] *= 1.0 + 0.1 * place
+            change_json(file, set={"ground.level": -0.2 * place}, camera_matrix=matrix)
     scene = advsearch.load_scene(BOX, "low-sun", backdrop=folder, unit="mm")
     render = scene.renderer({"backdrop": {"which": NAMES[:3]}}, resolution=48)
     for place in (0, 2):
@@ -98,7 +104,7 @@ def test_a_photograph_of_a_folder_is_as_that_photograph_alone(tmp_path: Path, gr
 
 def test_a_folder_needs_the_control_and_the_control_a_folder(folder: Path) -> None:
     scene = advsearch.load_scene(BOX, backdrop=folder, unit="mm")
-    with pytest.raises(InputError, match="is a folder of 6 photographs; name one of them, or let the control"):
+    with pytest.raises(InputError, match="is a folder of photographs; name one of them, or let the control"):
         scene.renderer("texture", resolution=96)
     with pytest.raises(InputError, match=r"chooses among the photographs of a folder.*give `backdrop=FOLDER`"):
         advsearch.load_scene(BOX, backdrop=folder / NAMES[0], unit="mm").renderer("backdrop", resolution=96)
@@ -119,7 +125,14 @@ def test_photographs_that_can_not_be_chosen_among_are_named(tmp_path: Path) -> N
         if name != NAMES[1]:
             change_json((folder / name).with_suffix(".json"), up=[0.0, -1.0, 0.0])
     scene = advsearch.load_scene(BOX, backdrop=folder, unit="mm")
-    with pytest.raises(InputError, match=r"the object stands in 000003.jpg with another side down"):
+    with pytest.raises(InputError, match=r"in 000003.jpg the object stands with another side down than in"):
+        scene.renderer("backdrop", resolution=96)
+    for name in NAMES:
+        change_json(
+            (folder / name).with_suffix(".json"), up=None, set={"ground.gloss": 0.04 if name == NAMES[1] else 0.02}
+        )
+    scene = advsearch.load_scene(BOX, backdrop=folder, unit="mm")
+    with pytest.raises(InputError, match=r"in 000003.jpg the plane has another size or gloss \(ground.size, "):
         scene.renderer("backdrop", resolution=96)
 
 

@@ -694,6 +694,8 @@ def make_scene_inputs(resolution: tuple[int, int]) -> tuple[SceneInput, ...]:
         # (H, W + 2, 3): a copy of the last column before the first, and of the first
         # after the last
         SceneInput("environment.padded", "environment.data", is_interior=True),
+        # of the plane that takes the shadow in a photograph
+        _make_pose_input(GROUND_NAME, "to_world"),
         # (h, w, 3): of a ground that shows the environment's photograph
         # (`advsearch.scene.grounds`)
         SceneInput(
