@@ -347,7 +347,7 @@ def _check_photograph_is_chosen(
     folder = scene.photographs
     if folder is not None and "backdrop" not in {control.kind for control in controls}:
         raise InputError(
-            f"backdrop: {folder.path} is a folder of {len(folder.scenes)} photographs; "
+            f"backdrop: {folder.path} is a folder of photographs; "
             "name one of them, or let the control backdrop choose, as in `over=backdrop`"
         )
 

@@ -8,7 +8,7 @@ light are carried there from the others:
     camera = T . camera of the other;   light is turned about the vertical by T
 
 so that controls of the object mean the same in each. T has to leave the plane that
-takes the shadow where it is.
+takes the shadow level; its height is carried there too.
 """
 
 from __future__ import annotations
@@ -34,8 +34,9 @@ from advsearch.scene.geometry import camera_to_world, object_to_world
 from advsearch.scene.scene_data import cache_per_scene
 from advsearch.scene.settings import Parameter
 
-# of a pose, in object sizes and of a cosine: how far the plane may be off
-PLANE_TOLERANCE = 1e-3
+PLANE_TOLERANCE = 1e-3  # of a cosine: how far the plane may be from level
+# settings of the plane that have one value in a scene
+PLANE_SURFACE = ("ground.size", "ground.gloss", "ground.roughness")
 
 
 class BackdropControl(Control):
@@ -118,7 +119,7 @@ class BackdropControl(Control):
                 raise InputError(
                     f"`controls` {self.name}: {name} has a {lens.kind} lens and "
                     f"{first_name} a {first_lens.kind} one; choose among photographs "
-                    f"of one kind, with {self.name}.which"
+                    f"of one kind, with {self.name}.which, or sweep over all"
                 )
             _check_compatible(name, view, first)
 
@@ -177,6 +178,8 @@ def _compute_view_inputs(scene: SceneDescription, index: int) -> dict[str, Tenso
         inputs["camera.lens"] = torch.tensor(_get_lens(view).numbers)
     else:
         inputs["camera.fov"] = torch.tensor([view.get_number("camera.fov")])
+    if has_plane(scene):
+        inputs["ground.to_world"] = _compute_plane_pose(view, carry)
     if scene.environment is not None:
         radiance = torch.from_numpy(scene.environment.radiance.copy())
         # the turn about the vertical axis, the only one that `carry` may have
@@ -189,6 +192,18 @@ def _compute_carry(view: SceneDescription, first: SceneDescription) -> Float64Ar
     """Return the map (4, 4) by which an object in a view stands as in the first."""
     carry: Float64Array = object_to_world(first) @ np.linalg.inv(object_to_world(view))
     return carry
+
+
+def _compute_plane_pose(view: SceneDescription, carry: Float64Array) -> Tensor:
+    """Return the pose (4, 4) of the plane of a view, at the height to which it is
+    carried.
+
+    `carry` is as in `_compute_carry`. The plane is a square with a side of 2 before.
+    """
+    half_size = view.get_number("ground.size") / 2.0
+    pose = torch.diag(torch.tensor([half_size, half_size, half_size, 1.0]))
+    pose[2, 3] = view.get_number("ground.level") + float(carry[2, 3])
+    return pose
 
 
 def _get_lens(view: SceneDescription) -> CameraModel:
@@ -213,29 +228,23 @@ def _check_compatible(
             f"`controls` backdrop: {name} has a light of its own beside it; state one "
             "`environment` for all photographs, or sweep over them"
         )
-    if not _stands_alike(view, first):
-        raise InputError(
-            f"`controls` backdrop: the object stands in {name} with another side down, "
-            "or at another height above its plane, than in the first photograph; leave "
-            f"it out of backdrop.which, or sweep over the photographs"
-        )
-
-
-def _stands_alike(view: SceneDescription, first: SceneDescription) -> bool:
-    """Return whether the object stands on the plane of a view as on that of the first.
-
-    That is with the same side down and at the same height; or on no plane in both.
-    """
     carry = _compute_carry(view, first)
     # Row 2 of the map gives z in the first scene: it has to be z, but for a shift.
     up_change = carry[2, :3] - [0.0, 0.0, 1.0]
     is_upright = np.abs(up_change).max() <= PLANE_TOLERANCE and carry[2, 2] > 0.0
-    if not is_upright or has_plane(view) != has_plane(first):
-        return False
-    if not has_plane(first):
-        return True
-    # how much higher the view's plane is than the first's, once carried there
-    level_change = (
-        carry[2, 3] + view.get_number("ground.level") - first.get_number("ground.level")
+    same_surface = all(
+        view.get_number(setting) == first.get_number(setting)
+        for setting in PLANE_SURFACE
     )
-    return bool(abs(level_change) <= PLANE_TOLERANCE)
+    if not is_upright:
+        reason = "the object stands with another side down"
+    elif has_plane(view) != has_plane(first):
+        reason = "the camera is on another side of the plane, or it has another size,"
+    elif not same_surface:
+        reason = f"the plane has another size or gloss ({', '.join(PLANE_SURFACE)})"
+    else:
+        return
+    raise InputError(
+        f"`controls` backdrop: in {name} {reason} than in the first photograph; leave "
+        "it out of backdrop.which, or sweep over the photographs"
+    )

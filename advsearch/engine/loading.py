@@ -67,6 +67,7 @@ from advsearch.scene.photograph_files import (
     read_photograph_view,
 )
 from advsearch.scene.renderer import Renderer
+from advsearch.scene.rig import read_photograph_cameras
 from advsearch.scene.settings import ORBIT_CAMERA, SettingValues
 from advsearch.settings import parse_controls, to_python
 from advsearch.trust.code import allow_code_of_call
@@ -80,7 +81,10 @@ or its instance, and ``mitsuba:KEY`` a range.
 
 Texture = str | Path | npt.ArrayLike | Tensor
 
-PHOTOGRAPH_SETTINGS = ("ground.level", "backdrop.noise", "backdrop.blur")
+PHOTOGRAPH_SETTINGS = (
+    *("ground.level", "ground.gloss", "ground.roughness"),
+    *("backdrop.noise", "backdrop.blur"),
+)
 """Settings that only a scene has which is rendered into a photograph."""
 
 SINGLE_VALUE_KEYS = {"distribution", "choices", "range"}
@@ -380,13 +384,16 @@ def _put_into_photographs(
         )
     scenes: dict[str, SceneDescription] = {}
     with track_opened_files(spec):
-        for name, view in read_photograph_folder(spec).items():
+        # of many photographs, parsed once
+        cameras = read_photograph_cameras(camera) if camera is not None else None
+        views = read_photograph_folder(spec, has_camera=camera is not None)
+        for name, view in views.items():
             light = None if has_environment else find_photographed_light(view.spec)
             lit_scene = description
             if light is not None:
                 environment = import_environment(light)
                 lit_scene = Scene(description).with_environment(environment).description
-            scenes[name] = put_into_photograph(lit_scene, view, camera)
+            scenes[name] = put_into_photograph(lit_scene, view, cameras or camera)
     folder = PhotographFolder(str(spec), camera, scenes)
     # the first photograph, until a control chooses another one
     return replace(next(iter(scenes.values())), photographs=folder)

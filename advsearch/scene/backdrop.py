@@ -1,6 +1,6 @@
 """Photographs that a scene is rendered into, and the camera that took them.
 
-    display-linear = rendered + shade * photograph
+    display-linear = rendered + shade * photograph + reflection
     shade = 1 - coverage + change of the plane's radiance / its radiance
 
 `rendered` is the object's light times its coverage. The plane is a matt ground below
@@ -11,9 +11,9 @@ albedo times what arrives, so that the ratio is right whatever the albedo of the
 at that pixel is, and it never goes below zero; a difference is right only where the
 albedo of the plane is that of the ground, and makes dark ground negative.
 
-A ground that shines is not covered: its coat reflects without the ground's color, so
-that a ratio tints the reflection and shows the ground's texture in it. It would take a
-second change that is added, and light that is sampled by the coat.
+What a clear coat on the ground (``ground.gloss``) reflects has not the ground's color.
+Its change, light of the object minus that of the environment behind it, is added; and
+as much of the photograph as the coat reflects of the environment takes no shadow.
 
 The photograph is read as a viewer shows it, decoded from sRGB, and averaged over the
 area of each pixel of the film. A part of it may be cut out, `photo.jpg#X,Y,WIDTH,HEIGHT`
@@ -73,7 +73,10 @@ SHAPE_TOLERANCE = 0.01
 PHOTOGRAPH_CAMERA = "photograph"  # name of the pinhole of a part of a photograph
 # settings of the plane that takes the shadow
 PLANE_SETTINGS = frozenset(
-    ("ground.size", "ground.level", *(f"ground.{channel}" for channel in CHANNELS))
+    (
+        *("ground.size", "ground.level", "ground.gloss", "ground.roughness"),
+        *(f"ground.{channel}" for channel in CHANNELS),
+    )
 )
 # fraction of a depth: what is nearer by less does not hide, as where things touch
 DEPTH_TOLERANCE = 0.01
@@ -243,8 +246,9 @@ def compose(rendered: Tensor, behind: Tensor, inputs: Mapping[str, Tensor]) -> T
     the object or the plane.
 
     Args:
-        rendered: (H, W, 4 or 7), the object's radiance times its coverage, its
-            coverage, and the change of the plane's radiance.
+        rendered: (H, W, 4, 7 or 13), the object's radiance times its coverage, its
+            coverage, the change of the plane's radiance, that of what its coat
+            reflects, and the environment in the coat without the object.
         behind: (H, W, 3) radiance of the photograph.
         inputs: as by `make_image_inputs`; the last channel of ``backdrop.front`` is
             what is before the plane.
@@ -261,10 +265,18 @@ def compose(rendered: Tensor, behind: Tensor, inputs: Mapping[str, Tensor]) -> T
         coverage = visible * coverage
     shade = (1.0 - coverage).clamp(0.0, 1.0)
     if "backdrop.plane" in inputs:
-        change = rendered[..., 4:] / inputs["backdrop.plane"]
+        change = rendered[..., 4:7] / inputs["backdrop.plane"]
+        reflection = rendered[..., 7:10]
         if front is not None:
             change = (1.0 - front[..., -1:]) * change
+            reflection = (1.0 - front[..., -1:]) * reflection
+        uncovered = shade
         shade = (shade + change).clamp_min(0.0)
+        if reflection.shape[-1]:
+            # what the photograph shows of the environment in the coat takes no shadow
+            coat = rendered[..., 10:] / (1.0 - rendered[..., 3:4]).clamp_min(1e-3)
+            unshaded = (uncovered - shade) * torch.minimum(coat, behind)
+            return radiance + (shade * behind + unshaded + reflection).clamp_min(0.0)
     return radiance + shade * behind
 
 
@@ -403,6 +415,15 @@ def has_plane(description: SceneData) -> bool:
         and bool((compute_level_irradiance(description) > 0.0).all())
         and camera_to_world(description)[2, 3] > description.get_number("ground.level")
     )
+
+
+def compute_refractive_index(gloss: float) -> float:
+    """Return the index of refraction of a coat by its reflectance at a right angle.
+
+    A reflectance of 1, which no index has, counts as 0.9996.
+    """
+    amplitude = min(math.sqrt(gloss), 0.9998)
+    return (1.0 + amplitude) / (1.0 - amplitude)
 
 
 def compute_plane_radiance(description: SceneData) -> Tensor | None:
@@ -552,6 +573,7 @@ def fit_to_photograph(
             photograph.
     """
     _check_film(photograph, resolution)
+    _check_gloss(description)
     full_height, full_width = photograph.full_size
     full_aspect = full_width / full_height
     model = description.camera_model
@@ -620,11 +642,35 @@ def _check_film(photograph: BackdropPhotograph, resolution: tuple[int, int]) -> 
     left = photograph.crop[0] + (width - part_width) // 2
     top = photograph.crop[1] + (height - part_height) // 2
     path = photograph.spec.partition("#")[0]
+    # the photograph's shape, with the larger side of the film
+    shrinking = max(film_width, film_height) / max(width, height)
+    fitting = f"{max(round(height * shrinking), 1)}x{max(round(width * shrinking), 1)}"
     raise InputError(
         f"backdrop: {photograph.spec} has {width} x {height} pixels (width x height) "
         f"and the rendered picture {film_width} x {film_height}, which is another "
         f"shape; give a part of the photograph, such as {path}#{left},{top},"
-        f"{part_width},{part_height}, or another `resolution`"
+        f"{part_width},{part_height}, or another `resolution`, such as {fitting}"
+    )
+
+
+def _check_gloss(description: SceneData) -> None:
+    """Raise InputError if a coat of the ground was requested that nothing would have."""
+    is_glossy = description.get_number("ground.gloss") > 0.0
+    if "ground.roughness" in description.requested and not is_glossy:
+        raise InputError(
+            "`set` ground.roughness: the ground is matt; give ground.gloss as well, "
+            "0.02 as water or 0.04 as varnish, or leave it out"
+        )
+    if not is_glossy or has_plane(description):
+        return
+    reason = "the camera is not above ground.level"
+    if description.get_number("ground.size") == 0.0:
+        reason = "ground.size is 0"
+    elif not (compute_level_irradiance(description) > 0.0).all():
+        reason = "no environment lights the scene"
+    raise InputError(
+        f"`set` ground.gloss: {reason}, so that no plane reflects the object; change "
+        "that, or leave ground.gloss out"
     )
 
 

@@ -188,7 +188,20 @@ def read_camera(spec: str) -> CameraModel:
     if lines and re.fullmatch(r"\d+\s+[A-Za-z_]\w*\s.*", lines[0].strip()):
         return _read_colmap(spec, path, camera_name, lines)
     check_text_format(path, text)
-    entries = _parse_file(path, text)
+    return make_camera(spec, _parse_file(path, text))
+
+
+def make_camera(spec: str, entries: Mapping[str, Any]) -> CameraModel:
+    """Return the camera's model that the entries of a file describe.
+
+    Args:
+        spec: as for `read_camera`; the file is not read.
+        entries: what is in the file, by name.
+
+    Raises:
+        FileFormatError: as for `read_camera`.
+    """
+    path, _, camera_name = spec.partition("#")
     data = {name: value for name, value in entries.items() if name not in VIEW_KEYS}
     translated = translate_entries(path, camera_name, data)
     if translated is not None:

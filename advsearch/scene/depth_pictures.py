@@ -17,7 +17,7 @@ from advsearch.errors import FileFormatError
 from advsearch.pictures import MAX_PIXELS, check_decodable, check_pixels, open_image
 from advsearch.scene.assets import Float32Array
 from advsearch.scene.importing.hdr import read_exr
-from advsearch.trust.stored_files import LARGEST_FILE, read_bytes
+from advsearch.trust.stored_files import LARGEST_FILE, read_existing_bytes
 
 EXR_SUFFIX = ".exr"
 ARRAY_SUFFIX = ".npy"
@@ -25,6 +25,7 @@ ARRAY_SUFFIX = ".npy"
 SCALED = re.compile(r"(?P<path>.+)#(?P<metres>\d+\.?\d*(e-?\d+)?|\.\d+)", re.IGNORECASE)
 LEVEL_BITS = ("I;16", "I;16B", "I;16L", "I")  # modes of pictures of 16 bits
 MAX_DEPTH = 1e5  # metres
+EXPECTED = "a picture of depth"
 
 
 def is_depth(spec: str | Path) -> bool:
@@ -81,22 +82,11 @@ def read_depth(spec: str | Path) -> Float32Array:
     return depth.astype(np.float32)
 
 
-def _read_file(path: Path) -> bytes:
-    try:
-        return read_bytes(path, "a picture of depth", LARGEST_FILE)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise FileFormatError(
-            f"{path}: expected a picture of depth, got one that cannot be read "
-            f"({reason}); check the path"
-        ) from error
-
-
 def _read_channels(path: Path) -> np.ndarray:
     """Return what a picture of depth has in its channels (H, W, c), as it is stored."""
     suffix = path.suffix.lower()
     if suffix == EXR_SUFFIX:
-        planes, _ = read_exr(path, _read_file(path))
+        planes, _ = read_exr(path, read_existing_bytes(path, EXPECTED, LARGEST_FILE))
         return np.stack(planes, axis=2)
     if suffix == ARRAY_SUFFIX:
         return _read_array(path)[..., None]
@@ -108,7 +98,7 @@ def _read_channels(path: Path) -> np.ndarray:
 
 def _read_array(path: Path) -> np.ndarray:
     """Return the numbers (H, W) of an .npy file, whose size is checked before."""
-    data = _read_file(path)
+    data = read_existing_bytes(path, EXPECTED, LARGEST_FILE)
     stream = io.BytesIO(data)
     try:
         version = np.lib.format.read_magic(stream)

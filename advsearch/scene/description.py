@@ -73,7 +73,7 @@ from advsearch.scene.parts import (
 )
 from advsearch.scene.places.environments import import_place
 from advsearch.scene.places.place_file import is_place_file
-from advsearch.scene.rig import AXES, read_photograph_camera, read_rig
+from advsearch.scene.rig import AXES, PhotographCameras, read_rig
 from advsearch.scene.scene_data import NO_ENVIRONMENT as NO_ENVIRONMENT
 from advsearch.scene.scene_data import OBJECT as OBJECT
 from advsearch.scene.scene_data import SceneData
@@ -249,29 +249,32 @@ class SceneDescription(SceneData):
             requested=self.requested | set(measured),
         )
 
-    def with_photograph_camera(self, spec: str, photograph: Path) -> SceneDescription:
+    def with_photograph_camera(
+        self, photograph_cameras: PhotographCameras, photograph: Path
+    ) -> SceneDescription:
         """Return the scene as the camera of one of many photographs sees it.
 
         The world of the camera file, with z up and in metres, is that of the scene: the
         object stands at its origin until its pose is set.
 
         Args:
-            spec: a camera file with the pose of each photograph, see
-                `advsearch.scene.rig.read_photograph_camera`.
+            photograph_cameras: cameras of many photographs.
             photograph: the file of the photograph.
 
         Raises:
-            FileFormatError: the file cannot be used, or does not name the photograph.
+            FileFormatError: they do not name the photograph, or its camera cannot be
+                used.
             InputError: the size of the object is not known; or a setting of the camera
                 around the object was given.
         """
+        spec = photograph_cameras.path
         if self.object.size_in_metres is None:
             raise InputError(
                 f"`camera={spec}` is in metres, and how large {self.object.name} is is "
                 "not known; give its longest side in metres, such as `size=0.1`"
             )
         with track_opened_files(photograph):
-            pose, model = read_photograph_camera(spec, photograph)
+            pose, model = photograph_cameras.find(photograph)
         to_world = pose @ AXES
         to_world[:3, 3] /= self.object.size_in_metres
         model.check_no_fov(self.requested)

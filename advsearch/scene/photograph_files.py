@@ -21,7 +21,7 @@ from advsearch.scene.assets import Float64Array
 from advsearch.scene.backdrop import CROP, compute_view_settings, find_photograph_file
 from advsearch.scene.camera_files import VIEW_KEYS, read_camera_entries
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.rig import has_photographs
+from advsearch.scene.rig import PhotographCameras, read_photograph_cameras
 from advsearch.scene.settings import resolve_settings
 from advsearch.trust.named_files import is_inside
 from advsearch.trust.stored_files import (
@@ -123,32 +123,41 @@ def find_camera_file(photograph: Path) -> Path | None:
     return None
 
 
-def read_photograph_folder(folder: str | Path) -> dict[str, PhotographView]:
+def read_photograph_folder(
+    folder: str | Path, *, has_camera: bool = False
+) -> dict[str, PhotographView]:
     """Read the camera files of all photographs of a folder.
 
     Other files, hidden ones and folders in it are not looked at.
+
+    Args:
+        folder: the folder.
+        has_camera: whether the user names a camera, or one file with the cameras of all
+            photographs; then they need none beside them.
 
     Returns:
         The views by the name of the photograph's file, in alphabetical order.
 
     Raises:
         FileFormatError: there are no photographs or too many, or they have too many
-            pixels; one has no camera file, or its file states other things than that of
-            the first; a file leads out of the folder or cannot be used.
+            pixels; one needs a camera file and has none, or its file states other
+            things than that of the first; a file leads out of the folder or cannot be
+            used.
     """
     directory = Path(folder)
     views: dict[str, PhotographView] = {}
     n_pixels = 0
     for path in _list_photographs(directory):
         file = find_camera_file(path)
-        if file is None:
+        if file is None and not has_camera:
             raise FileFormatError(
                 f"{path}: expected its camera file beside it, such as "
-                f"{path.with_suffix('.yaml').name}, got none; add it, or take the "
-                "photograph out of the folder"
+                f"{path.with_suffix('.yaml').name}, got none; add it, take the "
+                "photograph out of the folder, or give `camera` for all of them"
             )
         _check_inside(path, directory)
-        _check_inside(file, directory)
+        if file is not None:
+            _check_inside(file, directory)
         with open_image(path, LARGEST_FILE) as image:
             n_pixels += image.width * image.height
         check_most(
@@ -200,8 +209,8 @@ def _check_same_statements(view: PhotographView, first: PhotographView) -> None:
         missing = sorted(other.stated_names - file.stated_names)
         if missing:
             raise FileFormatError(
-                f"{file.file}: expected {missing[0]}, which {Path(other.file).name} "
-                "states; add it"
+                f"{file.file or file.spec}: expected {missing[0]}, which "
+                f"{Path(other.file).name} states; add it"
             )
 
 
@@ -313,7 +322,7 @@ def _parse_occluder(file: Path, stated: Mapping[str, Any]) -> str | None:
 def put_into_photograph(
     description: SceneDescription,
     view: PhotographView,
-    camera: str | None = None,
+    camera: str | PhotographCameras | None = None,
     occluder: str | Path | None = None,
 ) -> SceneDescription:
     """Return a scene as it is rendered into a photograph.
@@ -323,7 +332,7 @@ def put_into_photograph(
     Args:
         description: the scene.
         view: the photograph, and what its camera file states.
-        camera: a camera in the place of the file's.
+        camera: a camera in the place of the file's, or the cameras of many photographs.
         occluder: a mask in the place of the file's.
 
     Raises:
@@ -345,10 +354,13 @@ def put_into_photograph(
     )
     camera = camera or view.camera
     photograph = find_photograph_file(view.spec)
-    if camera is not None and photograph is not None and has_photographs(camera):
-        scene = scene.with_photograph_camera(camera, photograph)
-    elif camera is not None:
+    if isinstance(camera, str):
+        with track_opened_files(photograph or camera):
+            camera = read_photograph_cameras(camera) or camera
+    if isinstance(camera, str):
         scene = scene.with_camera(camera)
+    elif camera is not None and photograph is not None:
+        scene = scene.with_photograph_camera(camera, photograph)
     scene = scene.with_backdrop(view.spec, occluder or view.occluder)
     if view.object_to_camera is None:
         return scene

@@ -59,8 +59,8 @@ Source = Callable[[Mapping[str, Tensor], int, int], Tensor]
 Predict = Callable[[Mapping[str, Tensor]], Tensor]
 """From scene inputs to linear radiance (H, W, 3); differentiable.
 
-It is (H, W, 4) with coverage where there is a backdrop, and (H, W, 7) with the change
-of the plane that takes the shadow in a photograph.
+It is (H, W, 4) with coverage where there is a backdrop, and (H, W, 7 or 13) with the
+changes of the plane that takes the shadow in a photograph.
 """
 
 
@@ -607,7 +607,7 @@ class Renderer:
     def _compute_denoising_change(self, exposed: Tensor, guides: Tensor) -> Tensor:
         """Return the denoised image minus the image, (H, W, C).
 
-        C is 3, 4 with coverage, or 7 with the change of the plane that takes the
+        C is 3, 4 with coverage, or 7 or 13 with the changes of the plane that takes the
         shadow. `guides` are albedo and normals (H, W, 6), which show the denoiser the
         edges.
         """
@@ -632,8 +632,8 @@ class Renderer:
         """Return the image of rendered radiance.
 
         Args:
-            rendered: radiance (H, W, 3), or (H, W, 4) with coverage, or (H, W, 7) with
-                the change of the plane that takes the shadow.
+            rendered: radiance (H, W, 3), or (H, W, 4) with coverage, or (H, W, 7 or 13)
+                with the changes of the plane that takes the shadow.
             inputs: scene inputs, of which exposure and backdrop are applied.
             u: configuration, for what controls do to the finished image.
             display: if False, return the radiance that is to be displayed.
@@ -643,12 +643,14 @@ class Renderer:
         if "backdrop.blur" in inputs:
             rendered = blur_image(rendered, float(inputs["backdrop.blur"]))
         radiance = rendered[..., :3]
+        coat = rendered[..., 7:]  # without channels if the plane is matt
         if exposure is not None:
             radiance = radiance * torch.exp2(exposure)
+            coat = coat * torch.exp2(exposure)
         if "backdrop.color" in inputs:
             # the photograph is display-linear: divided by the gain it is radiance
             behind = inputs["backdrop.color"] / self.formation.gain
-            layers = torch.cat([radiance, rendered[..., 3:]], dim=-1)
+            layers = torch.cat([radiance, rendered[..., 3:7], coat], dim=-1)
             radiance = compose(layers, behind, inputs)
         if not display:
             return radiance
@@ -703,7 +705,8 @@ class Renderer:
 
         Returns:
             (H, W, 3), or (H, W, 4) with coverage if the environment is hidden, or (H,
-            W, 7) with the change of the plane that takes the shadow in a photograph.
+            W, 7) with the change of the plane that takes the shadow in a photograph, or
+            (H, W, 13) with that of what its coat reflects, and the environment in it.
         """
         if self._predict is not None:
             return self._predict(inputs)

@@ -9,8 +9,9 @@ transforms.json, or COLMAP's images.txt with the cameras.txt beside it.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -20,7 +21,12 @@ from torch import Tensor
 
 from advsearch.errors import FileFormatError
 from advsearch.scene.assets import Float64Array, make_pose
-from advsearch.scene.camera_files import LENS_KEYS, MAX_JSON_SIZE, read_camera
+from advsearch.scene.camera_files import (
+    LENS_KEYS,
+    MAX_JSON_SIZE,
+    make_camera,
+    read_camera,
+)
 from advsearch.scene.camera_model import CameraModel
 from advsearch.scene.poses import make_rotation
 from advsearch.scene.skeleton import compute_rotation_entries
@@ -158,55 +164,75 @@ def read_rig(spec: str) -> tuple[Mount, ...]:
     return mounts
 
 
-def has_photographs(spec: str) -> bool:
-    """Return whether a camera file states where each of its photographs was taken.
+@dataclass(frozen=True, eq=False)
+class PhotographCameras:
+    """The cameras of many photographs, which one file states.
 
-    It is COLMAP's images.txt, or a transforms.json; `spec` names none of its cameras.
-    """
-    if Path(spec).name == COLMAP_IMAGES:
-        return True
-    if Path(spec).suffix.lower() != ".json":
-        return False
-    try:
-        data = parse_json(read_text(Path(spec), "a camera file", MAX_JSON_SIZE))
-    except (OSError, ValueError):
-        return False  # `read_camera` reports what is wrong with it
-    return isinstance(data, dict) and "frames" in data
-
-
-def read_photograph_camera(
-    path: str, photograph: Path
-) -> tuple[Float64Array, CameraModel]:
-    """Return pose and model of the camera that took a photograph, by its file name.
-
-    Where files of several folders have that name, the folders decide.
-
-    Args:
+    Attributes:
         path: COLMAP's images.txt with the cameras.txt beside it, or a transforms.json.
-        photograph: the file.
+        files: files of the photographs, by the names of their entries.
+        read_entry: returns pose and model of an entry, as `find` does.
+    """
 
-    Returns:
-        The pose (4, 4) leads from the camera's axes (x to the right, y down, z ahead)
-        to the file's world.
+    path: str
+    files: Mapping[str, str]
+    read_entry: Callable[[str], tuple[Float64Array, CameraModel]]
+
+    def find(self, photograph: Path) -> tuple[Float64Array, CameraModel]:
+        """Return pose and model of the camera that took a photograph, by its file name.
+
+        Where files of several folders have that name, the folders decide.
+
+        Returns:
+            The pose (4, 4) leads from the camera's axes (x to the right, y down, z
+            ahead) to the file's world.
+
+        Raises:
+            FileFormatError: an entry cannot be used, or the photograph is named never
+                or several times.
+        """
+        return self.read_entry(_find_photograph(self.path, self.files, photograph))
+
+
+def read_photograph_cameras(path: str) -> PhotographCameras | None:
+    """Read the cameras of many photographs; None if the file is of another kind.
+
+    `path` names none of its cameras.
 
     Raises:
-        FileFormatError: the file cannot be used, or names the photograph never or
-            several times.
+        FileFormatError: the file cannot be used.
     """
     if Path(path).name == COLMAP_IMAGES:
-        words_by_id = _parse_images(path)
-        files = {name: words[-1] for name, words in words_by_id.items()}
-        name = _find_photograph(path, files, photograph)
+        return _read_image_cameras(path)
+    if Path(path).suffix.lower() != ".json":
+        return None
+    try:
+        data = parse_json(read_text(Path(path), "a camera file", MAX_JSON_SIZE))
+    except (OSError, ValueError):
+        return None  # `read_camera` reports what is wrong with it
+    if not isinstance(data, dict) or "frames" not in data:
+        return None
+    frames = _check_frames(path, data)["frames"]
+    files = {str(i): str(frame.get("file_path", "")) for i, frame in enumerate(frames)}
+
+    def read_frame(name: str) -> tuple[Float64Array, CameraModel]:
+        return _read_frame_pose(path, data, name), make_camera(f"{path}#{name}", data)
+
+    return PhotographCameras(path, files, read_frame)
+
+
+def _read_image_cameras(path: str) -> PhotographCameras:
+    """Read the cameras of COLMAP's images.txt."""
+    words_by_id = _parse_images(path)
+    files = {name: words[-1] for name, words in words_by_id.items()}
+    read_model = cache(read_camera)  # many images have one camera
+
+    def read_image(name: str) -> tuple[Float64Array, CameraModel]:
         words = words_by_id[name]
         pose = _parse_image(f"{path}: image {name[:40]}", words)
-        return pose, _read_image_model(path, words)
-    data = _parse_transforms(path)
-    files = {
-        str(index): str(frame.get("file_path", ""))
-        for index, frame in enumerate(data["frames"])
-    }
-    name = _find_photograph(path, files, photograph)
-    return _read_frame_pose(path, data, name), read_camera(f"{path}#{name}")
+        return pose, read_model(_name_image_camera(path, words))
+
+    return PhotographCameras(path, files, read_image)
 
 
 def _find_photograph(path: str, files: Mapping[str, str], photograph: Path) -> str:
@@ -416,7 +442,11 @@ def _read_transforms(path: str, frame_names: str) -> tuple[Mount, ...]:
 def _parse_transforms(path: str) -> dict[str, Any]:
     """Parse a transforms.json, whose `frames` are a list of mappings."""
     text = read_existing_text(path, "a camera file", MAX_JSON_SIZE)
-    data = parse_text(path, text, "JSON", parse_json)
+    return _check_frames(path, parse_text(path, text, "JSON", parse_json))
+
+
+def _check_frames(path: str, data: Any) -> dict[str, Any]:
+    """Return a transforms.json as it is; raise FileFormatError unless it is one."""
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not all(
         isinstance(frame, dict) for frame in frames
@@ -508,7 +538,12 @@ def _read_image_model(path: str, words: Sequence[str]) -> CameraModel:
 
     `words` are the image's line, of 10 words, of which the ninth is the camera's id.
     """
-    return read_camera(f"{Path(path).with_name('cameras.txt')}#{words[8]}")
+    return read_camera(_name_image_camera(path, words))
+
+
+def _name_image_camera(path: str, words: Sequence[str]) -> str:
+    """Return how `read_camera` is asked for the camera of an image's line."""
+    return f"{Path(path).with_name('cameras.txt')}#{words[8]}"
 
 
 def _parse_images(path: str) -> dict[str, list[str]]:

@@ -513,6 +513,25 @@ GROUND = (
         description="Height of the ground that takes the shadow in a photograph "
         "(`backdrop`).",
     ),
+    Parameter(
+        "gloss",
+        shape=(),
+        unit="1",
+        low=0.0,
+        high=1.0,
+        default=0.0,
+        description="What a coat on that ground reflects at a right angle: 0 is matt, 0.02 "
+        "water, 0.04 varnish, 1 a mirror.",
+    ),
+    Parameter(
+        "roughness",
+        shape=(),
+        unit="1",
+        low=0.05,
+        high=1.0,
+        default=0.2,
+        description="Roughness of the coat: 0.05 is polished, 1 blurs all.",
+    ),
     *Parameter.colors(
         "of the table.", defaults=(0.55, 0.45, 0.37), estimators=("differences",)
     ),
@@ -656,13 +675,14 @@ def resolve_settings(settings: SettingValues) -> dict[str, float | None]:
                     name, str(value), setting.options, "Write it as `set` NAME=VALUE."
                 )
             value = setting.options.index(str(value))
+        unit = "" if setting.unit == "1" else f" ({setting.unit})"
+        allowed_range = f"{setting.low:g} to {setting.high:g}{unit}"
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise InputError(
-                f"`set` {name}: expected a number in {setting.unit}, got {value!r}"
+                f"`set` {name}: expected a number from {allowed_range}, got {value!r}"
             )
         values[name] = float(value)
         if not setting.low <= value <= setting.high:  # NaN is not, either
-            allowed_range = f"{setting.low:g} to {setting.high:g} ({setting.unit})"
             raise InputError(
                 f"`set` {name}: expected a number from {allowed_range}, got {value:g}"
             )

@@ -172,6 +172,18 @@ def read_text(path: Path, expected: str, limit: int) -> str:
         ) from None
 
 
+def read_existing_bytes(path: Path, expected: str, limit: int) -> bytes:
+    """Return what `read_bytes` returns, and raise FileFormatError where it raises
+    OSError, too.
+    """
+    try:
+        return read_bytes(path, expected, limit)
+    except OSError as error:
+        raise FileFormatError(
+            f"{path}: expected {expected}, got {error.strerror}; check the path"
+        ) from None
+
+
 def read_existing_text(path: Path | str, expected: str, limit: int) -> str:
     """Return the text of a file that has to exist, as `read_text` does.
 

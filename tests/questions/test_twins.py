@@ -209,6 +209,19 @@ def test_an_attack_states_what_the_run_of_twins_measured(compared: TwinsResult, 
     assert any("was not measured" in text for text in list_remarks(summary, get_view(summary)))
 
 
+@pytest.mark.parametrize(
+    "names, words",
+    [
+        ({}, r"photographs.csv: row 1: .*no label 'cup'.*'mug'.* Or name its class with `names`, obj_000001=CLASS"),
+        ({"obj_000001": "mug"}, r"photographs.csv: row 2: .*no label 'box'.*obj_000002=CLASS"),
+        ({"obj_000001": "mugg"}, r"names: obj_000001: the model has no label 'mugg'. Did you mean 'mug'"),
+    ],
+)
+def test_a_label_that_the_model_does_not_know_is_named_with_its_row(names: dict[str, str], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        advsearch.twins(PHOTOGRAPHS / "photographs.csv", model="small_models:easy", names=names)
+
+
 @pytest.mark.medium
 def test_sweep_gate_and_evidence_state_what_the_run_of_twins_measured(tmp_path: Path) -> None:
     """Of one run of two models: the row of the model and its environment, and how it is put into words."""

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 import advsearch
 import samples
@@ -19,6 +20,7 @@ from advsearch.errors import FileFormatError, InputError
 from advsearch.scene import photograph_files
 from advsearch.scene.geometry import camera_to_world, object_to_world
 from advsearch.scene.photograph_files import read_photograph_folder, read_photograph_view
+from advsearch.trust import stored_files
 
 BOX = str(samples.PHOTOGRAPHS / "models" / "obj_000002.ply")
 NAMES = [f"{number:06d}.jpg" for number in (1, 3, 5, 7, 9, 11)]
@@ -78,9 +80,15 @@ def test_the_first_photograph_is_the_clean_scene_and_one_is_chosen(folder: Path)
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("ground", [{"set": {"ground.size": 0.0}}, {}], ids=["object", "shadow"])
-def test_a_photograph_of_a_folder_is_as_that_photograph_alone(tmp_path: Path, ground: dict[str, Any]) -> None:
-    folder = samples.write_photograph_folder(tmp_path / "desk", **ground)
+@pytest.mark.parametrize("ground", ["none", "below the object", "at several heights"])
+def test_a_photograph_of_a_folder_is_as_that_photograph_alone(tmp_path: Path, ground: str) -> None:
+    folder = samples.write_photograph_folder(tmp_path / "desk", set={"ground.size": 0.0 if ground == "none" else 12.0})
+    if ground == "at several heights":
+        for place, name in enumerate(NAMES):  # and with focal lengths of their own
+            file = (folder / name).with_suffix(".json")
+            matrix = json.loads(file.read_text("utf-8"))["camera_matrix"]
+            matrix[0][0] *= 1.0 + 0.1 * place
+            change_json(file, set={"ground.level": -0.2 * place}, camera_matrix=matrix)
     scene = advsearch.load_scene(BOX, "low-sun", backdrop=folder, unit="mm")
     render = scene.renderer({"backdrop": {"which": NAMES[:3]}}, resolution=48)
     for place in (0, 2):
@@ -94,7 +102,7 @@ def test_a_photograph_of_a_folder_is_as_that_photograph_alone(tmp_path: Path, gr
 
 def test_a_folder_needs_the_control_and_the_control_a_folder(folder: Path) -> None:
     scene = advsearch.load_scene(BOX, backdrop=folder, unit="mm")
-    with pytest.raises(InputError, match="is a folder of 6 photographs; name one of them, or let the control"):
+    with pytest.raises(InputError, match="is a folder of photographs; name one of them, or let the control"):
         scene.renderer("texture", resolution=96)
     with pytest.raises(InputError, match=r"chooses among the photographs of a folder.*give `backdrop=FOLDER`"):
         advsearch.load_scene(BOX, backdrop=folder / NAMES[0], unit="mm").renderer("backdrop", resolution=96)
@@ -115,8 +123,58 @@ def test_photographs_that_can_not_be_chosen_among_are_named(tmp_path: Path) -> N
         if name != NAMES[1]:
             change_json((folder / name).with_suffix(".json"), up=[0.0, -1.0, 0.0])
     scene = advsearch.load_scene(BOX, backdrop=folder, unit="mm")
-    with pytest.raises(InputError, match=r"the object stands in 000003.jpg with another side down"):
+    with pytest.raises(InputError, match=r"in 000003.jpg the object stands with another side down than in"):
         scene.renderer("backdrop", resolution=96)
+    for name in NAMES:
+        change_json(
+            (folder / name).with_suffix(".json"), up=None, set={"ground.gloss": 0.04 if name == NAMES[1] else 0.02}
+        )
+    scene = advsearch.load_scene(BOX, backdrop=folder, unit="mm")
+    with pytest.raises(InputError, match=r"in 000003.jpg the plane has another size or gloss \(ground.size, "):
+        scene.renderer("backdrop", resolution=96)
+
+
+@pytest.mark.parametrize("name", ["transforms.json", "images.txt"])
+def test_one_file_has_the_cameras_of_a_folder_and_is_read_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    photographs = tmp_path / "frames"
+    photographs.mkdir()
+    frames = []
+    lines = []
+    for number in range(3):
+        file = f"{number}.png"
+        Image.new("RGB", (64, 48), (90, 60 * number, 30)).save(photographs / file)
+        pose = np.eye(4)
+        pose[2, 3] = 1.0 + number
+        frames.append({"file_path": f"frames/{file}", "transform_matrix": pose.tolist()})
+        # from the world to the camera, whose y is down and z ahead: turned about x by 180 degrees
+        lines.append(f"{number} 0 1 0 0 0 0 {1 + number} 7 frames/{file}\n\n")
+    lens = {"camera_model": "PINHOLE", "fl_x": 50, "fl_y": 60, "cx": 32, "cy": 24, "w": 64, "h": 48}
+    (tmp_path / "transforms.json").write_text(json.dumps(lens | {"frames": frames}))
+    (tmp_path / "images.txt").write_text("".join(lines))
+    (tmp_path / "cameras.txt").write_text("7 PINHOLE 64 48 50 60 32 24\n")
+    with pytest.raises(FileFormatError, match=r"0.png: expected its camera file .* or give `camera` for all"):
+        advsearch.load_scene("mug", backdrop=photographs)
+    opened: list[str] = []
+    open_regular = stored_files.open_regular
+
+    def open_noted(path: Path, *rest: Any) -> Any:
+        opened.append(Path(path).name)
+        return open_regular(path, *rest)
+
+    monkeypatch.setattr(stored_files, "open_regular", open_noted)
+    scene = advsearch.load_scene("mug", backdrop=photographs, camera=str(tmp_path / name)).description
+    assert [file for file in opened if file.endswith((".json", ".txt"))] == (
+        [name] if name == "transforms.json" else [name, "cameras.txt"]
+    )
+    assert scene.photographs and list(scene.photographs.scenes) == ["0.png", "1.png", "2.png"]
+    for number, view in enumerate(scene.photographs.scenes.values()):
+        height = camera_to_world(view)[:3, 3] * view.size_in_metres
+        np.testing.assert_allclose(height, [0.0, 0.0, 1.0 + number], atol=1e-9)
+        assert view.camera_model and view.camera_model.values["fx"] == 50 / 64
+    opened_files = stored_files.list_opened_files(photographs)
+    assert str(tmp_path / name) in opened_files, "a run keeps its digest"
 
 
 def write_text(name: str, text: str) -> Callable[[Path], None]:

@@ -246,11 +246,14 @@ class Comparison:
             if not self._is_hidden(item)
         }
         assets: dict[Path, Any] = {}
+        checked_labels: set[tuple[str, str]] = set()
         windows: dict[int, rendering.PhotoWindow] = {}
         for number, item in visible.items():
+            label = (item.object, item.label)
+            if label not in checked_labels:
+                self._check_label(item)
+                checked_labels.add(label)
             if item.mesh not in assets:
-                for judge in self._judges:
-                    judge.task.check(self._make_facts(item))
                 self._context.progress.stage(f"reading {item.object}")
                 assets[item.mesh] = self._load_asset(item)
             window = self._choose_window(item, assets[item.mesh])
@@ -297,6 +300,21 @@ class Comparison:
                 f"{rendering.MIN_SILHOUETTE:g} pixels and left out."
             )
         return warnings
+
+    def _check_label(self, item: PhotographedObject) -> None:
+        """Raise InputError if a model does not know the right label of an object."""
+        for judge in self._judges:
+            try:
+                judge.task.check(self._make_facts(item))
+            except InputError as error:
+                reason = str(error).removeprefix("label: ")
+                if item.object in self._config.names:
+                    raise InputError(f"names: {item.object}: {reason}") from None
+                end = "" if reason.endswith(("?", ".")) else "."
+                raise InputError(
+                    f"{item.where}: {reason}{end} Or name its class with `names`, "
+                    f"{item.object}=CLASS"
+                ) from None
 
     def _load_asset(self, item: PhotographedObject) -> Any:
         """Return the object that a photograph shows; one that was read is cached."""

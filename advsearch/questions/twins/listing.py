@@ -86,6 +86,7 @@ class PhotographedObject:
         visible_mask: file of what is visible of it; None without.
         visible: fraction of the silhouette that is visible; None if it is not known.
         box: x, y, width and height of the silhouette in pixels, by the data set.
+        where: file and entry that name it, for messages.
     """
 
     photograph: Path
@@ -101,6 +102,7 @@ class PhotographedObject:
     visible_mask: Path | None = None
     visible: float | None = None
     box: tuple[float, float, float, float] | None = None
+    where: str = ""
 
 
 @dataclass(frozen=True)
@@ -205,6 +207,7 @@ def _read_scene(scene: Path, models: Path, condition: str) -> Listing:
             "camera": _read_bop_camera(scene, cameras, image),
             "unit": "mm",
             "condition": condition,
+            "where": where,
         }
         image_infos = infos.get(image)
         for index, entry in enumerate(entries):
@@ -389,6 +392,7 @@ def _read_row(row: Mapping[str, Any], path: Path, where: str) -> PhotographedObj
         label=str(row.get("label") or "")[:MAX_TEXT],
         condition=str(row.get("condition") or "")[:MAX_TEXT],
         mask=_get_file(row, "mask", path, where) if "mask" in row else None,
+        where=where,
     )
 
 

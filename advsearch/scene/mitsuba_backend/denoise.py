@@ -88,12 +88,13 @@ def denoise_image(
     *,
     quick: bool = False,
 ) -> Tensor:
-    """Denoise a rendered image (H, W, C), where C is 3, 4 or 7.
+    """Denoise a rendered image (H, W, C), where C is 3, 4, 7 or 13.
 
     Args:
         rendered: channels 0 to 2 are radiance; 3 is coverage, which stays as it is; 4
             to 6 are the change of the radiance of the plane that takes the shadow in a
-            photograph.
+            photograph, 7 to 9 that of what its coat reflects, and 10 to
+            12 the environment in the coat.
         albedo, normal: as for `denoise`.
         plane_radiance: (3,) of the plane without the object; None if there is no plane.
         quick: as for `denoise`.
@@ -103,13 +104,26 @@ def denoise_image(
     channels = [denoise(color, albedo, normal, quick=quick), coverage]
     if plane_radiance is not None:
         relative_change = _denoise_shade(
-            rendered[..., 4:] / plane_radiance,
+            rendered[..., 4:7] / plane_radiance,
             (1.0 - coverage).clamp(0.0, 1.0),  # where no surface covers the plane
             lambda shade: denoise(shade, albedo, normal, quick=quick),
         )
         # the plane is a surface too: where nothing is hit there is no normal
         is_surface = (normal != 0.0).any(dim=-1, keepdim=True)
         channels.append(plane_radiance * is_surface * relative_change)
+    if rendered.shape[-1] > 7:
+        # what the coat reflects with the object and without it, each an image by itself
+        change = rendered[..., 7:10]
+        before = rendered[..., 10:].contiguous()
+        after = (before + change).clamp_min(0.0)
+        before, after = (
+            denoise(image, albedo, normal, quick=quick) for image in (before, after)
+        )
+        assert plane_radiance is not None
+        channels += [
+            (after - before) * _compute_fade(change / plane_radiance),
+            before,
+        ]
     return torch.cat(channels, dim=-1)
 
 
@@ -136,8 +150,16 @@ def _denoise_shade(
     full_change = (change + FILL_WEIGHT * mean_nearby) / (visible + FILL_WEIGHT)
     # 1 is added for the filter, since a change may be negative
     clean = remove_noise((1.0 + full_change).clamp_min(0.0).contiguous()) - 1.0
+    return clean * visible * _compute_fade(change)
+
+
+def _compute_fade(change: Tensor) -> Tensor:
+    """Return a factor (H, W, 1) that is 0 where nothing near a change (H, W, 3) is.
+
+    The change is relative to the radiance of the plane.
+    """
     magnitude = _average(change.abs().mean(dim=-1, keepdim=True), FADE_RADIUS)
-    return clean * visible * (magnitude / MIN_CHANGE).clamp_max(1.0)
+    return (magnitude / MIN_CHANGE).clamp_max(1.0)
 
 
 def _average(image: Tensor, radius: int) -> Tensor:

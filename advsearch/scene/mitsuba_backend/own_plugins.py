@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from advsearch.scene.assets import Float32Array, Float64Array, IntArray
+from advsearch.scene.backdrop import compute_refractive_index
 from advsearch.scene.camera_model import NUMBER_NAMES, CameraModel
 from advsearch.scene.mitsuba_backend.variant import dr, mi
 
@@ -121,6 +122,8 @@ def _find_highest_drops(drops: Float64Array, half_width: float) -> IntArray:
 common: Any = mi.ad.integrators.common
 PRBIntegrator: Any = mi.ad.integrators.prb.PRBIntegrator
 PLANE_SHAPE = "ground"  # Mitsuba's id of the plane that takes the shadow
+COAT_FRACTION = 0.5  # of the paths from a plane with a coat: those that leave its coat
+MIN_DENSITY = 1e-20  # per steradian
 ISOTROPIC_PHASE = 1.0 / (4.0 * math.pi)  # isotropic phase function, per steradian
 MIN_EXTINCTION = 1e-20
 MAX_SCATTERINGS = 8
@@ -434,24 +437,73 @@ def _make_event(ray: Any, si: Any, scattered: Any, distance: Any) -> Any:
 mi.register_integrator("advsearch_haze", lambda props: HazePath(props))
 
 
+class _Coat:
+    """A rough, clear coat (GGX, Walter et al. 2007) without color.
+
+    Args:
+        reflectance: that at a right angle, in [0, 1]; Fresnel's elsewhere.
+        roughness: in [0, 1], the square root of the distribution's width.
+    """
+
+    def __init__(self, reflectance: float, roughness: float) -> None:
+        """Find the index of refraction; arguments are those of the class."""
+        self._index = compute_refractive_index(reflectance)
+        self._alpha = roughness**2
+
+    def sample(self, incident: Any, point: Any) -> Any:
+        """Sample a direction of light; all directions are local, z is the normal.
+
+        Args:
+            incident: unit direction to the viewer.
+            point: two random numbers.
+        """
+        normal, _ = self._make_distribution().sample(incident, point)
+        return mi.reflect(incident, normal)
+
+    def evaluate(self, incident: Any, direction: Any) -> tuple[Any, Any]:
+        """Return the reflected fraction times the cosine, and the density of `sample`.
+
+        Args:
+            incident: unit direction to the viewer.
+            direction: unit direction to the light.
+        """
+        half = dr.normalize(incident + direction)
+        cosine = dr.dot(incident, half)
+        is_above = (incident.z > 0.0) & (direction.z > 0.0) & (cosine > 0.0)
+        distribution = self._make_distribution()
+        value = mi.fresnel(cosine, self._index)[0] * distribution.eval(half)
+        value *= distribution.G(incident, direction, half) / (4.0 * incident.z)
+        density = distribution.pdf(incident, half) / (4.0 * cosine)
+        return dr.select(is_above, value, 0.0), dr.select(is_above, density, 0.0)
+
+    def _make_distribution(self) -> Any:
+        return mi.MicrofacetDistribution(mi.MicrofacetType.GGX, self._alpha)
+
+
 class _PlaneHits:
     """Camera rays that meet the plane first, and where their paths go on.
+
+    Its changes are those of the light that the matt ground reflects and, if there is a
+    coat, that the coat reflects; the last is all of the environment in the coat.
 
     Args:
         scene, sampler: as in `mi.ad.integrators.common.RBIntegrator`.
         ray: camera rays.
         active: which are traced at all.
+        coat: coat of the plane; None if it is matt.
 
     Attributes:
         is_hit: whether a ray meets the plane first.
-        direct_change: the change of its radiance by what hides the environment, and by
-            lamps.
-        weight: weight of the light that comes along the path's next segment.
+        direct_changes: the changes by what hides the environment, and by lamps.
+        weights: for each change the weight of the light that comes along the path's
+            next segment.
         path_ray: that segment as a ray; of other rays, the camera ray.
         is_traced: whether there is such a segment.
     """
 
-    def __init__(self, scene: Any, sampler: Any, ray: Any, active: Any) -> None:
+    def __init__(
+        self, scene: Any, sampler: Any, ray: Any, active: Any, coat: _Coat | None
+    ) -> None:
         """Intersect camera rays with the plane, and sample what it does to the light.
 
         Arguments and what is set are those of the class.
@@ -460,24 +512,34 @@ class _PlaneHits:
         hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
         self.is_hit = active & hit.is_valid() & (hit.shape == mi.ShapePtr(plane))
         self._si = hit.compute_surface_interaction(ray, mi.RayFlags.All, self.is_hit)
-        light = self._sample_emitter(scene, sampler)  # which also sets `_factor`
-        self.direct_change = dr.select(self.is_hit, self._factor * light, 0.0)
-        bounce, self.weight = self._si.bsdf().sample(
-            mi.BSDFContext(),
-            self._si,
-            sampler.next_1d(),
-            sampler.next_2d(),
-            self.is_hit,
-        )
-        bounced_ray = self._si.spawn_ray(self._si.to_world(bounce.wo))
+        self._coat = coat
+        # Of a plane with a coat the matt part alone; ratios need no transmittance.
+        self._albedo = self._si.bsdf().eval_diffuse_reflectance(self._si, self.is_hit)
+        light = self._sample_emitter(scene, sampler)  # which also sets `_factors`
+        self.direct_changes = [
+            dr.select(self.is_hit, factor * light, 0.0) for factor in self._factors
+        ]
+        is_off_coat = sampler.next_1d() < COAT_FRACTION
+        direction = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
+        self.weights = [self._albedo]
+        is_bounced = direction.z > 0.0
+        if coat is not None:
+            direction, is_bounced = self._choose_bounce(
+                coat, direction, is_off_coat, sampler
+            )
+        bounced_ray = self._si.spawn_ray(self._si.to_world(direction))
         self.path_ray = dr.select(self.is_hit, bounced_ray, ray)
-        self.is_traced = active & (~self.is_hit | (bounce.pdf > 0.0))
+        self.is_traced = active & (~self.is_hit | is_bounced)
+        if coat is not None:
+            self._reflect_environment(scene, coat, direction)
 
     def _sample_emitter(self, scene: Any, sampler: Any) -> Any:
         """Sample an emitter from the plane, and return its radiance over the density.
 
-        `_factor` is set to the fraction of this light that the plane reflects, with the
-        sign by which it changes the photograph.
+        `_factors` are set to what the object changes: the light that the plane
+        reflects, times -1 for light of the environment that something blocks and 0 for
+        what passes; for a lamp, which the photograph does not have, 0 for what is
+        blocked and 1 for what passes.
         """
         si = self._si
         ds, light = scene.sample_emitter_direction(
@@ -490,26 +552,113 @@ class _PlaneHits:
         # -1 and 0, since the photograph has its light already
         sign = dr.select(is_blocked, 0.0, 1.0)
         sign = dr.select(is_environment, sign - 1.0, sign)
-        reflected = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(ds.d), is_sampled)
+        direction = si.to_local(ds.d)
+        reflected = self._albedo * dr.inv_pi * dr.maximum(direction.z, 0.0)
         self._emitter_sample = ds
-        self._factor = dr.select(is_sampled, sign * reflected, 0.0)
+        self._factors = [dr.select(is_sampled, sign * reflected, 0.0)]
+        if self._coat is not None:
+            value, density = self._coat.evaluate(si.wi, direction)
+            # the bounce meets the environment too: the balance heuristic (Veach 1997)
+            share = ds.pdf / (ds.pdf + COAT_FRACTION * density)
+            value *= dr.select(is_environment, share, 1.0)
+            self._factors.append(mi.Color3f(dr.select(is_sampled, sign * value, 0.0)))
+            is_met = is_sampled & is_environment
+            self._factors.append(mi.Color3f(dr.select(is_met, value, 0.0)))
         return light
 
-    def backpropagate(self, scene: Any, cotangent: Any) -> None:
-        """Add the derivatives of `cotangent * direct_change` by the lights' parameters.
+    def _choose_bounce(
+        self, coat: _Coat, matt_direction: Any, is_off_coat: Any, sampler: Any
+    ) -> tuple[Any, Any]:
+        """Choose whether a path goes on from the matt ground or from its coat.
+
+        `weights` are set, of which one is not 0.
+
+        Args:
+            coat: coat of the plane.
+            matt_direction: local direction of a path from the matt ground.
+            is_off_coat: whether it goes on from the coat.
+            sampler: as in the class.
+
+        Returns:
+            The local direction of the path, and whether there is one.
+        """
+        reflected = coat.sample(self._si.wi, sampler.next_2d())
+        value, density = coat.evaluate(self._si.wi, reflected)
+        is_reflected = density > 0.0
+        coat_weight = dr.select(is_reflected, value / density, 0.0) / COAT_FRACTION
+        self.weights = [
+            dr.select(is_off_coat, 0.0, self._albedo / (1.0 - COAT_FRACTION)),
+            mi.Color3f(dr.select(is_off_coat, coat_weight, 0.0)),
+            mi.Color3f(0.0),
+        ]
+        direction = dr.select(is_off_coat, reflected, matt_direction)
+        is_bounced = dr.select(is_off_coat, is_reflected, matt_direction.z > 0.0)
+        return direction, is_bounced
+
+    def _reflect_environment(self, scene: Any, coat: _Coat, direction: Any) -> None:
+        """Add the environment that a bounce off the coat meets, or that it does not.
+
+        The weight is that of the path times the rest of the balance heuristic in
+        `_sample_emitter`.
+
+        Args:
+            scene: as in the class.
+            coat: coat of the plane.
+            direction: local direction of the bounce.
+        """
+        environment = scene.environment()
+        ds = dr.zeros(mi.DirectionSample3f)
+        ds.d = self.path_ray.d
+        ds.emitter = mi.EmitterPtr(environment)
+        is_bounced = self.is_hit & self.is_traced
+        density = COAT_FRACTION * coat.evaluate(self._si.wi, direction)[1]
+        both = density + scene.pdf_emitter_direction(self._si, ds, is_bounced)
+        share = density / dr.maximum(both, MIN_DENSITY)
+        beyond = dr.zeros(mi.SurfaceInteraction3f)  # a ray that leaves the scene
+        beyond.wi = -ds.d
+        beyond.wavelengths = self._si.wavelengths
+        met = self.weights[1] * share * environment.eval(beyond, is_bounced)
+        met = dr.select(is_bounced, met, 0.0)
+        is_blocked = scene.ray_test(self.path_ray, is_bounced)
+        self.direct_changes[1] -= dr.select(is_blocked, met, 0.0)
+        self.direct_changes[2] += met
+
+    def list_changes(self, path_radiance: Any) -> list[Any]:
+        """Return the changes, three channels each, with the light that paths bring."""
+        channels: list[Any] = []
+        for weight, change in zip(self.weights, self.direct_changes, strict=True):
+            full_change = weight * path_radiance + change
+            channels.extend(dr.select(self.is_hit, full_change, 0.0))
+        return channels
+
+    def backpropagate(self, scene: Any, cotangents: list[Any]) -> Any:
+        """Add the derivatives of the direct changes by the lights' parameters.
 
         The emitter sample is that of the primal pass, evaluated again with gradients.
+        The environment that a bounce meets has none: in a photograph it is fixed.
+
+        Args:
+            scene: as in the class.
+            cotangents: those of `list_changes`.
+
+        Returns:
+            The cotangent of the path's radiance.
         """
         ds = self._emitter_sample
         is_sampled = self.is_hit & (ds.pdf != 0.0)
         with dr.resume_grad():
             light = scene.eval_emitter_direction(self._si, ds, is_sampled)
             light *= dr.select(is_sampled, dr.rcp(ds.pdf), 0.0)
-            if dr.grad_enabled(light):
-                # Derivatives of the rest of the path go back through the same lights
-                # later: what leads to them is kept.
-                change = cotangent * self._factor * light
-                dr.backward_from(change, dr.ADFlag.ClearInterior)
+        path_cotangent = mi.Spectrum(0.0)
+        for index, factor in enumerate(self._factors):
+            cotangent = mi.Spectrum(*cotangents[3 * index : 3 * index + 3])
+            path_cotangent += self.weights[index] * cotangent
+            with dr.resume_grad():
+                change = cotangent * factor * light
+                if dr.grad_enabled(change):
+                    # The path goes along the same edges later: they are kept.
+                    dr.backward_from(change, dr.ADFlag.ClearInterior)
+        return path_cotangent
 
 
 class PhotographPath(PRBIntegrator):  # type: ignore[misc]
@@ -526,8 +675,19 @@ class PhotographPath(PRBIntegrator):  # type: ignore[misc]
     Both are exactly zero where nothing is in the way, so that the photograph stays as
     it is there, without noise. The object sees the plane as any other surface.
 
+    With a `reflectance` above 0 (and a `roughness`) the plane has a clear coat, and six
+    further channels are the same change of what that reflects, and the environment in
+    it without the object. Other surfaces see the plane's own plugin, which may differ.
+
     The derivative is that of `prb` on what is left of the path.
     """
+
+    def __init__(self, props: Any) -> None:
+        """Read the coat; `props` are Mitsuba's."""
+        super().__init__(props)
+        reflectance = props.get("reflectance", 0.0)
+        roughness = props.get("roughness", 1.0)
+        self.coat = _Coat(reflectance, roughness) if reflectance > 0.0 else None
 
     def sample(
         self,
@@ -544,15 +704,14 @@ class PhotographPath(PRBIntegrator):  # type: ignore[misc]
         """Sample paths of light, or in the adjoint modes replay them.
 
         Where a ray meets the plane that takes the shadow, the color is 0, and the
-        change of the plane's radiance is returned in three further channels (`δaovs`
-        are their cotangents). Arguments and results are those of
+        changes of the plane's radiance are returned in further channels, three each
+        (`δaovs` are their cotangents). Arguments and results are those of
         `mi.ad.integrators.common.RBIntegrator`.
         """
-        plane = _PlaneHits(scene, sampler, mi.Ray3f(dr.detach(ray)), mi.Bool(active))
+        camera_ray = mi.Ray3f(dr.detach(ray))
+        plane = _PlaneHits(scene, sampler, camera_ray, mi.Bool(active), self.coat)
         if mode != dr.ADMode.Primal:
-            change = mi.Spectrum(*δaovs)
-            plane.backpropagate(scene, change)
-            δL = dr.select(plane.is_hit, plane.weight * change, δL)
+            δL = dr.select(plane.is_hit, plane.backpropagate(scene, δaovs), δL)
         L, valid, _, state_out = super().sample(
             mode=mode,
             scene=scene,
@@ -563,9 +722,8 @@ class PhotographPath(PRBIntegrator):  # type: ignore[misc]
             active=plane.is_traced,
             **rest,
         )
-        change = dr.select(plane.is_hit, plane.weight * L + plane.direct_change, 0.0)
         color = dr.select(plane.is_hit, 0.0, L)
-        return color, valid & ~plane.is_hit, [*change], state_out
+        return color, valid & ~plane.is_hit, plane.list_changes(L), state_out
 
     def sample_rays(self, scene: Any, sensor: Any, sampler: Any, **rest: Any) -> Any:
         """Return rays, weights and positions, with weights that are plain numbers.
@@ -577,7 +735,10 @@ class PhotographPath(PRBIntegrator):  # type: ignore[misc]
         return ray, mi.Float(weight[0]), position
 
     def aov_names(self) -> list[str]:
-        return [f"plane.{channel}" for channel in "RGB"]
+        names = ["plane"]
+        if self.coat is not None:
+            names += ["coat", "environment"]
+        return [f"{name}.{channel}" for name in names for channel in "RGB"]
 
 
 mi.register_integrator("advsearch_photograph", lambda props: PhotographPath(props))

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from advsearch.errors import InputError
 from advsearch.scene import parts
-from advsearch.scene.backdrop import has_plane
+from advsearch.scene.backdrop import compute_refractive_index, has_plane
 from advsearch.scene.camera_model import NUMBER_NAMES, CameraModel
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
@@ -485,6 +485,9 @@ def _make_rgb(value: Sequence[float]) -> Plugin:
 
 
 GROUND_NAME = "ground"
+# of the plane's coat in a photograph, as other surfaces see it: a smoother one would
+# make fireflies on them
+MIN_PLANE_ROUGHNESS = 0.3
 
 
 def make_scene_dict(
@@ -564,15 +567,24 @@ def _make_ground(description: SceneDescription) -> Any:
         level = description.get_number("ground.level")
     srgb = np.array(description.ground_color, np.float32)
     reflectance = _make_rgb(srgb_to_linear(srgb).tolist())
+    bsdf: Plugin = {"type": "diffuse", "reflectance": reflectance}
+    gloss = description.get_number("ground.gloss")
+    if description.backdrop_photograph is not None and gloss > 0.0:
+        roughness = description.get_number("ground.roughness")
+        bsdf = {
+            "type": "roughplastic",
+            "distribution": "ggx",
+            "alpha": max(roughness, MIN_PLANE_ROUGHNESS) ** 2,
+            "int_ior": compute_refractive_index(gloss),
+            "ext_ior": 1.0,
+            "diffuse_reflectance": reflectance,
+        }
     return {
         "type": "rectangle",
         "to_world": mi.ScalarTransform4f()
         .translate([0.0, 0.0, level])
         .scale(size / 2.0),  # Mitsuba's rectangle is 2 wide
-        "bsdf": {
-            "type": "twosided",
-            "bsdf": {"type": "diffuse", "reflectance": reflectance},
-        },
+        "bsdf": {"type": "twosided", "bsdf": bsdf},
     }
 
 
@@ -707,6 +719,8 @@ def make_scene_inputs(resolution: tuple[int, int]) -> tuple[SceneInput, ...]:
         # (H, W + 2, 3): a copy of the last column before the first, and of the first
         # after the last
         SceneInput("environment.padded", "environment.data", is_interior=True),
+        # of the plane that takes the shadow in a photograph
+        _make_pose_input(GROUND_NAME, "to_world"),
         # (h, w, 3): of a ground that shows the environment's photograph
         # (`advsearch.scene.grounds`)
         SceneInput(

@@ -372,7 +372,8 @@ class MitsubaScene:
             For each of `seeds` (H, W, 3) float32, of the window if there is one; of a
             scene with a backdrop (H, W, 4) with the coverage of its surfaces, or with a
             plane that takes the shadow in a photograph (H, W, 7), where the last three
-            are the change of the plane's radiance; of "guides" (H, W, 6), the first
+            are the change of the plane's radiance, or (H, W, 13) with that of what its
+            coat reflects, and the environment in it; of "guides" (H, W, 6), the first
             hit's albedo in [0, 1] and its shading normal.
         """
         INTERRUPTS.look()
@@ -563,13 +564,12 @@ class MitsubaScene:
         """Return a cotangent with the channels of the image that Mitsuba renders.
 
         That is 3; with a backdrop also coverage, whose cotangent is 0 as it has no
-        derivative here; and with a plane in a photograph also the 3 of its change.
+        derivative here; and with a plane in a photograph also those of its change.
         """
         gradient = cotangent.detach().to(torch.float32)
         image_gradient = gradient[..., :3]
         if self._backdrop:
-            # coverage, and behind it the change of a plane
-            n_others = 1 if self.plane_radiance is None else 4
+            n_others = 1 + gradient[..., 4:].shape[-1]
             others = torch.zeros(*gradient.shape[:2], n_others)
             others[..., 1:] = gradient[..., 4:]
             image_gradient = torch.cat([image_gradient, others], dim=-1)
@@ -842,6 +842,8 @@ class MitsubaScene:
             hidden = {**adjoint, "hide_emitters": True}
             if self.plane_radiance is not None:
                 hidden["type"] = "advsearch_photograph"
+                hidden["reflectance"] = self.definition[0].get_number("ground.gloss")
+                hidden["roughness"] = self.definition[0].get_number("ground.roughness")
             recipes: dict[str, Plugin] = {
                 "path": path,
                 "adjoint": adjoint,

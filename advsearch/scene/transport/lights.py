@@ -517,11 +517,15 @@ def find_refusal(renderer: Renderer, varying: Collection[str] = ()) -> Refusal |
         varying: names of controls that vary. They are fixed for each matrix, whatever
             they change; if there are any, light may not change.
     """
+    if renderer.scene.definition[0].get_number("ground.gloss") > 0.0:
+        return Refusal("the ground reflects the object")
     linear_inputs = find_linear_inputs(renderer)
     searched_groups = [
         group for group in renderer.plan.groups if group.control not in varying
     ]
     light_groups = {} if varying else find_lighting(renderer).groups
+    if light_groups and renderer.scene.plane_radiance is not None:
+        return Refusal("light that changes falls on the ground of the photograph too")
     parts = renderer.scene.definition[0].parts
     haze_prefixes = tuple(f"{part.name}." for part in parts if part.volumetric)
     for group in searched_groups:
