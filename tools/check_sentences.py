@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 SENTENCES = frozenset(
     "brief caution cautions command_line hint message note reason refusal remark remarks "
-    "said sentence statement warning warnings why".split()
+    "said sentence statement warning warnings what why".split()
 )
 """Attributes that hold text for people."""
 

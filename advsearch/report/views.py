@@ -468,7 +468,9 @@ def make_case_claim(
 def make_average_claim(case: AverageCase, name: str) -> Claim:
     """Return the claim about the average case of an attack."""
     what = "configurations in which the model is right"
-    extent = Extent.from_count(what, case.correct, case.configurations, case.interval)
+    extent = Extent.from_count(
+        what, case.correct, case.configurations, case.interval, counts_right=True
+    )
     text = (
         f"{name}: the model is right in {format_extent(extent)} configurations drawn "
         "by chance"

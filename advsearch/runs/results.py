@@ -406,6 +406,8 @@ class Extent(Fields):
         description="the mean over draws of the share of each, where "
         "some share one; absent elsewhere",
     )
+    # whether right predictions were counted, for a criterion of them; not stored
+    counts_right: bool = Field(default=False, exclude=True)
 
     @classmethod
     def from_count(
@@ -415,6 +417,8 @@ class Extent(Fields):
         total: int,
         interval: Interval | None,
         share: float | None = None,
+        *,
+        counts_right: bool = False,
     ) -> Extent:
         """Return a count with the interval of its share.
 
@@ -424,6 +428,7 @@ class Extent(Fields):
             total: number of all cases.
             interval: interval of the share; None is the whole of [0, 1].
             share: an estimate of the share; it is left out if it is count over total.
+            counts_right: whether right predictions are counted.
         """
         is_known_from_counts = not total or share == count / total
         stated_share = None if is_known_from_counts else share
@@ -433,6 +438,7 @@ class Extent(Fields):
             total=total,
             interval=interval or (0.0, 1.0),
             share=stated_share,
+            counts_right=counts_right,
         )
 
 

@@ -12,6 +12,7 @@ import samples
 from advsearch.questions.explain.result import ExplainResult
 from advsearch.questions.harden.result import HardenResult
 from advsearch.questions.replay.result import ReplayResult
+from advsearch.questions.report import evidence
 from advsearch.questions.report.evidence import (
     RULES,
     collect_claims,
@@ -23,7 +24,7 @@ from advsearch.questions.report.evidence import (
 from advsearch.questions.report.recorded import RecordedSettings
 from advsearch.questions.report.result import Evidence, format_markdown, make_evidence_page
 from advsearch.report.views import FAILED_SEARCH_ENDINGS, NO_PROOF, NOTHING_CLAIMED, Claim
-from advsearch.runs.results import Result
+from advsearch.runs.results import Extent, Result
 from advsearch.runs.summary import to_json
 
 ENDINGS = (
@@ -138,3 +139,10 @@ def test_predictions_of_several_models_to_the_same_pictures_are_not_counted_toge
     said = [claim for claim in collect_claims(swept) if "is right in" in claim.statement]
     assert [claim.extent and claim.extent.total for claim in said] == [20, 20]
     assert [claim.statement.split()[2] for claim in said] == ["first", "second"]
+
+
+def test_a_criterion_is_that_of_right_predictions_whatever_the_words_are() -> None:
+    counted = [Extent.from_count("right ones", 3, 4, (0.2, 0.9), counts_right=is_right) for is_right in (False, True)]
+    claims = [Claim(kind="measured", statement="3 of 4", extent=extent) for extent in counted]
+    assert len(evidence._criterion_of_claims(claims, 0.5, [])) == 1
+    assert "counts_right" not in counted[1].model_dump()

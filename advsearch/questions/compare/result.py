@@ -480,5 +480,6 @@ def make_compare_claims(result: CompareResult) -> Iterator[views.Claim]:
             second.configurations,
             second.interval,
             second.accuracy,
+            counts_right=True,
         )
         yield views.Claim(kind="measured", statement=statement, extent=extent)

@@ -41,7 +41,12 @@ class RightCounts(results.Fields):
     def make_extent(self, counted_text: str) -> results.Extent:
         """Return the counts for a claim; `counted_text` says what is counted."""
         return results.Extent.from_count(
-            counted_text, self.right, self.total, self.interval, self.share
+            counted_text,
+            self.right,
+            self.total,
+            self.interval,
+            self.share,
+            counts_right=True,
         )
 
 

@@ -445,6 +445,7 @@ def make_harden_claims(result: HardenResult) -> Iterator[views.Claim]:
                 "count": share.right,
                 "of": share.count,
                 "interval": share.interval,
+                "counts_right": True,
             }
             text = (
                 f"{when}, the searches ({result.search}) found no failure in "

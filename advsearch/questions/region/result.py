@@ -190,7 +190,11 @@ def make_region_claims(result: RegionResult) -> Iterator[views.Claim]:
         return
     description = f"samples that are {result.verdict}"
     extent = results.Extent.from_count(
-        description, result.same, result.samples, result.interval
+        description,
+        result.same,
+        result.samples,
+        result.interval,
+        counts_right=result.verdict == "right",
     )
     sides = [
         f"{side.name} {side.low:.4g} to {side.high:.4g} {side.unit}".strip()

@@ -277,7 +277,7 @@ def _criterion_of_claims(
     lines = []
     for claim in claims:
         extent = claim.extent
-        if extent is not None and _counts_right_predictions(extent):
+        if extent is not None and extent.counts_right:
             verdict = evaluate_criterion(criterion, extent.interval)
             lines.append(
                 f"At least {wording.percent(criterion)}: "
@@ -285,15 +285,6 @@ def _criterion_of_claims(
                 f"95 % interval {wording.format_interval(extent.interval)}.{remark}"
             )
     return lines
-
-
-def _counts_right_predictions(extent: results.Extent) -> bool:
-    """Return whether an extent counts right predictions, by its words.
-
-    All claims about these have "right" in them, but for those of `harden`, which are
-    about "held-out scenes".
-    """
-    return "right" in extent.what or "held-out" in extent.what
 
 
 def read_exposure(path: str) -> dict[str, dict[str, float]]:

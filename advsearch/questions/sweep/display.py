@@ -713,6 +713,7 @@ def _accuracy_extent(description: str, counts: CountedPredictions) -> Extent:
         counts.configurations,
         counts.interval,
         counts.accuracy,
+        counts_right=True,
     )
 
 
