@@ -87,11 +87,12 @@ def test_colors_of_faces_and_of_both(tmp_path: Path) -> None:
     whole.elements["face"] = (colors, faces)
     (part,), notes = whole.read(tmp_path)
     assert notes == [] and shown(part)[:, 0] == pytest.approx(np.array([[1, 0, 0], [0, 0, 1]]))
-    white = square("uchar red", "uchar green", "uchar blue", values=[[255] * 3] * 4)
-    white.elements["face"] = (colors, faces)
-    (part,), notes = white.read(tmp_path)
-    assert shown(part)[:, 0] == pytest.approx(np.array([[1, 0, 0], [0, 0, 1]]))
-    assert len(notes) == 1 and "colours of vertices" in notes[0]
+    for same in ([255, 255, 255], [255, 0, 0]):
+        plain = square("uchar red", "uchar green", "uchar blue", values=[same] * 4)
+        plain.elements["face"] = (colors, faces)
+        (part,), notes = plain.read(tmp_path)
+        assert shown(part)[:, 0] == pytest.approx(np.array([[1, 0, 0], [0, 0, 1]]))
+        assert len(notes) == 1 and "colours of vertices" in notes[0]
     varied = square("uchar red", "uchar green", "uchar blue", values=[[9, 9, 9], [0, 0, 0], [1, 1, 1], [2, 2, 2]])
     varied.elements["face"] = (colors, faces)
     assert varied.read(tmp_path)[1] == ["colours of faces are left out: its vertices have some, too"]

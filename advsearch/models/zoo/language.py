@@ -104,7 +104,7 @@ def _check_has_choice(names: Sequence[str] | None, model_name: str) -> None:
         raise InputError(
             "labels: expected two names at least, such as mug,cup,bowl, of which "
             f"model {model_name} chooses one, got "
-            f"{'none' if names is None else repr(names[0])}; with `task=answer` it "
+            f"{repr(names[0]) if names else 'none'}; with `task=answer` it "
             "answers freely"
         )
 

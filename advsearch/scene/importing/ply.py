@@ -636,8 +636,8 @@ class _Properties:
     ) -> Float64Array | None:
         """Return the linear colors (T, 3, 3) of the corners of triangles, or None.
 
-        Those of vertices are used, unless these are all the same and those of faces are
-        not.
+        If both vertices and faces have colors, those of vertices are used, unless all
+        vertices have the same one.
 
         Args:
             vertices: (T, 3) vertices of the triangles.
@@ -649,7 +649,7 @@ class _Properties:
             face_colors = np.repeat(face_colors[:, None], 3, axis=1)
         if vertex_colors is None or face_colors is None:
             return face_colors if vertex_colors is None else vertex_colors
-        if np.ptp(vertex_colors) == 0.0:
+        if (vertex_colors == vertex_colors[:1, :1]).all():
             self.notes.warn(
                 "colours of vertices are left out: its faces have some, too"
             )
