@@ -224,7 +224,7 @@ class DaskExecutor(WorkerExecutor):
             deadline: time (`time.monotonic`) until which the scheduler may answer; it has
                 one second at least.
         """
-        import distributed
+        import distributed  # late: an optional package, and it takes a second
 
         untyped: Any = distributed
         # started once, however often the connection is tried

@@ -10,6 +10,7 @@ import json
 import math
 import time
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal
@@ -75,6 +76,7 @@ class FakeRenderer:
         self.start, self.scene = space.start, SimpleNamespace(assembly=dict)  # nothing of it is light
         self.formation, self.plan = ImageFormation(denoiser=denoise, resolution=size), GradientPlan(())
         self.seen: list[tuple[Tensor, int, int]] = []
+        self.share_paths = nullcontext
         FakeRenderer.made.append(self)
 
     def __call__(self, u: Tensor, seed: int, spp: int) -> Tensor:

@@ -229,6 +229,7 @@ def test_sweeps_stand_side_by_side(browser: Browser, sweep: Path, tmp_path: Path
         page.wait_for_selector("[data-cell]")
         assert page.locator("figure.map").count() == 1  # as the address says
         page.get_by_role("link", name="All runs").click()
+        page.wait_for_selector("table.runs tbody tr")
         assert page.locator("table.runs tbody tr").count() == 2
 
 
