@@ -695,7 +695,7 @@ class Problem:
             group.name for group in self.plan.groups if group.control in searched_names
         ]
         # the inputs of the scene that each group changes, such as
-        # "mug.bsdf.reflectance.data"
+        # "object.base_color"
         routes = [
             self.renderer.routes.get(name, frozenset()) for name in searched_groups
         ]
