@@ -54,6 +54,11 @@ def sample_condition(domain: Domain, index: int, seed: int) -> Tensor:
     than independent samples; each is still uniformly distributed. Independent samples
     are taken if there are too many coordinates for the sequence, or if a block is an L2
     ball, which is no box.
+
+    Args:
+        domain: domain of the conditions.
+        index: index in the sequence; a bank takes 0, 1, 2, ...
+        seed: seed of the sequence.
     """
     has_l2_block = any(block.norm == "l2" for block in domain.blocks)
     if domain.dim > MAX_SOBOL_DIM or has_l2_block:
@@ -189,7 +194,13 @@ class Bank(PredictedSearch):
     def _evaluate_under(
         self, conditions: Sequence[Condition], u: Tensor, gradient: WhichGradient
     ) -> Evaluation:
-        """Evaluate u (d,) under conditions of the bank."""
+        """Evaluate u by its mean over conditions of the bank.
+
+        Args:
+            conditions: conditions of the bank.
+            u: (d,) the searched coordinates.
+            gradient: whether a derivative is computed.
+        """
         full_configurations = [torch.cat([u, condition.u]) for condition in conditions]
         evaluation = self.problem.evaluate_conditions(
             lambda batch, batch_u: self._predict_images(conditions[batch], batch_u),
@@ -447,9 +458,7 @@ class Bank(PredictedSearch):
     def _predict_objectives(
         self, u: Tensor, conditions: Sequence[Condition]
     ) -> list[float]:
-        """Return the objectives of predicted images of u (d,) under conditions of the
-        bank.
-        """
+        """Return the objective of the predicted image of u (d,) under each condition."""
         evaluated, _ = self.problem.evaluate_batch(
             partial(self._predict_images, conditions),
             [torch.cat([u, condition.u]) for condition in conditions],
@@ -459,12 +468,15 @@ class Bank(PredictedSearch):
         return [evaluation.objective for evaluation, _ in evaluated]
 
     def _trace_unseen(self, u: Tensor, seed: int) -> list[float]:
-        """Return the objectives of traced images of u (d,) under `N_COMPARED` new
-        conditions, which are not in the bank.
+        """Return the objectives of traced images under conditions not in the bank.
+
+        Args:
+            u: (d,) the searched coordinates.
+            seed: seed of the `N_COMPARED` new conditions and of the noise.
         """
         objectives = []
         for index in range(N_COMPARED):
-            # of both the conditions and the noise
+            # one seed for both the condition and the noise
             draw_seed = seeds.stream(seed, "draw", index)
             evaluation, _ = self.problem.evaluate_full(
                 Query(u, draw_seed),

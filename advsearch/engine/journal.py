@@ -593,8 +593,14 @@ class Journal:
     def _row_of_search(
         self, query: Query, evaluation: Evaluation
     ) -> tuple[Row, CachedEvaluation]:
-        """Return the row of a search's evaluation, and what is stored beside it so that
-        the search can be resumed.
+        """Return the row of a search's evaluation, and what resuming it needs.
+
+        That is what the row does not have: digest of the configuration, cost, gradient
+        and image. It is deleted when the run is done.
+
+        Args:
+            query: the query.
+            evaluation: its evaluation.
         """
         problem = self.problem
         is_finite = evaluation.is_finite
@@ -603,7 +609,8 @@ class Journal:
             query.kind,
             query.index,
             query.seed,
-            # a predicted image was not rendered: it has neither samples nor renders
+            # A predicted image was not rendered: it has neither samples nor renders.
+            # The cost of a rendered one counts images under each condition.
             spp=None if is_predicted else problem.spp * query.samples,
             objective=evaluation.objective if is_finite else math.nan,
             success=evaluation.success and is_finite,
@@ -708,7 +715,12 @@ def compute_digest(u: Tensor) -> bytes:
 
 
 def _restore_evaluation(row: Row, cached: CachedEvaluation) -> Evaluation:
-    """Return a search's evaluation from its row and what is stored beside it."""
+    """Return a search's evaluation as it was when it was stored.
+
+    Args:
+        row: row of the evaluation.
+        cached: gradient, image and cost, which the row does not have.
+    """
     gradient = None
     if cached.gradient is not None:
         gradient = torch.from_numpy(cached.gradient.copy())

@@ -294,8 +294,13 @@ def add_metrics(
 
 
 def _to_metric_value(name: str, result: Any) -> float | None:
-    """Return what a metric returned as a number; None for NaN and infinity, which
-    neither JSON nor a column of rows has.
+    """Return what a metric returned as a number.
+
+    None stands for NaN and infinity, which JSON does not have.
+
+    Args:
+        name: name of the metric, for the message.
+        result: what it returned.
 
     Raises:
         InputError: it is no number.
@@ -894,6 +899,10 @@ def reduce_objectives(
     the objective is over 0 only where every model is misled. The mean may be large
     because of one model, but its gradient reaches all of them. The returned function
     takes outputs of all models and a tuple of their truths.
+
+    Args:
+        objectives: objective of each model.
+        reduction: "mean" or "worst".
     """
 
     def objective(

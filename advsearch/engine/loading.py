@@ -127,8 +127,8 @@ class Scene:
             resolution: side, or (height, width), in pixels.
             denoise: "oidn" or "none".
             seed: root of the noise; the `seed` of each call counts on from it.
-            estimators: how derivatives are obtained, by "control.parameter", "control"
-                or "*"; see `advsearch check`.
+            estimators: how derivatives are computed, by "control.parameter", "control"
+                or "*". `advsearch check` shows which estimators there are.
             sampler: "multijitter", or "independent", which has more noise; the first
                 rounds sample counts up to products of two near numbers.
 
@@ -201,7 +201,11 @@ class Scene:
         return f"Scene({names}{fixed})"
 
     def with_texture(self, texture: Texture) -> Scene:
-        """Return the scene with another texture of the object; see `load_scene`.
+        """Return the scene with another texture of the object.
+
+        Args:
+            texture: a picture file, or (h, w, 3) sRGB in [0, 1] or of 8 bits, row 0 on
+                top.
 
         Raises:
             FileFormatError: the file is no picture.
@@ -408,7 +412,12 @@ def _put_into_photographs(
 def _check_no_photograph(
     fixed_values: SettingValues, occluder: str | Path | None
 ) -> None:
-    """Raise InputError for settings of a photograph in a scene that has none."""
+    """Raise InputError for settings of a photograph in a scene that has none.
+
+    Args:
+        fixed_values: parameters that the user fixed, such as "ground.level".
+        occluder: the mask that the user stated, if any.
+    """
     stated = [name for name in fixed_values if name in PHOTOGRAPH_SETTINGS]
     if occluder is not None:
         stated.append("occluder")
@@ -652,6 +661,10 @@ def _check_rig_times(description: SceneDescription, space: Space) -> None:
 
     Such a rig is pointless unless something in the scene changes with time. It cannot
     have motion blur or a rolling shutter.
+
+    Args:
+        description: the scene, whose rig states a delay for each camera.
+        space: the controls.
 
     Raises:
         InputError: nothing changes with time, or an image has motion blur.

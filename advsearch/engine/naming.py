@@ -206,8 +206,12 @@ def _take_model_warnings(caught: Iterable[warnings.WarningMessage]) -> list[str]
 
 
 def _check_task_of_rig(task: Task, camera: str, n_cameras: int) -> None:
-    """Raise InputError if a task cannot judge the images of several cameras, which
-    `camera` names.
+    """Raise InputError if a task cannot judge the images of several cameras.
+
+    Args:
+        task: task of the run.
+        camera: setting that names the cameras, for the message.
+        n_cameras: their number.
     """
     if not task.judges_rig:
         raise InputError(
@@ -553,7 +557,14 @@ def takes_setting(
 def _list_choices(
     qualified_name: str, control_settings: Mapping[str, object]
 ) -> list[Choice] | None:
-    """List the active choices of a control; None if its kind is not known."""
+    """List the choices of a control that have an effect; None for an unknown kind.
+
+    A choice is an option of a control besides its parameters, such as `epsilon`.
+
+    Args:
+        qualified_name: kind and name, such as "light:key", perhaps with a parameter.
+        control_settings: settings that the user stated for it.
+    """
     # a name may have a parameter behind it ("camera.azimuth"), which becomes a setting
     merged = merge_control_settings({qualified_name: control_settings})
     ((name, settings),) = merged.items()
@@ -577,12 +588,12 @@ def _list_active_choices(
         kind: class of the control.
         settings: settings that the user stated for it.
     """
-    # names of the parameters that a choice fixes, or that are set to a number
+    # names of parameters that do not vary: a choice fixes them, or a number is set
     fixed = {
         choice.fixes for choice in kind.choices if settings.get(choice.name) is not None
     }
     fixed |= {name for name, value in settings.items() if Parameter.is_number(value)}
-    # those with a default range, and those for which a range is set
+    # names of parameters that are searched: with a default range, or with a range set
     searched = {
         parameter.name for parameter in kind.parameters if parameter.search is not None
     }

@@ -149,7 +149,7 @@ def make_trial_row(
 
 
 def add_judgement(row: Row, judgement: Judgement) -> Row:
-    """Return a row with the values of a judgement."""
+    """Return a row with the values of a judgement; a NaN becomes None."""
     prediction = judgement.prediction
     return replace(
         row,

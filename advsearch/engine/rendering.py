@@ -543,6 +543,10 @@ def _make_view_facts(
 def check_judged_thing(description: SceneDescription, judge: str) -> None:
     """Check that a scene has the thing that is to be judged.
 
+    Args:
+        description: the scene.
+        judge: "object", the name of another thing, or "all".
+
     Raises:
         UnknownNameError: nothing in the scene has that name.
         InputError: all things are to be judged, and there is only the object.
@@ -564,10 +568,17 @@ def check_judged_thing(description: SceneDescription, judge: str) -> None:
 def list_camera_renders(
     renderer: Renderer, u: Tensor, n_rig_cameras: int
 ) -> list[Callable[[], Surfaces]]:
-    """Return functions that render which surfaces are visible at a configuration (d,).
+    """Return functions that render which surfaces each camera sees.
 
-    The first is for the main camera; one follows for each of the `n_rig_cameras` of a
-    rig. Nothing is rendered until they are called.
+    Nothing is rendered until they are called.
+
+    Args:
+        renderer: renders the surfaces.
+        u: (d,) the configuration.
+        n_rig_cameras: number of cameras of the scene's rig; 0 without a rig.
+
+    Returns:
+        A function for the main camera, followed by one for each camera of the rig.
     """
     return [
         partial(renderer.surfaces, u),
@@ -736,6 +747,10 @@ def find_visible_things(renderer: Renderer, u: Tensor) -> JsonObject | None:
 
 def check_image_path(path: str | Path, n_views: int) -> Path:
     """Return the path of an image if its name is one that can be written.
+
+    Args:
+        path: path of a .png or .exr file.
+        n_views: number of views that the image shows.
 
     Raises:
         InputError: another suffix, an .exr of several views, or a directory.

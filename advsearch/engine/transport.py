@@ -213,9 +213,15 @@ class PredictedSearch(ABC):
     def rank_all(
         self, queries: Sequence[Query], trace: Evaluate
     ) -> Iterator[Evaluation]:
-        """Evaluate queries of a ranking, all of one kind, lazily.
+        """Evaluate the queries of a ranking lazily.
 
-        Paths are traced, in the window if there is one. `trace` evaluates whole images.
+        A ranking renders the best configurations of a search again, to choose the best
+        one. So images are traced and not predicted; if there is a window, only the
+        window is traced.
+
+        Args:
+            queries: the queries, all of one kind.
+            trace: renders full images.
         """
         renderer = self.get_window_renderer(queries[0].kind)
         if renderer is None:

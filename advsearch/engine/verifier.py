@@ -207,10 +207,15 @@ class Verifier:
     def _condition_ladder(
         self, n_candidates: int, search_samples: int | None
     ) -> Sequence[int]:
-        """Return the sample counts to choose from where conditions vary.
+        """Return the sample counts to choose from if conditions vary.
 
-        `search_samples` are the samples that the searches took: counts that would make
-        the verification more expensive than that are left out. None for no such limit.
+        Counts are left out with which the verification would take more samples than the
+        searches did.
+
+        Args:
+            n_candidates: number of configurations to verify.
+            search_samples: samples per pixel of all renders of the searches; None for
+                no limit.
         """
         if search_samples is None:
             return OVER_LADDER
@@ -454,7 +459,7 @@ class Retrials:
         Args:
             conditions: conditions under which configurations are tried again.
             run: run whose store has the rows.
-            progress: progress that is told of each trial.
+            progress: progress, which counts the trials.
             trials: number of trials of a configuration under a condition.
             seed: root of the trials' seeds.
             executor: evaluates trials on workers, if there are any.
@@ -462,8 +467,8 @@ class Retrials:
         self._progress = progress
         self._n_trials = trials
         self._seed = seed
-        # The others are copies of the first journal, with the same rows and notes,
-        # which are read from the store only once.
+        # All journals are copies of the first one, so that rows and notes are read from
+        # the store only once.
         first_journal = Journal(run, ParallelEvaluator(conditions[0].problem))
         self._journals = {
             condition.name: replace(
@@ -475,12 +480,13 @@ class Retrials:
             for condition in conditions
         }
         self._clean: dict[str, tuple[Judgement, ...]] = {}
-        # Images and radiances that several conditions need, of one kind of rows: by
-        # what sets them (`image_key`, `radiance_key`), seed and spp.
+        # Images and radiances that several conditions need, for trials of the kind
+        # `_shared_kind`. Keys are `image_key` or `radiance_key`, seed, and samples per
+        # pixel.
         self._images: dict[tuple[Hashable, int, int], Tensor] = {}
         self._radiances: dict[tuple[Hashable, int, int], Tensor] = {}
         self._shared_kind = ""
-        # how many conditions have each light
+        # number of conditions by `radiance_key`; a light is shared if it is over 1
         self._n_conditions_of_light = Counter(
             condition.radiance_key
             for condition in conditions
@@ -503,10 +509,16 @@ class Retrials:
     def try_adversarial(
         self, kind: str, u: Tensor, condition: RetrialCondition
     ) -> Verification:
-        """Try a configuration (d,) under one condition, compared with the clean scene.
+        """Try a configuration under one condition, compared with the clean scene.
 
-        Only rates are compared: the search claims nothing under this condition, which
-        trials could confirm. The rows have the kind "KIND under CONDITION".
+        Only success rates are compared: the search was run under other conditions, so
+        that it makes no claim that trials could confirm. The rows have the kind "KIND
+        under CONDITION".
+
+        Args:
+            kind: kind of the trials, such as "verification".
+            u: (d,) the configuration.
+            condition: condition under which it is tried.
         """
         return verify(
             partial(self._evaluate_trials, kind, condition),
@@ -585,10 +597,14 @@ class Retrials:
     def _render_on_workers(
         self, condition: RetrialCondition, queries: Sequence[Query]
     ) -> Iterator[Evaluation]:
-        """Yield the images of queries, rendered by workers; none without workers.
+        """Yield the images of queries, rendered by workers.
 
-        None either for a single query: its image is rendered in this process, where its
-        radiance can be shared.
+        Nothing is yielded without workers, or for a single query: its image is rendered
+        in this process, where conditions can share its radiance.
+
+        Args:
+            condition: condition of the trials.
+            queries: queries for images that are not cached.
         """
         evaluator = self._journals[condition.name].evaluator
         if evaluator.executor is not None and len(queries) > 1:
@@ -596,10 +612,15 @@ class Retrials:
         return iter(())
 
     def _render(self, condition: RetrialCondition, u: Tensor, seed: int) -> Tensor:
-        """Return the image (H, W, 3) of u (d,), as `Problem.picture` does.
+        """Return the image (H, W, 3) of a configuration under a condition.
 
-        Conditions under the same light share the radiance, which is cached; only the
-        formation of the image from it differs.
+        Conditions with the same light share the radiance, which is cached. They differ
+        only in how the image is formed from it.
+
+        Args:
+            condition: the condition.
+            u: (d,) the searched coordinates.
+            seed: seed of the noise and of random conditions.
         """
         problem = condition.problem
         # how many conditions have this light; 0 without a key, which is never shared
@@ -618,6 +639,10 @@ class Retrials:
 
 def read_stored_configuration(directory: Path, problem: Problem) -> torch.Tensor:
     """Return the configuration (d,) that a run directory has stored.
+
+    Args:
+        directory: the run directory.
+        problem: problem of the present scene, to whose domain it must fit.
 
     Raises:
         InputError: the scene has another number of coordinates now.

@@ -280,7 +280,12 @@ def _sum_squares(image: Tensor) -> Tensor:
 
 
 def _compute_slope(problem: Problem, image: FullImage) -> Tensor:
-    """Return the derivative of the displayed image by its radiance, (H, W, 3)."""
+    """Return the derivative of the displayed image by its radiance, (H, W, 3).
+
+    It converts small differences of radiance into differences of displayed values. Each
+    displayed pixel depends on its own radiance, so that the gradient of the sum has the
+    derivative of each pixel.
+    """
     radiance = image.radiance.clone()
     inputs = _compute_inputs(problem, image.u)
     with torch.enable_grad():

@@ -144,7 +144,17 @@ def load(spec: str, purpose: models.Purpose) -> Model:
 
 
 def _check_chat(spec: str, name: str, *, is_free: bool, is_named: bool) -> None:
-    """Raise InputError unless a chat is asked for free answers, and its model named."""
+    """Check that a chat can be used as the task needs it.
+
+    Args:
+        spec: what the user wrote.
+        name: name of the model, for messages.
+        is_free: whether the task takes answers in free words; a chat has no scores.
+        is_named: whether the address names the chat's model behind a #.
+
+    Raises:
+        InputError: one of the two is not the case.
+    """
     if not is_free:
         raise InputError(
             f"task: a chat such as {name} answers in words; use "

@@ -197,7 +197,11 @@ def _trace_modules(network: Any, x: Tensor, only: nn.Module | None) -> list[_Cal
         kwargs: dict[str, Tensor],
         output: Tensor,
     ) -> None:
-        """Record a call of a layer, after it."""
+        """Record a call of a layer; PyTorch calls this after each of them.
+
+        Calls are left out whose output has another number of rows than the input, as
+        they do not work on the images of the batch.
+        """
         input = args[0] if args else kwargs["input"]
         keeps_batch = len(input) == len(output) and input.dim() > 1
         if keeps_batch:

@@ -401,7 +401,12 @@ def _advise_on_second_input(names: list[str]) -> str:
 
 
 def _report_corrupt(path: Path, kind: str) -> AbstractContextManager[None]:
-    """Turn whatever torch raises while it reads a file into a FileFormatError."""
+    """Return a context that turns errors of torch into a FileFormatError.
+
+    Args:
+        path: path of the file that torch reads.
+        kind: kind of the file, such as "TorchScript", for the message.
+    """
     problem = (
         f"model file {path}: cannot be read as {kind} with torch {torch.__version__}"
     )

@@ -398,7 +398,12 @@ def fit_labels(
 def _order_by_index(name_by_index: dict[str, Any], where: str) -> list[Any]:
     """Return the values of a JSON object whose keys are the indices 0, 1, ...
 
-    `where` is the beginning of an error. Raises FileFormatError for other keys.
+    Args:
+        name_by_index: the object; its keys may be in any order.
+        where: what is read, with which the message begins.
+
+    Raises:
+        FileFormatError: the keys are others.
     """
     indices = list(map(str, range(len(name_by_index))))
     last_index = len(name_by_index) - 1
@@ -440,7 +445,12 @@ def _read_file(path: Path) -> tuple[str, ...]:
 def _parse_json_names(text: str, where: str) -> list[Any]:
     """Return the names in a JSON list, or in a JSON object from index to name.
 
-    `where` is the beginning of an error. Raises FileFormatError for anything else.
+    Args:
+        text: content of a label file.
+        where: what is read, with which the message begins.
+
+    Raises:
+        FileFormatError: it is anything else.
     """
     try:
         names = parse_json(text)

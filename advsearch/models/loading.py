@@ -106,7 +106,8 @@ def load_model(
         input_size: (height, width) in pixels, or one number; default 224.
         mean: one number, three, or ``"imagenet"``, ``"half"``, ``"clip"``, in units of
             `value_range`; default 0.
-        std: likewise; default 1. A preset given for one of `mean` and `std` sets both.
+        std: standard deviation in the same forms; default 1. The name of a preset for
+            `mean` or `std` sets both.
         value_range: (low, high), the values of black and white; default (0, 1).
         layout: ``"NCHW"`` (default) or ``"NHWC"``.
         channels: ``"RGB"`` (default) or ``"BGR"``.
@@ -464,6 +465,10 @@ def _find_library_source(network: nn.Module, purpose: Purpose) -> Source | None:
 
     Libraries such as transformers and timm describe their networks: preprocessing and
     names of classes follow from that description.
+
+    Args:
+        network: network that the user passed.
+        purpose: what the model is loaded for, such as the task.
     """
     for library, recognizer in list_built_ins("recognizer").items():
         if library in sys.modules:  # else no network of it can exist

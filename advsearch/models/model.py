@@ -99,11 +99,13 @@ class _Recomputed(torch.autograd.Function):
 def compute_checkpointed(function: Callable[[Tensor], Any], images: Tensor) -> Any:
     """Return `function(images)` without storing activations.
 
-    It returns a tensor, or lists and mappings of tensors.
+    The gradient computes the function a second time. So the activations of one batch
+    are in memory at a time, and not those of all (Chen et al. 2016, *Training Deep Nets
+    with Sublinear Memory Cost*, section 3).
 
-    The gradient computes the function a second time, and takes the memory of one batch
-    instead of that of all (Chen et al. 2016, *Training Deep Nets with Sublinear Memory
-    Cost*, section 3).
+    Args:
+        function: function that returns a tensor, or lists and mappings of tensors.
+        images: (N, H, W, 3).
     """
     # `apply` returns tensors only, and appends the structure that they belong to
     structures: list[Any] = []
@@ -404,7 +406,7 @@ class Model:
         """Return a copy of the network, to train it further.
 
         Raises:
-            ModelError: there is none, as of an exported program.
+            ModelError: there is none, since an exported program cannot be trained.
         """
         if self.make_trainable is not None:
             return self.make_trainable()
@@ -759,7 +761,12 @@ def mend_batch_norms(output: Any) -> None:
     def with_strides(
         strides: tuple[int, ...], gradients: tuple[Tensor | None, ...]
     ) -> tuple[Tensor | None, ...]:
-        """Return gradients of which the first has these strides, copied if need be."""
+        """Return the gradients of a batch norm, the first with these strides.
+
+        Args:
+            strides: strides of the input of the batch norm.
+            gradients: gradients by its outputs; the first is that of the image.
+        """
         gradient, *rest = gradients
         if gradient is None or gradient.stride() == strides:
             return gradients

@@ -157,7 +157,12 @@ def _check_batch_size(model: Model) -> None:
 
 
 def _check_finite(model: Model, rows: Tensor) -> None:
-    """Raise ModelError if the outputs for a gray image and noise are not finite."""
+    """Raise ModelError if outputs are not finite.
+
+    Args:
+        model: model that is probed.
+        rows: output for a gray image, then that for noise.
+    """
     if bool(torch.isfinite(rows).all()):
         return
     image = "grey" if not bool(torch.isfinite(rows[0]).all()) else "noise"
@@ -211,17 +216,19 @@ def _warn_of_odd_scores(model: Model, rows: Tensor) -> None:
 
 
 def _run(model: Model, images: Tensor) -> Tensor:
-    """Run a network on images (N, H, W, 3), and return rows of its raw output.
+    """Run a network on images (N, H, W, 3), and return numbers for each to compare.
 
-    They are logits (N, classes), float32 on the CPU. An output of another kind is
-    summarized by three numbers of each image, (N, 3): how many numbers it has, their
-    sum, and the sum of their absolute values.
+    For a classifier these are its raw scores (N, classes), float32 on the CPU. Any
+    other output, such as boxes, may differ in size from image to image. So it is
+    summarized by three numbers, (N, 3): how many numbers it has, their sum, and the sum
+    of their absolute values.
     """
     if model.read is None:
         returned, count = _run_network(model, images)
         return read_logits(returned, count, None, model.name)[: len(images)].cpu()
     rows = []
     for output in _run_and_read(model, images):
+        # an empty tensor first, as `cat` needs one and an output may have none
         tensors = [torch.zeros(0, device="cpu")]
         tensors += [tensor.float().flatten().cpu() for tensor in list_tensors(output)]
         values = torch.cat(tensors)
@@ -692,10 +699,14 @@ def _try_attached(
 
 
 def _compute_gradient(model: Model, images: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the rows of `_run` for images, and the gradient of one number of them.
+    """Return the output for images, and the gradient of one number computed from it.
 
-    That number is `_compute_checked_value`. The gradient is zero if nothing is
-    detected.
+    That number is a weighted sum of the output (`_compute_checked_value`). The gradient
+    (N, H, W, 3) is zero if nothing is detected.
+
+    Args:
+        model: model that is probed.
+        images: (N, H, W, 3).
     """
     leaf = images.clone().requires_grad_()
     with torch.enable_grad():

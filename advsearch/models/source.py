@@ -227,6 +227,10 @@ def freeze_network(module: nn.Module, name: str) -> nn.Module:
     caller may go on training the original, and the copy sees the new weights if they
     are changed in place, as optimizers do. Exported and scripted programs are frozen
     themselves. So are modules that cannot be copied, with a warning.
+
+    Args:
+        module: the network.
+        name: name of the model, for the warning.
     """
     if not isinstance(module, PROGRAMS):
         try:

@@ -144,6 +144,12 @@ class RunDirectory:
     ) -> RunDirectory:
         """Begin a run in a directory that exists; after an error nothing of it is left.
 
+        Args:
+            path: path of the directory.
+            config: configuration of the run, which is written as `run.yaml`; None for
+                a run that cannot be repeated.
+            overwrite: whether an older run in the directory is removed.
+
         Raises:
             RunExistsError: another process has begun a run there.
         """
@@ -510,10 +516,13 @@ def create_before_work(config: Config) -> Iterator[Path | None]:
 
 
 def make_default_name(object_name: str, controls: Iterable[str]) -> str:
-    """Return the name of a run by default: ``mug-texture`` for the object ``mug`` or
-    ``data/mug.obj`` and the control ``texture``.
+    """Return the default name of a run, such as ``mug-texture``.
 
-    It has only small letters, digits and hyphens, 80 at most.
+    It has only small letters, digits and hyphens, at most 80 of them.
+
+    Args:
+        object_name: name or file of the object, such as ``data/mug.obj``.
+        controls: names of the controls, such as ``texture``.
     """
     words = [Path(object_name).stem, *controls]
     return (
@@ -686,8 +695,12 @@ def _known_settings(config: Config) -> dict[str, Any]:
 
 
 def _format_change(name: str, value: object) -> str:
-    """Return the name of a changed fact, with the value that it had where that is known
-    and short.
+    """Return the name of a changed fact, such as "seed (was 0)".
+
+    Args:
+        name: name of the fact.
+        value: the value that it had. It is left out if it is None or long, as digests
+            are.
     """
     text = format_value(value)
     return (

@@ -149,7 +149,13 @@ def _flatten_values(values: Mapping[str, Value | JsonValue]) -> JsonObject:
 def _write_csv(
     records: Iterable[JsonObject], names: list[str], stream: IO[bytes]
 ) -> None:
-    """Write records as CSV; a missing value is empty, and a bool is 0 or 1."""
+    """Write records as CSV; a missing value is empty, and a bool is 0 or 1.
+
+    Args:
+        records: a record for each row.
+        names: names of the columns.
+        stream: open binary stream, which stays open.
+    """
     text = io.TextIOWrapper(stream, encoding="utf-8", newline="", write_through=True)
     writer = csv.DictWriter(text, names, restval="", lineterminator="\n")
     writer.writeheader()
@@ -159,7 +165,7 @@ def _write_csv(
             for name, value in _encode_payload(record).items()
         }
         writer.writerow(cells)
-    # the stream stays open when the wrapper is deleted
+    # A text wrapper closes its stream when it is deleted, unless it is detached.
     text.detach()
 
 
@@ -175,7 +181,13 @@ def _encode_payload(record: JsonObject) -> JsonObject:
 def _write_json(
     records: Iterable[JsonObject], names: list[str], stream: IO[bytes]
 ) -> None:
-    """Write records as one JSON array, a record on each line."""
+    """Write records as one JSON array, a record on each line.
+
+    Args:
+        records: a record for each row.
+        names: names of the columns; a record without one has null.
+        stream: open binary stream.
+    """
     stream.write(b"[")
     for number, record in enumerate(records):
         line = json.dumps(

@@ -123,9 +123,13 @@ def connect_to_write(path: Path) -> sqlite3.Connection:
 def check_version(db: sqlite3.Connection, path: Path) -> None:
     """Check that a database has the version that this advsearch reads.
 
+    Args:
+        db: the open database.
+        path: its path, for the message.
+
     Raises:
-        FileFormatError: it has not, and is closed; the message says which advsearch
-            reads it.
+        FileFormatError: it has another version. The database is then closed, and the
+            message states which advsearch can read it.
     """
     version = read_version(db)
     day = ""
@@ -187,8 +191,14 @@ def to_8bit(image: Any) -> Bytes:
 def amplify_difference(
     before: Any, after: Any, gain: float = DIFFERENCE_GAIN
 ) -> Floats:
-    """Return ``0.5 + gain (after - before)`` clipped to [0, 1]: mid grey where nothing
-    changed.
+    """Return an image of the difference between two images, mid gray for no change.
+
+    It is ``0.5 + gain (after - before)``, clipped to [0, 1].
+
+    Args:
+        before: (H, W, 3) or (H, W), in [0, 1].
+        after: the changed image, of the same shape.
+        gain: factor by which differences are amplified.
     """
     moved: Floats = np.float32(0.5) + np.float32(gain) * (
         _to_float32(after) - _to_float32(before)

@@ -79,8 +79,15 @@ class Measurements:
         row_type: type[AnyFields],
         measure: Callable[[], Sequence[AnyFields]],
     ) -> list[AnyFields]:
-        """Return rows that are stored under a key; measure and store them if there are
-        none, as `get`.
+        """Return the rows that are stored under a key, or measure and store them.
+
+        Args:
+            key: key of the measurement in the store of the run.
+            row_type: class of the rows.
+            measure: measures the rows.
+
+        Raises:
+            OutOfTime: they would have to be measured, and the time is up.
         """
         return [
             row_type.of(row)

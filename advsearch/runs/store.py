@@ -211,10 +211,11 @@ class Store:
                 row = cursor.fetchone()
 
     def rows(self, kind: str | None = None, after: int = 0) -> Iterator[Row]:
-        """Yield the rows, or those of one kind, in the order in which they were
-        written.
+        """Yield rows in the order of their ids.
 
-        Only rows with an id larger than `after` are read.
+        Args:
+            kind: kind of the rows; None for all kinds.
+            after: only rows with a larger id.
         """
         condition = "id > ?"
         parameters: list[int | str] = [after]
@@ -287,8 +288,10 @@ class Store:
         return bool(next(self._select("EXISTS (SELECT * FROM told)"))[0])
 
     def delete_cached(self) -> None:
-        """Delete what rows told their searches: the run is done. The file gets smaller
-        by it.
+        """Delete what searches would need to be resumed, as the run is done.
+
+        That is gradients and images, which take most of the file. So the file is then
+        compacted.
         """
         check_not_moved(self.path)
         with storage_errors(self.path):

@@ -375,8 +375,12 @@ def _iterate_digests(setting: str, path: str) -> Iterator[tuple[str, str]]:
 
 
 def _digest_folder(folder: Path, pattern: str) -> str:
-    """Return one SHA-256 of the names and contents of the files that match a
-    pattern.
+    """Return one SHA-256 of the names and contents of files in a folder.
+
+    Args:
+        folder: the folder.
+        pattern: pattern of the paths of its files that count, such as "*/*". At most
+            `MAX_FILES` do.
     """
     paths = sorted(islice(folder.glob(pattern), MAX_FILES))
     lines = [

@@ -132,7 +132,12 @@ class Tracker:
             return  # a tracker that is that slow is told less; the run has all of it
 
     def _work(self, folder: Path, settings: Mapping[str, str]) -> None:
-        """Send messages until None comes; the body of the thread."""
+        """Send messages until None comes; this is what the thread runs.
+
+        Args:
+            folder: folder of the run.
+            settings: settings of the run as texts, by name.
+        """
         try:
             log_metrics, close = _open_tracker(self._name, folder, settings)
             message = self._queue.get()
