@@ -346,9 +346,11 @@ class Bank(PredictedSearch):
             tick: called with the samples of each condition that is made.
         """
         size = self._count_conditions(index)
+        # index of the first condition that has no matrix yet
         first_missing = 0
         if self._conditions:
-            # the newest is the last; older ones may have been dropped
+            # The newest condition is the last. Older ones may have been dropped, so
+            # that their number does not tell the index.
             first_missing = self._conditions[-1].index + 1
         if first_missing >= size:
             return
@@ -458,7 +460,7 @@ class Bank(PredictedSearch):
     def _predict_objectives(
         self, u: Tensor, conditions: Sequence[Condition]
     ) -> list[float]:
-        """Return the objective of the predicted image of u (d,) under each condition."""
+        """Return the objectives of predicted images of u (d,), one per condition."""
         evaluated, _ = self.problem.evaluate_batch(
             partial(self._predict_images, conditions),
             [torch.cat([u, condition.u]) for condition in conditions],

@@ -82,7 +82,7 @@ class CroppedSearch(PredictedSearch):
     def _renew_surroundings(
         self, windowing: Windowing, kind: str, number: int, image: FullImage
     ) -> Renderer:
-        """Render new surroundings of the window, which a kind of search uses from now on.
+        """Render new surroundings of the window, for a kind of search from now on.
 
         Args:
             windowing: the window.

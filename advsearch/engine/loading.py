@@ -153,8 +153,11 @@ class Scene:
     def with_environment(self, environment: EnvironmentAsset | None) -> Scene:
         """Return the scene under another environment; None for no environment map.
 
-        The environment counts as chosen by the user. In a folder of photographs, the
-        scene in each of them gets it.
+        The environment then counts as chosen by the user, and not as the default. If
+        the scene is in a folder of photographs, the scene in each photograph gets it.
+
+        Args:
+            environment: the environment; None for no environment map.
 
         Raises:
             InputError: the ground of the scene shows the photograph of its environment,
@@ -704,8 +707,8 @@ def choose_moments(
 
     The average of these images has motion blur. The faster points move in the image,
     the more moments there are (`MOMENTS_PER_PIXEL`), so that the blur shows no steps. A
-    flashing light needs `MOMENTS_PER_FLASH`, so that it is on in some moments and off in
-    others. The number is limited to `MIN_MOMENTS` to `MAX_MOMENTS`.
+    flashing light needs `MOMENTS_PER_FLASH`, so that it is on in some moments and off
+    in others. There are at least `MIN_MOMENTS` and at most `MAX_MOMENTS`.
 
     Args:
         space: the controls, which state how long an exposure takes.

@@ -80,7 +80,9 @@ def make_scene_kwargs(config: SceneConfig) -> dict[str, Any]:
 
 
 def collect_scene_parameters(config: SceneConfig) -> SettingValues:
-    """Return the parameters that a scene is loaded with: `set` and `exposure`.
+    """Return the parameters that a scene is loaded with, by name.
+
+    They are those of the setting `set`, and `exposure` as "camera.exposure".
 
     Raises:
         InputError: both state an exposure.
@@ -524,7 +526,7 @@ def _check_named_controls(
         UnknownNameError: there is no such control.
         InputError: a control does not take the setting.
     """
-    # the setting has only the name: "key"
+    # The setting names a control as "key", and `controls` as "light:key".
     qualified_names = {
         parse_control_name(qualified_name, control_settings)[1]: qualified_name
         for qualified_name, control_settings in controls.items()

@@ -780,7 +780,7 @@ class Problem:
         ), output
 
     def _limit_search_depth(self, renderer: Renderer) -> AbstractContextManager[None]:
-        """Return a context in which a renderer's light paths are as short as a search's.
+        """Return a context in which light paths are as short as those of a search.
 
         Without a `search_depth` the context changes nothing.
         """
@@ -876,7 +876,7 @@ class Problem:
         gradient: WhichGradient,
         batch_size: int,
     ) -> Evaluation:
-        """Evaluate u by its mean over conditions whose images are predicted, in batches.
+        """Evaluate u by its mean over conditions whose images are predicted.
 
         Args:
             render: function from a slice of the conditions and u (d,) to their images

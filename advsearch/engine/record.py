@@ -173,8 +173,8 @@ def _none_if_nan(value: float | None) -> float | None:
 def read_judgement(row: Row) -> Judgement:
     """Return the judgement that a row has, the inverse of `add_judgement`.
 
-    A row has None where the judgement has NaN; without a label it is the row of an
-    output that was NaN itself.
+    A None in the row stands for a NaN in the judgement. A row without a label is that
+    of an output that was NaN.
     """
     prediction = Prediction(row.label or NOT_A_NUMBER, row.label_index, row.probability)
     return Judgement(

@@ -274,13 +274,14 @@ class SurfaceLight(PredictedSearch):
     def _sample_bank_conditions(self) -> list[Tensor]:
         """Return the conditions (k,) of the bank, each of which gets its light.
 
-        Without conditions it is a single one, which has no coordinates.
+        If the problem has no conditions, the list has a single one without coordinates,
+        so that other code need not tell the cases apart.
         """
         problem = self.problem
         if problem.conditions is None:
             return [torch.empty(0)]
         seed = seeds.stream(problem.seed, "bank")
-        # where no condition needs a light of its own, one light serves all
+        # If no coordinate of the conditions needs new light, one light serves all.
         n_conditions = N_LIGHTS if bool(self._needs_new_light.any()) else 1
         return [
             sample_condition(problem.conditions, index, seed)

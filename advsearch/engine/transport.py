@@ -465,8 +465,8 @@ class Transport(PredictedSearch):
         has_same_surroundings, current = self._compare_surroundings(kind, query.u)
         if deviation.is_accepted and has_same_surroundings:
             return predictor
-        # Basis images of lights do not depend on u, so that computing them again changes
-        # nothing. They are no matrix, and so have 0 entries.
+        # Basis images of lights do not depend on u, so that computing them again would
+        # change nothing. They are no matrix, and so have 0 entries.
         has_basis_images = self.start.n_entries == 0
         if has_basis_images:
             self.trace_from(kind, number, f" of the {kind}")

@@ -118,7 +118,8 @@ class Verifier:
     ) -> Iterator[Evaluation]:
         """Evaluate trials lazily and in order; store their images, and count renders.
 
-        A trial whose image is rendered counts once, however often it is evaluated.
+        A trial counts as one render, even if it is evaluated several times: its results
+        are stored.
 
         Args:
             queries: the trials.
@@ -149,7 +150,7 @@ class Verifier:
     def choose_spp(
         self, candidates: dict[str, Tensor], search_samples: int | None = None
     ) -> None:
-        """Choose the samples per pixel of the verification, and store them in the state.
+        """Choose the samples per pixel of the verification, and store the choice.
 
         They are raised until more samples would not change the verdict. If conditions
         vary by chance, they are raised until more samples would not change the fraction
@@ -360,9 +361,9 @@ class Verifier:
             )
 
     def try_random(self, n_trials: int) -> None:
-        """Try random configurations, to measure how often the model is wrong on average.
+        """Try random configurations, to measure how often the model is wrong.
 
-        Each is sampled uniformly from the domain of the search.
+        Each is sampled at random from the domain of the search.
         """
         problem = self.problem
         self.begin_stage(
@@ -553,7 +554,7 @@ class Retrials:
     def _evaluate_new(
         self, kind: str, condition: RetrialCondition, queries: Sequence[Query]
     ) -> Iterator[Evaluation]:
-        """Evaluate trials that are not stored: judge images as the condition changes them.
+        """Evaluate trials that are not stored, under one condition.
 
         Images before that change are cached, since other conditions, such as another
         compression, may need the same ones. The cache is emptied when trials of another

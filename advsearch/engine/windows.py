@@ -178,11 +178,15 @@ def _find_box(problem: Problem) -> Window | None:
 
 
 def render_full(problem: Problem, u: Tensor) -> FullImage:
-    """Render the full image of u (d,), to compare it with that of another u.
+    """Render the full image of a configuration, to compare it with that of another.
 
-    It is traced twice with independent noise (`halves`); `radiance` is the mean of
-    both, denoised. The two seeds are the same for every u, so that most of the noise
+    It is traced twice with independent noise (`halves`); `radiance` is the denoised
+    mean of both. The two seeds are the same for every u, so that most of the noise
     cancels in the difference of two images.
+
+    Args:
+        problem: problem of the search.
+        u: (d,) the configuration.
     """
     renderer = problem.renderer
     noise_seed = seeds.stream(problem.seed, "crop")

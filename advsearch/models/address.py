@@ -473,7 +473,8 @@ class AddressModel(models.RemoteNetwork):
     def _make_body(self, image: Image8Bit) -> dict[str, Any]:
         """Return the JSON body of a request about an image.
 
-        It is one of the plain protocol, or of OpenAI's chat if `chat` is not empty.
+        It follows the protocol of OpenAI's chat if `chat` is not empty, and else the
+        plain protocol, {"image": PNG in base64, "prompt": question}.
         """
         encoded = base64.b64encode(models.encode_levels(image)).decode()
         if not self.chat:
@@ -901,10 +902,12 @@ class AddressModel(models.RemoteNetwork):
         )
 
     def _count_tokens(self, response: Mapping[str, Any]) -> None:
-        """Count the tokens that a response states.
+        """Add the tokens that a response states to those that are spent.
+
+        They are in its field `usage`, as in OpenAI's protocol.
 
         Raises:
-            ModelError: it states none, and a limit needs them.
+            ModelError: it states none, and a limit or a price needs them.
         """
         usage = response.get("usage")
         if not isinstance(usage, Mapping):
@@ -914,7 +917,7 @@ class AddressModel(models.RemoteNetwork):
             isinstance(count, int) and not isinstance(count, bool) and count >= 0
             for count in counts
         )
-        # without a limit (there is none by default) and a price, tokens may be unknown
+        # Tokens may be unknown if neither a limit nor a price depends on them.
         needs_tokens = self.limits["tokens"] < LIMITS["tokens"] or self._priced_by_token
         if is_stated:
             tokens_in, tokens_out = counts

@@ -166,8 +166,12 @@ def _load_torchscript(archive: Archive) -> Source:
 
 
 def _find_archive_kind(archive: Archive) -> str:
-    """Return ``"exported"`` or ``"torchscript"``; raise FileFormatError for anything
-    else.
+    """Return the kind of an archive, "exported" or "torchscript".
+
+    The names of its members tell the kind.
+
+    Raises:
+        FileFormatError: it is of another kind, such as a pickle that `torch.save` made.
     """
     path = archive.path
     names = archive.members
@@ -191,7 +195,10 @@ def _find_archive_kind(archive: Archive) -> str:
 
 
 def _check_no_code(archive: Archive) -> None:
-    """Raise FileFormatError if an exported program has pickles or compiled code."""
+    """Raise FileFormatError if an exported program has pickles or compiled code.
+
+    Both would run whatever their author wants when they are loaded.
+    """
     pickle_prefixes = ("opaque_obj", "custom_obj")
     members_with_code = [
         name
@@ -208,7 +215,7 @@ def _check_no_code(archive: Archive) -> None:
 
 
 def _describe_file(path: Path, head: bytes) -> str:
-    """Describe what a file may be that is no zip archive, and what to do about it.
+    """Describe what a file that is no zip archive may be, and what to do about it.
 
     Args:
         path: path of the file, whose suffix is looked at.

@@ -441,7 +441,11 @@ def _find_named_source(text: str, purpose: Purpose) -> Source | Model:
 
 
 def _make_unknown_error(text: str) -> UnknownNameError:
-    """Return the error for a model's name that means nothing, with similar names."""
+    """Return the error for a model's name that means nothing, with similar names.
+
+    A name without a colon, such as "resnet18", may be that of a library's network. Then
+    the message states how it is written with its library.
+    """
     # what stands after the colon; NAME for other sources
     forms = {
         "hf": "hf:REPOSITORY",
@@ -565,8 +569,14 @@ def _parse_input_size(value: Any) -> tuple[int, int]:
 def _parse_normalization(options: Mapping[str, Any]) -> dict[str, Any]:
     """Parse the options `mean` and `std`, three numbers each.
 
-    The name of a preset ("imagenet") for one of them sets both, unless the user gave
-    the other one too.
+    The name of a preset, such as "imagenet", for one of them sets both, unless the user
+    stated the other one too.
+
+    Args:
+        options: options of `load_model` that the user set.
+
+    Returns:
+        Fields of `Preprocessing`, as far as the options determine them.
     """
     fields: dict[str, Any] = {}
     for key in ("mean", "std"):
@@ -597,7 +607,7 @@ def _parse_value_range(value: Any) -> tuple[float, float]:
 def _check_eight_bit(
     name: str, fields: Mapping[str, Any], options: Mapping[str, object]
 ) -> None:
-    """Raise InputError if options contradict a network that takes integers from 0 to 255.
+    """Raise InputError if options contradict a network that takes uint8 images.
 
     Args:
         name: name of the model, for the message.

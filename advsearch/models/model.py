@@ -646,8 +646,7 @@ def map_tensors(output: Any, function: Callable[[Tensor], Tensor]) -> Any:
     """Apply a function to every tensor in an output.
 
     The result has plain dicts and lists. `torch.utils._pytree` would not do: it takes a
-    subclass of dict that is not registered, such as an output of transformers, for a
-    leaf.
+    subclass of dict that is not registered, such as a library's output, for a leaf.
 
     Args:
         output: a tensor, or mappings and sequences of tensors and other values.
@@ -811,8 +810,12 @@ def _find_scores(returned: Any) -> Any:
 
 
 def _advise_on_missing_scores(returned: Any) -> str:
-    """Return what to do about an output that has losses or class indices instead of
-    scores; "" for any other output.
+    """Return what to do about an output without scores; "" for any other output.
+
+    Such an output has losses, as in training, or the indices of chosen classes.
+
+    Args:
+        returned: what the network returned.
     """
     values = list(returned.values()) if isinstance(returned, Mapping) else [returned]
     are_losses = all(isinstance(value, Tensor) and value.ndim == 0 for value in values)
@@ -867,9 +870,9 @@ def _guess_task(returned: Any) -> str | None:
 def _looks_like_boxes(returned: Any) -> bool:
     """Return whether an output of a network looks like boxes of a detector.
 
-    Detectors return one of these: a tuple that begins with boxes (N, K, 4) and goes on
-    with scores; or a mapping or an object with a field "boxes" or "pred_boxes", by
-    itself or for each image, as the elements of a list.
+    Detectors return one of these: a tuple that begins with boxes (N, K, 4), followed by
+    scores; a mapping or an object with a field "boxes" or "pred_boxes"; or a list of
+    such mappings, one for each image.
     """
     is_sequence = isinstance(returned, (tuple, list))
     first = returned[0] if is_sequence and returned else returned
@@ -888,7 +891,7 @@ def _advise_other_task(name: str) -> str:
 
 
 def _advise_on_shape(shape: tuple[int, ...]) -> str:
-    """Return what to do about an output whose shape is not that of logits."""
+    """Return what to do about an output whose shape is not (N, classes)."""
     if len(shape) == 4:
         return (
             f"{_advise_other_task('segmentation')}. If these are a classifier's "

@@ -546,7 +546,10 @@ def _are_equal(model: Model, rows: Tensor, repeated_rows: Tensor) -> bool:
 def _find_batch_limits(
     model: Model, pair: Tensor, rows: Tensor | None
 ) -> tuple[int, int]:
-    """Return the minimum and maximum batch size, from a batch of two images.
+    """Return the minimum and maximum batch size, after running a batch of two images.
+
+    A network that fails on two images takes one at a time. Warns if an image has
+    another output in a batch than by itself.
 
     Args:
         model: model that is probed.
@@ -753,13 +756,17 @@ class _Change(NamedTuple):
 def _measure_change(
     model: Model, images: Tensor, step: Tensor, *gradients: Tensor
 ) -> _Change:
-    """Measure how the number of `_compute_checked_value` changes around images.
+    """Measure how outputs change around images, and what gradients predict of it.
+
+    Outputs are summed up in one number (`_compute_checked_value`), and its change is
+    the central difference f(x + step) - f(x - step).
 
     Args:
         model: model that is run.
         images: (N, H, W, 3).
-        step: (N, H, W, 3), taken to both sides; the images are clipped to [0, 1] there.
-        *gradients: (N, H, W, 3) that predict the change.
+        step: (N, H, W, 3) change of the images; x + step and x - step are clipped to
+            [0, 1].
+        *gradients: gradients (N, H, W, 3) of that number by the images.
     """
     ends = [(images + step).clamp(0.0, 1.0), (images - step).clamp(0.0, 1.0)]
     outputs = [_run(model, end) for end in ends]

@@ -306,6 +306,9 @@ def _describe_misfit(
 ) -> list[str]:
     """Describe why the tensors of a file do not fit a network; empty if they do.
 
+    Counters of batch norms (`num_batches_tracked`) may be missing, since they do not
+    matter outside of training.
+
     Args:
         expected: tensors of the network, by key.
         state: tensors of the file, by key.

@@ -680,6 +680,7 @@ def _make_numbered_directory(default: str) -> Path:
 
 
 def _clear(path: Path) -> None:
+    """Remove all that a run writes from a directory, and nothing else."""
     for entry in list(path.iterdir()):
         if entry.name in CONTENTS or entry.name.startswith(PART):
             if entry.is_dir() and not entry.is_symlink():
@@ -711,13 +712,15 @@ def _format_change(name: str, value: object) -> str:
 
 
 def _is_leftover(path: Path) -> bool:
-    """Whether it is what a kill leaves before there is a run: the lock, or a part of a
-    file.
+    """Return whether a file is a leftover of a run that was killed as it began.
+
+    It is the lock, or a file that was not written completely.
     """
     return path.name == LOCK or path.name.startswith(PART)
 
 
 def _remove_if_bare(path: Path) -> None:
+    """Remove a directory if it has nothing but leftovers of a killed run."""
     with suppress(OSError):
         if all(_is_leftover(entry) for entry in path.iterdir()):
             for entry in list(path.iterdir()):

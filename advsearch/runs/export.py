@@ -318,10 +318,12 @@ def read_threedb(folder: Path) -> Iterator[tuple[Row, Path | None]]:
 
 
 def _read_classes(path: Path) -> list[str]:
-    """Return the names of classes in a file of 3DB; empty if there is no such file.
+    """Return the names of classes by index, from a file of 3DB.
+
+    The list is empty if there is no such file.
 
     Raises:
-        FileFormatError: it has something else.
+        FileFormatError: the file has something else than a list.
     """
     try:
         classes = parse_json(read_text(path, "the classes of 3DB", MAX_CLASSES_BYTES))

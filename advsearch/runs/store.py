@@ -410,8 +410,8 @@ def _encode_cached(cached: CachedEvaluation) -> tuple[Any, ...]:
 def _encode(row: Row, stamp: float) -> tuple[Any, ...]:
     """Return a row as the values of its columns, for SQLite.
 
-    Numbers of numpy and torch become Python's, mappings become JSON, and empty metrics
-    become NULL.
+    Numbers of NumPy and torch become numbers of Python, mappings become JSON, and empty
+    metrics become NULL. Time and id stand last in the columns.
 
     Args:
         row: row of an evaluation.

@@ -222,10 +222,17 @@ NAMES_BUNDLED = (
 
 
 def compute_bundled_digests(settings: Mapping[str, object]) -> dict[str, str]:
-    """Return the SHA-256 of each bundled object, environment and model that settings
-    name.
+    """Return the SHA-256 of each bundled thing that settings name.
 
-    The digest of a folder is that of a list of its files with their digests.
+    Bundled things are objects, environments and the reference model. They may change
+    with a new version of advsearch. The digest of a folder is that of a list of its
+    files with their digests.
+
+    Args:
+        settings: settings by name.
+
+    Returns:
+        Digests by name, such as "bundled object mug".
     """
     package = Path(__file__).parent.parent
     names = _list_bundled_names(settings)
