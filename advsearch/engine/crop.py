@@ -54,6 +54,7 @@ class CroppedSearch(PredictedSearch):
         return self.refusal
 
     def measure_size(self) -> tuple[int, int]:
+        """Return 0 entries, as there is no matrix, and the bytes of stored images."""
         height, width = self.problem.renderer.formation.resolution
         # stored for each kind of search: the two halves of its full image, their mean,
         # and the surroundings of the window
@@ -118,6 +119,7 @@ class CroppedSearch(PredictedSearch):
         self._update(query)
 
     def evaluate(self, query: Query) -> Evaluation:
+        """Evaluate a query, by rendering only the window if that is enough."""
         renderer = self._update(query)
         if renderer is None:
             return self.problem.evaluate(query)

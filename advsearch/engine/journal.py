@@ -383,7 +383,10 @@ class Journal:
         return self.evaluator.problem
 
     def __post_init__(self) -> None:
-        # once, and not for another problem of the same run
+        """Read from the store which machines and how many rows the run has.
+
+        A copy for another problem of the same run has these already.
+        """
         if self.run is not None and not self._opened:
             self.machines |= self.get_note(MACHINES_NOTE) or {}
             self._counts |= self.run.store.count_by_kind()
@@ -541,18 +544,20 @@ class Journal:
         return rows
 
     def _append_in_memory(self, rows: Iterable[Row]) -> None:
-        """Append rows to those of a journal without a run, with the id and the time
-        that the store of a run would add.
+        """Append rows to those of a journal without a run.
+
+        They get the id and the time that the store of a run would add.
         """
         for row in rows:
             row_id = row.id or len(self.rows) + 1
             self.rows.append(replace(row, id=row_id, time=time.time()))
 
     def _note_machine(self, name: str | None) -> None:
-        """Store the description of a machine that differs from this one, at its first
-        row.
+        """Store the description of a machine that differs from this one.
 
-        `name` is None for machines that are like this one.
+        Args:
+            name: name of the machine in its rows; None for one that is like this one.
+                Nothing is done for a name that is stored already.
         """
         if name is None or name in self.machines:
             return

@@ -567,6 +567,7 @@ class StackedTensors(Mapping[str, Tensor]):
         self._tensors_of_configuration = each
 
     def __getitem__(self, name: str) -> Tensor:
+        """Return the tensors with a name, stacked to (N, ...)."""
         # Not a KeyError, which `Mapping.get` would turn into None: an unknown name is
         # an error there, too.
         if name not in self:

@@ -224,9 +224,7 @@ def _check_task_of_rig(task: Task, camera: str, n_cameras: int) -> None:
 
 
 def _check_n_images(model: Model) -> None:
-    """Raise InputError if a model takes another number of images than there are
-    cameras.
-    """
+    """Raise InputError if a model takes more or fewer images than there are cameras."""
     module = model.module
     if isinstance(module, AllAtOnce) and module.cameras != model.cameras:
         verb = "is" if model.cameras == 1 else "are"

@@ -84,8 +84,10 @@ MAX_CACHED_TRUTHS = 512
 
 
 def _add_to_cache(cached: dict[bytes, Any], key: bytes, value: Any) -> None:
-    """Add a value to a cache of at most `MAX_CACHED_TRUTHS`; the oldest ones make
-    room.
+    """Add a value to a cache, and remove its oldest values if it is full.
+
+    A cache has at most `MAX_CACHED_TRUTHS` values. A dict keeps the order in which keys
+    were added.
     """
     while len(cached) >= MAX_CACHED_TRUTHS:
         del cached[next(iter(cached))]

@@ -236,8 +236,13 @@ class SurfaceLight(PredictedSearch):
         return Refusal(f"light on surfaces is {self.deviations[0].reason}")
 
     def count_predicted(self, kind: str, evaluations: int) -> int:
-        """Return how many of the first evaluations of a search were predicted: none, if
-        an earlier search has given predictions up.
+        """Return how many of the first evaluations of a search were predicted.
+
+        None were if an earlier search has given predictions up.
+
+        Args:
+            kind: kind of the search.
+            evaluations: how many evaluations it has had.
         """
         if "search" in self.first_traced and kind != "search":
             # another search is later, and is traced from its first evaluation on

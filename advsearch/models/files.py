@@ -378,8 +378,9 @@ def _find_batch_limits(
 
 
 def make_eight_bit(source: Source) -> Source:
-    """Return the source of a network that takes uint8 as one that takes floating-point
-    images from 0 to 255.
+    """Return the source of a network that takes uint8, wrapped to take float32.
+
+    The wrapper rounds images from 0 to 255.
     """
     return replace(
         source,
@@ -586,8 +587,10 @@ def _check_onnx_inputs(path: Path, inputs: list[Any]) -> None:
 
 
 def _parse_image_size(text: str) -> list[int]:
-    """Parse (height, width) as YOLO's exporters write it, such as "[640, 640]"; empty
-    if it is no such text.
+    """Parse (height, width) in pixels from a text such as "[640, 640]".
+
+    YOLO's exporters write it so. The result is empty if the text has another form, or
+    if a size is 0.
     """
     match = re.fullmatch(r"\[(\d{1,5}), ?(\d{1,5})\]", text)
     size = [int(number) for number in match.groups()] if match else []

@@ -472,8 +472,12 @@ def _parse_json_names(text: str, where: str) -> list[Any]:
 def _check_names(
     names: Sequence[Any], kind: type[InputError], where: str
 ) -> tuple[str, ...]:
-    """Return label names without surrounding spaces; raise an error of a kind if one is
-    invalid.
+    """Return label names without surrounding spaces.
+
+    Args:
+        names: names in index order.
+        kind: class of the error that is raised if one is invalid.
+        where: where they come from, for the message.
     """
     if problem := _find_problem(names):
         raise kind(f"{where}: {problem}")

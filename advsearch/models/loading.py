@@ -349,8 +349,12 @@ def _adapt_to_images_alone(
 ) -> Callable[[Tensor], Any]:
     """Return the network of a source as one that is called with images alone.
 
-    Some networks also take the size of the images, which is then passed along. One with
-    a state, such as speed, has it already (`WithState`).
+    Some networks also take the size of the images, which is then passed along. A
+    network with a state, such as a speed, is called with that already (`WithState`).
+
+    Args:
+        source: source of the network.
+        preprocessing: states the layout of the images.
     """
     if source.size_type is None or isinstance(source.module, WithState):
         return source.module
@@ -489,6 +493,10 @@ def _check_processor(source: Source, options: Mapping[str, Any]) -> None:
     """Raise InputError for options that repeat what a source's processor does.
 
     A processor is the preprocessing that a library supplies with a network.
+
+    Args:
+        source: source of the network.
+        options: options of `load_model` that the user set.
     """
     if not source.processor:
         return

@@ -349,7 +349,10 @@ class Model:
         recomputes = self._must_recompute(images)
 
         def return_to_device(output: Tensor) -> Tensor:
-            # A copy, because a network may write into the same memory again.
+            """Return an output on the device of the images.
+
+            It is a copy, because a network may write into the same memory again.
+            """
             returned = output.to(images.device)
             is_same_memory = returned is output and not output.requires_grad
             return returned.clone() if is_same_memory else returned

@@ -238,8 +238,16 @@ def _run(model: Model, images: Tensor) -> Tensor:
 
 
 def _run_and_read(model: Model, images: Tensor) -> Any:
-    """Run a network that does not return logits on images (N, H, W, 3), and return the
-    output for each as the task reads it.
+    """Run a network, and return its output as the task reads it.
+
+    The network is one that does not return logits.
+
+    Args:
+        model: model that is probed.
+        images: (N, H, W, 3).
+
+    Returns:
+        The output for each of the N images, a tensor (N, ...) or a list.
     """
     assert model.read is not None
     returned, batch_size = _run_network(model, images)
@@ -248,8 +256,9 @@ def _run_and_read(model: Model, images: Tensor) -> Any:
 
 
 def _run_network(model: Model, images: Tensor) -> tuple[Any, int]:
-    """Return what the network returns for images (N, H, W, 3), and the size of its
-    batch, which may be larger.
+    """Return what a network returns for images (N, H, W, 3), and its batch size.
+
+    The batch is larger than N if the network needs a larger one.
     """
     x = model.prepare(images)
     with torch.set_grad_enabled(torch.is_grad_enabled()):
@@ -478,8 +487,9 @@ def _check_range(model: Model, images: Tensor) -> None:
 
 
 def _is_range_declared(model: Model) -> bool:
-    """Return whether the user or a library has set what depends on the range of colors:
-    then the range is known, too.
+    """Return whether the user or a library has stated how colors are normalized.
+
+    Then the range of colors is known, and need not be guessed.
     """
     preprocessing = model.preprocessing
     return (
@@ -526,10 +536,13 @@ def _collect_numbers(model: Model, images: Tensor) -> Tensor | None:
 
 
 def _compute_relative_change(outputs: Tensor) -> float:
-    """Return the median, over the n numbers of outputs (K, n), of their relative
-    change.
+    """Return how much outputs change between K images, relative to their size.
 
-    That is the range over the K outputs, divided by the largest absolute value.
+    For each of n numbers this is its range over the images, divided by its largest
+    absolute value. The result is the median over the numbers.
+
+    Args:
+        outputs: (K, n).
     """
     change = outputs.amax(dim=0) - outputs.amin(dim=0)
     size = outputs.abs().amax(dim=0).clamp_min(torch.finfo(torch.float32).tiny)

@@ -88,6 +88,7 @@ class _Convolution(nn.Module):
     def __init__(
         self, inputs: int, outputs: int, size: int, *, stride: int = 1
     ) -> None:
+        """Build the layers; `size` is the side of the kernel in pixels."""
         super().__init__()
         self.convolve = nn.Conv2d(inputs, outputs, size, stride, size // 2, bias=False)
         self.normalise = nn.BatchNorm2d(outputs)

@@ -468,8 +468,15 @@ def _import_module(name: str, spec: str, libraries: Iterable[str]) -> ModuleType
 
 
 def _suggest_library(name: str, spec: str, libraries: Iterable[str]) -> str:
-    """Return the question whether a library is meant by the name of a module, "" if
-    none is similar.
+    """Return a suggestion such as "; did you mean 'timm:resnet18'?".
+
+    Args:
+        name: name of a module that does not exist.
+        spec: what the user wrote, "NAME:REST".
+        libraries: names that may have been meant.
+
+    Returns:
+        The suggestion; "" if no library has a similar name.
     """
     similar = find_similar_names(name, libraries)
     if not similar:
@@ -478,6 +485,7 @@ def _suggest_library(name: str, spec: str, libraries: Iterable[str]) -> str:
 
 
 def _where(error: BaseException) -> str:
+    """Return the first line of an error, and the file and line that raised it."""
     frames = traceback.extract_tb(error.__traceback__)
     return get_first_line(error) + (
         f" at {frames[-1].filename}:{frames[-1].lineno}" if frames else ""

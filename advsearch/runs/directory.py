@@ -358,8 +358,14 @@ class RunDirectory:
 
     @staticmethod
     def find_file_changed_since(run: Path, config: Config) -> str | None:
-        """Return the name of a file that settings name and that is another one than
-        when a run was made, or None.
+        """Return the name of a file that has changed since a run was made.
+
+        Args:
+            run: directory of the run.
+            config: configuration whose settings name the files.
+
+        Returns:
+            One such name; None if no file has changed.
         """
         return summary.find_changed_file(
             RunDirectory.read_versions(run), config.to_json()
@@ -367,8 +373,9 @@ class RunDirectory:
 
     @staticmethod
     def read_versions(run: Path) -> dict[str, object]:
-        """Return the versions and the digests of files and weights that a run was made
-        with, as it noted them.
+        """Return the versions of packages and digests of files that a run has noted.
+
+        They are those with which the run was made.
         """
         with store.Store.open_to_read(run) as results:
             noted = results.read_json_note(summary.VERSIONS_NOTE)
@@ -531,9 +538,13 @@ def make_default_name(object_name: str, controls: Iterable[str]) -> str:
 
 
 def check_links(run: Path) -> None:
-    """Check that what a run's folder has is its own, as `check_no_links`. Small
-    pictures, of which there may be a million, are checked as each is read
-    (`viewer.thumbnails`). Raises FileFormatError.
+    """Check that nothing in a run's folder is a link to a file elsewhere.
+
+    Small pictures, of which there may be a million, are checked when each is read
+    (`viewer.thumbnails`).
+
+    Raises:
+        FileFormatError: something is a link.
     """
     check_no_links(run, CONTENTS, SMALL_PICTURES)
 
@@ -546,8 +557,9 @@ def locate_run(run: str | Path) -> Path:
 
 
 def format_run_name(path: str | Path) -> str:
-    """Return what a user types to name the run in a folder: its name in `HOME`, or its
-    path.
+    """Return what a user types to name the run in a folder.
+
+    It is the name of the folder if that is in ``runs/``, else its path.
     """
     path = Path(path)
     return path.name if path.parent == HOME else str(path)

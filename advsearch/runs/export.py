@@ -105,6 +105,7 @@ def list_columns(rows: Iterable[Row]) -> list[str]:
 
 
 def make_record(row: Row) -> JsonObject:
+    """Return a row as values by column, with a column for each metric and value."""
     columns = {
         field.name: getattr(row, field.name)
         for field in fields(row)
@@ -140,6 +141,7 @@ def iterate_values(
 
 
 def _flatten_values(values: Mapping[str, Value | JsonValue]) -> JsonObject:
+    """Return values by column, whose name has the unit: "pose.yaw [degrees]"."""
     return {
         f"{name} [{unit}]" if unit else name: value
         for name, value, unit in iterate_values(values)

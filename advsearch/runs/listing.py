@@ -42,8 +42,9 @@ class ListedRun:
 
 
 def list_runs(folder: Path) -> list[ListedRun]:
-    """Return the runs in a folder, by name; what cannot be read is shown as far as it
-    can.
+    """Return the runs in a folder, sorted by name.
+
+    A run that cannot be read completely is listed with what can be read.
     """
     if not folder.is_dir():
         return []
@@ -55,8 +56,9 @@ def list_runs(folder: Path) -> list[ListedRun]:
 
 
 def is_finished(path: Path) -> bool:
-    """Whether a run has come to its end; one that was interrupted, or killed while its
-    report was written, has not.
+    """Return whether a run has come to its end.
+
+    A run has not if it was interrupted, or killed while its report was written.
     """
     if not (path / summary.NAME).is_file() or summary.read_result(path).is_unfinished:
         return False
@@ -126,6 +128,7 @@ def _make_damaged_run(path: Path) -> ListedRun:
 
 
 def _state(path: Path) -> object:
+    """Return what changes when a file is written; None if it is missing or empty."""
     with suppress(OSError):
         file = os.lstat(path)
         if file.st_size:  # who reads leaves an empty log

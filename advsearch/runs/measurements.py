@@ -68,8 +68,15 @@ class Measurements:
     def get_row(
         self, key: str, row_type: type[AnyFields], measure: Callable[[], AnyFields]
     ) -> AnyFields:
-        """Return the fields that `measure` returns, or those that are stored; otherwise
-        as `get`.
+        """Return the fields that are stored under a key, or measure and store them.
+
+        Args:
+            key: key of the measurement in the store of the run.
+            row_type: class of the fields.
+            measure: measures them.
+
+        Raises:
+            OutOfTime: they would have to be measured, and the time is up.
         """
         return row_type.of(self.get(key, lambda: measure().to_dict()))
 

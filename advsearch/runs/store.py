@@ -82,10 +82,10 @@ class Row:
 
 @dataclass(frozen=True)
 class CachedEvaluation:
-    """What a search was told of an evaluation that its row does not have.
+    """What a search needs of an evaluation to be resumed, and the row does not have.
 
-    A policy's state follows from the evaluations that it was told of, so a search that
-    is resumed is told of all of them again.
+    The state of a policy follows from the evaluations that it has received. So a search
+    is resumed by sending it all of them again.
     """
 
     number: int  # index of the evaluation in the search
@@ -307,6 +307,7 @@ class Store:
         return int(step)
 
     def count_rows(self, kind: str | None = None) -> int:
+        """Return the number of rows of a kind; None for all kinds."""
         condition, parameters = (
             ("", []) if kind is None else (" WHERE kind = ?", [kind])
         )

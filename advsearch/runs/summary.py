@@ -121,8 +121,11 @@ named, and parses the header as Python, which ends in errors of any kind.
 
 
 def write_configuration(run: Path, u: NDArray[np.float32]) -> Path:
-    """Keep a configuration (d,) of the unit box, whole or not at all, and return
-    where.
+    """Write the adversarial configuration of a run atomically, and return its path.
+
+    Args:
+        run: directory of the run.
+        u: (d,) the configuration, in [0, 1].
     """
     buffer = io.BytesIO()
     np.save(buffer, np.ascontiguousarray(u, dtype=np.float32), allow_pickle=False)
@@ -421,6 +424,7 @@ def _find_paths(value: object) -> Iterator[str]:
 
 
 def _digest_file(path: Path) -> str:
+    """Return the SHA-256 of a file, which is read in pieces of 1 MiB."""
     digest = hashlib.sha256()
     with path.open("rb") as file:
         while part := file.read(1 << 20):

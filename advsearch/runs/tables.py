@@ -54,7 +54,8 @@ class Units:
     frames: Annotated[int, Field(strict=True, ge=0)] | None = None
     samples: Count = 1  # draws at each point of the grid
     models: Count = 1  # models that are shown the same pictures
-    # pictures after which the draws come again; 0 for never
+    # number of pictures after which the same draws come again, with the adversarial
+    # scene; 0 for never
     again: Annotated[int, Field(strict=True, ge=0, le=MAX_ROWS)] = 0
     noise: Count = 1  # pictures of each draw that differ in noise alone
     # Photographs of a folder, in which the scenes are in turn; 1 where there is no
@@ -64,6 +65,11 @@ class Units:
 
     @property
     def size(self) -> int:
+        """Number of rows that follow one another and belong to one unit.
+
+        Each image has a row for each model. With `again`, all images come twice:
+        without and with the adversarial scene.
+        """
         if self.photographs > 1:
             return self.models * (2 if self.again else 1) * self.scene
         frames = 1 if self.frames is None else self.sizes[self.frames]
@@ -341,8 +347,10 @@ def _make_cells(row: Row, number: int, units: dict[str, str]) -> dict[str, Any]:
 
 
 def _to_categories(column: pd.Series) -> pd.Categorical:
-    """Return a column that has names as categories, in the order in which they come;
-    numbers among them follow.
+    """Return a column with texts as a column of categories.
+
+    Categories are the texts in the order in which they occur, followed by the numbers
+    among them, as texts.
     """
     texts = list(map(_as_category, column))
     names = [value for value in column if isinstance(value, str)]

@@ -32,6 +32,7 @@ _LOG = logging.getLogger("advsearch")
 
 
 def check_tracker(name: str | None) -> None:
+    """Check that a tracker exists and is installed; None stands for no tracker."""
     if name is None:
         return
     if name not in PACKAGES:
@@ -40,6 +41,7 @@ def check_tracker(name: str | None) -> None:
 
 
 def _import_package(name: str) -> Any:
+    """Import the package of a tracker; raise InputError if it is not installed."""
     try:
         return importlib.import_module(PACKAGES[name])
     except ImportError:
@@ -126,6 +128,7 @@ class Tracker:
         return metrics
 
     def _put(self, message: tuple[MetricValues, int] | None) -> None:
+        """Queue metrics and their step for the thread; None ends the thread."""
         try:
             self._queue.put_nowait(message)
         except Full:
