@@ -141,9 +141,12 @@ class Deviation:
 def compare_views(compare_view: Callable[[int], ComparedView]) -> Deviation:
     """Compare predictions with traced images over several views.
 
-    At first over `N_FIRST_VIEWS`; only if these are neither clearly good nor clearly
-    bad, over all `N_VIEWS`. `compare_view` compares a single view, a predicted
-    image and traced ones of one configuration, by its index.
+    `N_FIRST_VIEWS` are compared first. Only if these are neither clearly good nor
+    clearly bad, all `N_VIEWS` are, since each view takes three renders.
+
+    Args:
+        compare_view: function of the index of a view that compares a predicted image
+            with traced ones of the same configuration.
     """
     views = [compare_view(index) for index in range(N_FIRST_VIEWS)]
     first = Deviation.from_views(views)
@@ -177,7 +180,8 @@ def compare_with_traced(
         u: (d,) full configuration.
         seed: seed of the noise of the traced images.
         spp: samples per pixel of the search.
-        measure_margin: from an image and a configuration to the model's margin.
+        measure_margin: function from an image (H, W, 3) and its configuration to the
+            model's margin.
         predicted_start: (H, W, 3) image that is predicted for the start of the search
             under the same conditions; None if `u` is that.
     """
@@ -188,7 +192,8 @@ def compare_with_traced(
         *halves, converged = renderer.render_halves(u, seed, CHECK_SPP)
         object_mask = renderer.mask(u)
     predicted_margin = measure_margin(predicted, u)
-    # how far the search has moved the margin, by which its bias is judged
+    # How far the search has moved the margin: an error of the margin that is small
+    # against this is accepted.
     margin_change = 0.0
     if predicted_start is not None:
         margin_change = abs(predicted_margin - measure_margin(predicted_start, u))

@@ -48,10 +48,17 @@ MAX_SOBOL_DIM = 64  # coordinates of a condition up to which conditions are stra
 
 
 def sample_condition(domain: Domain, index: int, seed: int) -> Tensor:
-    """Return the condition (d,) with an index, one of evenly spread ones.
+    """Return the condition (d,) with an index, out of evenly spread ones.
 
-    Each is as likely as any other. They are points of a scrambled Sobol sequence, or
-    independent samples where the sequence cannot be used.
+    Conditions are points of a scrambled Sobol sequence, which covers their range better
+    than independent samples; each is still uniformly distributed. Independent samples
+    are taken if there are too many coordinates for the sequence, or if a block is an L2
+    ball, which is no box.
+
+    Args:
+        domain: domain of the conditions.
+        index: index in the sequence; a bank takes 0, 1, 2, ...
+        seed: seed of the sequence.
     """
     has_l2_block = any(block.norm == "l2" for block in domain.blocks)
     if domain.dim > MAX_SOBOL_DIM or has_l2_block:
@@ -70,7 +77,12 @@ def _compare_means(
     """Return the difference of two mean objectives, and its standard error.
 
     The difference is over 0 if the search does better under conditions of the bank than
-    under unseen ones: then it has adapted to the bank.
+    under unseen ones: then it has adapted to the bank. The standard error is
+    sqrt(var_1 / n_1 + var_2 / n_2).
+
+    Args:
+        bank_objectives: objectives under conditions of the bank.
+        unseen_objectives: objectives under new conditions.
     """
     bank_mean = statistics.fmean(bank_objectives)
     gap = bank_mean - statistics.fmean(unseen_objectives)
@@ -152,8 +164,9 @@ class Bank(PredictedSearch):
     def replay(self, query: Query) -> None:
         """Bring the bank to the state in which a query is evaluated.
 
-        At every `COMPARISON_INTERVAL`-th query of a search it is compared with unseen
-        conditions. Then all matrices are made that it has by that query.
+        At every `COMPARISON_INTERVAL`-th query of a search, the bank is compared with
+        unseen conditions, and may grow from there on. Then the matrices that it has by
+        this query are made.
         """
         if query.kind == "search" and query.phase == "search":
             self._latest_step = query.index
@@ -181,7 +194,13 @@ class Bank(PredictedSearch):
     def _evaluate_under(
         self, conditions: Sequence[Condition], u: Tensor, gradient: WhichGradient
     ) -> Evaluation:
-        """Evaluate u (d,) under conditions of the bank."""
+        """Evaluate u by its mean over conditions of the bank.
+
+        Args:
+            conditions: conditions of the bank.
+            u: (d,) the searched coordinates.
+            gradient: whether a derivative is computed.
+        """
         full_configurations = [torch.cat([u, condition.u]) for condition in conditions]
         evaluation = self.problem.evaluate_conditions(
             lambda batch, batch_u: self._predict_images(conditions[batch], batch_u),
@@ -196,8 +215,13 @@ class Bank(PredictedSearch):
     def _choose_conditions(self, kind: str, index: int) -> list[Condition]:
         """Return the conditions under which a query is evaluated.
 
-        They are those that are new in the bank since the query before, and random
-        others. While configurations are ranked, after the search, none is new.
+        The conditions that the bank has gained since the previous query come first, so
+        that each of them counts soon. The rest is random. While configurations are
+        ranked, after the search, none is new.
+
+        Args:
+            kind: kind of the search.
+            index: index of the query.
         """
         count = min(self.problem.n_draws, len(self._conditions))
         # any other kind of search runs after "search", so that no condition is new to it
@@ -218,7 +242,11 @@ class Bank(PredictedSearch):
     ) -> list[Condition]:
         """Return `count` random conditions out of some, none of them twice.
 
-        The random numbers are those of a stream and an index.
+        Args:
+            conditions: conditions to choose from.
+            count: number of conditions.
+            stream: name of the stream of random numbers.
+            index: index in that stream.
         """
         generator = torch.Generator().manual_seed(
             seeds.stream(self.problem.seed, stream, index)
@@ -227,11 +255,14 @@ class Bank(PredictedSearch):
         return [conditions[position] for position in order[:count]]
 
     def _predict_images(self, conditions: Sequence[Condition], u: Tensor) -> Tensor:
-        """Return predicted images (n, H, W, 3) of u (d,) under conditions, with a
-        graph.
+        """Return predicted images (n, H, W, 3) under n conditions, with a graph from u.
 
-        If the searched controls alone set all inputs of the matrix, these are computed
-        once for all conditions.
+        If the searched controls alone set all inputs of a matrix, such as base colors,
+        these are computed once for all conditions.
+
+        Args:
+            conditions: n conditions of the bank.
+            u: (d,) the searched coordinates.
         """
         inputs = self.problem.searched_space.inputs(u)
         images = []
@@ -259,13 +290,16 @@ class Bank(PredictedSearch):
             return self._image_renderer(self.problem.add_conditions(u))
 
     def _count_conditions(self, index: int) -> int:
-        """Return how many conditions the bank has had by the evaluation with an index,
-        those that were dropped since then included.
+        """Return how many conditions the bank has had by an evaluation.
 
-        It begins with `INITIAL_CONDITIONS` for each draw. It grows from the start on,
-        and again from each comparison in `growth_steps`, until the next comparison: by
-        one condition for every `DRAWS_PER_CONDITION` draws. In the second half of a
-        search it does not grow.
+        Conditions that were dropped since then count. The bank begins with
+        `INITIAL_CONDITIONS` for each draw. It grows during the first interval between
+        comparisons, and during each interval after a comparison in `growth_steps`. It
+        gains one condition for every `DRAWS_PER_CONDITION` draws. In the second half of
+        a search it does not grow, so that the search can converge.
+
+        Args:
+            index: index of the evaluation.
         """
         last_index_of_first_half = self.steps // 2 - 1
         index = min(index, last_index_of_first_half)
@@ -282,8 +316,12 @@ class Bank(PredictedSearch):
     def _make_query(self, number: int) -> Query:
         """Return the query that collects the light of the condition with an index.
 
-        Light is collected at one configuration: where the search was when the bank last
-        began to grow before this condition, or at the start.
+        Light is collected at one configuration of the searched controls, near which a
+        matrix is exact. It is the configuration of the latest comparison that let the
+        bank grow before this condition, or the start.
+
+        Args:
+            number: index of the condition in the bank's sequence.
         """
         assert self.problem.conditions is not None
         # comparisons that let the bank grow and before which it lacked this condition
@@ -308,9 +346,11 @@ class Bank(PredictedSearch):
             tick: called with the samples of each condition that is made.
         """
         size = self._count_conditions(index)
+        # index of the first condition that has no matrix yet
         first_missing = 0
         if self._conditions:
-            # the newest is the last; older ones may have been dropped
+            # The newest condition is the last. Older ones may have been dropped, so
+            # that their number does not tell the index.
             first_missing = self._conditions[-1].index + 1
         if first_missing >= size:
             return
@@ -326,10 +366,14 @@ class Bank(PredictedSearch):
                 self._drop_oldest()
 
     def _request_light(self, first_missing: int, index: int) -> None:
-        """Request the light of all conditions up to the comparison after an evaluation.
+        """Request the light of all conditions that the bank needs before a comparison.
 
-        They are requested at once, so that workers collect them in parallel. Later ones
-        depend on how the comparison ends.
+        They are requested at once, so that workers collect them in parallel. Whether
+        more follow depends on the result of the comparison.
+
+        Args:
+            first_missing: index of the first condition without a matrix.
+            index: index of the evaluation; the comparison after it counts.
         """
         next_comparison = (index // COMPARISON_INTERVAL + 1) * COMPARISON_INTERVAL
         self._collected_until = self._count_conditions(next_comparison - 1)
@@ -348,7 +392,9 @@ class Bank(PredictedSearch):
     def _make_condition(self, number: int, light: LinearizedScene | None) -> Condition:
         """Return the condition with an index, with the matrix of its light.
 
-        `light` is what another process has collected; None to collect it here.
+        Args:
+            number: index of the condition in the bank's sequence.
+            light: light that another process has collected; None to collect it here.
         """
         query = self._make_query(number)
         dim = self.problem.domain.dim
@@ -364,7 +410,8 @@ class Bank(PredictedSearch):
             name in searched_inputs and torch.equal(searched_inputs[name], value)
             for name, value in inputs.items()
         )
-        # Equal inputs of all matrices share one tensor.
+        # To save memory, an input that equals that of the previous matrix shares its
+        # tensor.
         for name, value in inputs.items():
             latest = self._latest_inputs.get(name)
             if latest is not None and torch.equal(latest, value):
@@ -373,10 +420,14 @@ class Bank(PredictedSearch):
         return Condition(number, query.u[dim:], renderer, depends_on_searched_only)
 
     def _compare(self, u: Tensor, index: int) -> None:
-        """Compare the bank with unseen conditions, and let it grow where it must.
+        """Compare the bank with unseen conditions, and let it grow if it must.
 
-        It grows if unseen conditions are clearly better for the model than those of the
-        bank, or if predictions are too far from traced images.
+        It grows if the search does clearly worse under unseen conditions than under
+        those of the bank, or if predictions are too far from traced images.
+
+        Args:
+            u: (d,) where the search is.
+            index: index of the evaluation.
         """
         problem = self.problem
         with self.count_time():
@@ -389,6 +440,7 @@ class Bank(PredictedSearch):
             self.n_traced += N_COMPARED
 
         def compare_view(number: int) -> ComparedView:
+            """Compare the predicted image under a condition with traced ones."""
             # there may be more views than conditions, which are then used again
             position = number % len(conditions)
             return problem.compare_view(
@@ -408,9 +460,7 @@ class Bank(PredictedSearch):
     def _predict_objectives(
         self, u: Tensor, conditions: Sequence[Condition]
     ) -> list[float]:
-        """Return the objectives of predicted images of u (d,) under conditions of the
-        bank.
-        """
+        """Return the objectives of predicted images of u (d,), one per condition."""
         evaluated, _ = self.problem.evaluate_batch(
             partial(self._predict_images, conditions),
             [torch.cat([u, condition.u]) for condition in conditions],
@@ -420,12 +470,15 @@ class Bank(PredictedSearch):
         return [evaluation.objective for evaluation, _ in evaluated]
 
     def _trace_unseen(self, u: Tensor, seed: int) -> list[float]:
-        """Return the objectives of traced images of u (d,) under `N_COMPARED` new
-        conditions, which are not in the bank.
+        """Return the objectives of traced images under conditions not in the bank.
+
+        Args:
+            u: (d,) the searched coordinates.
+            seed: seed of the `N_COMPARED` new conditions and of the noise.
         """
         objectives = []
         for index in range(N_COMPARED):
-            # of both the conditions and the noise
+            # one seed for both the condition and the noise
             draw_seed = seeds.stream(seed, "draw", index)
             evaluation, _ = self.problem.evaluate_full(
                 Query(u, draw_seed),

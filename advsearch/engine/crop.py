@@ -54,6 +54,7 @@ class CroppedSearch(PredictedSearch):
         return self.refusal
 
     def measure_size(self) -> tuple[int, int]:
+        """Return 0 entries, as there is no matrix, and the bytes of stored images."""
         height, width = self.problem.renderer.formation.resolution
         # stored for each kind of search: the two halves of its full image, their mean,
         # and the surroundings of the window
@@ -82,13 +83,14 @@ class CroppedSearch(PredictedSearch):
     def _renew_surroundings(
         self, windowing: Windowing, kind: str, number: int, image: FullImage
     ) -> Renderer:
-        """Render the surroundings of the window, for a kind of search from now on.
+        """Render new surroundings of the window, for a kind of search from now on.
 
         Args:
             windowing: the window.
             kind: kind of the search.
             number: index of the query, for the seed.
-            image: full image of the configuration whose surroundings they are.
+            image: full image of the configuration whose surroundings are rendered; it
+                is stored, to be compared with later ones.
 
         Returns:
             The renderer that traces the window and pastes it into these surroundings.
@@ -117,6 +119,7 @@ class CroppedSearch(PredictedSearch):
         self._update(query)
 
     def evaluate(self, query: Query) -> Evaluation:
+        """Evaluate a query, by rendering only the window if that is enough."""
         renderer = self._update(query)
         if renderer is None:
             return self.problem.evaluate(query)
@@ -141,7 +144,8 @@ class CroppedSearch(PredictedSearch):
         assert self.windowing is not None
         image, renderer = self._current.setdefault(kind, self._current["start"])
         is_due = number > 0 and number % COMPARISON_INTERVAL == 0
-        # a baseline draws configurations by chance: there is nothing to keep up with
+        # A random search ("baseline") does not move away from the start, so that its
+        # surroundings do not get old.
         if not is_due or not kind.startswith("search"):
             return renderer
         was_accepted = self.deviations[-1].is_accepted
@@ -150,7 +154,8 @@ class CroppedSearch(PredictedSearch):
                 self.windowing.window, image, query.u
             )
             self.deviations.append(deviation)
-            # a single bad comparison only renews the surroundings
+            # After a single bad comparison the surroundings are only renewed, since
+            # this may have been enough.
             if deviation.is_accepted or was_accepted:
                 assert self.n_renewals is not None  # None only for a `Bank`
                 self.n_renewals += 1

@@ -68,8 +68,12 @@ def change_image(image: Tensor, change_name: str, n_cameras: int = 1) -> Tensor:
 def meets_claim(claim: str, before: Prediction, after: Prediction) -> bool:
     """Return whether a prediction did what was claimed, when its image was changed.
 
-    The claim is "must_not_change", of the label; or "must_change", of the label or of
-    the probability by more than `MAX_UNCHANGED_DIFFERENCE`.
+    Args:
+        claim: "must_not_change" claims that the label stays. "must_change" claims that
+            the label changes, or the probability by more than
+            `MAX_UNCHANGED_DIFFERENCE`.
+        before: prediction on the original image.
+        after: prediction on the changed image.
     """
     has_other_label = before.label != after.label
     if claim != "must_change":

@@ -98,7 +98,7 @@ class ParallelEvaluator:
     def __call__(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
         """Evaluate queries, and yield the evaluations in the order of the queries.
 
-        Workers return results as they are done; a result waits here until those of all
+        Workers finish in any order. A result waits here until the results of all
         earlier queries have been yielded.
         """
         # a single query is evaluated here: sending it away would save no time
@@ -108,9 +108,9 @@ class ParallelEvaluator:
         items: list[WorkItem] = [
             (self.key, self.problem.preparation, query) for query in queries
         ]
-        # a result refers to the item that was sent, which is the same object
+        # A result has the very object that was sent, so that its id finds the query.
         index_of_item = {id(item): index for index, item in enumerate(items)}
-        # evaluations by index that came before those of earlier queries
+        # evaluations that came too early, by the index of their query
         waiting = dict[int, Evaluation]()
         next_index = 0
         results: Any = self.executor.compute([item] for item in items)
@@ -124,7 +124,8 @@ class ParallelEvaluator:
                 waiting[index] = replace(evaluation, machine=result.machine)
                 while next_index in waiting:
                     evaluation = waiting.pop(next_index)
-                    # evaluations in this process count them as they render
+                    # The renderer counts non-finite values as it renders. A worker has
+                    # another renderer, so that its count is added here.
                     self.problem.renderer.non_finite += evaluation.non_finite
                     yield evaluation
                     next_index += 1
@@ -137,6 +138,7 @@ def make_worker_call(get_evaluator: Callable[[Any], Evaluator]) -> BatchFunction
     """
 
     def call(items: Sequence[WorkItem]) -> list[Evaluation]:
+        """Evaluate work items, and return the evaluations in their order."""
         evaluations = list[Evaluation]()
         # queries of one problem follow one another
         for key, group in groupby(items, lambda item: item[0]):
@@ -153,12 +155,12 @@ def make_worker_call(get_evaluator: Callable[[Any], Evaluator]) -> BatchFunction
 def make_lost_evaluation(query: Query, reason: str) -> Evaluation:
     """Return the evaluation of a query whose workers all died.
 
-    It counts as evaluated, without a result: objective and margin are NaN, the gradient
-    is zero.
+    The search goes on with a result that teaches it nothing: objective and margin are
+    NaN, and the gradient is zero.
 
     Args:
         query: query that was lost.
-        reason: why, as a clause.
+        reason: why it was lost, to follow a colon in a message.
 
     Raises:
         ClusterError: the query is for an image or for light, which nothing replaces.
@@ -200,7 +202,8 @@ def check_digests(
 ) -> None:
     """Store the digests of networks and functions, or check those of a resumed run.
 
-    A model behind an address has none: its answers are stored in the run instead.
+    A run may only be resumed with what it began with. A model behind an address has no
+    digest, as its weights are elsewhere: its answers are stored in the run instead.
 
     Args:
         run: run that is new or resumed.
@@ -232,7 +235,7 @@ def check_digests(
 def compute_weights_digest(model: Model) -> str | None:
     """Return the SHA-256 of a network's weights and buffers, with their names.
 
-    None for a network that does not give access to them.
+    None for a network that does not give access to them, such as a user's function.
     """
     try:
         state = model.module.state_dict()  # type: ignore[attr-defined]
@@ -243,6 +246,7 @@ def compute_weights_digest(model: Model) -> str | None:
         # by name, since a network may list them in any order
         for name, tensor in sorted(tensors.items()):
             digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
+            # as bytes, since NumPy has no bfloat16
             flat = tensor.detach().cpu().contiguous().flatten()
             digest.update(flat.view(torch.uint8).numpy().tobytes())
     except (AttributeError, RuntimeError, TypeError, NotImplementedError):
@@ -254,8 +258,10 @@ def compute_code_digest(function: Callable[..., Any]) -> str | None:
     """Return the SHA-256 of what a function does; None if it has no Python code.
 
     It covers code, constants, defaults, closures and the arguments that a `partial`
-    holds; of an object that is called as a function also its arrays.
+    holds. If the function is an object with `__call__` or `forward`, it also covers the
+    arrays that the object holds.
     """
+    # unwrap a `partial`, perhaps of a `partial`, and note its arguments
     partial_arguments = []
     while isinstance(function, partial):
         keywords = sorted(function.keywords.items())
@@ -288,18 +294,25 @@ def compute_code_digest(function: Callable[..., Any]) -> str | None:
 def _list_array_digests(holder: Any) -> list[tuple[str, Any]]:
     """Return name and digest of each array that is an attribute of an object.
 
-    So also of an attribute of type bytes, which counts as its own digest.
+    An attribute of type bytes is listed, too: it stands for itself.
     """
     attributes = sorted(getattr(holder, "__dict__", {}).items())
     simplified = [(name, _simplify(value)) for name, value in attributes]
-    # of arrays `_simplify` makes digests, which are bytes
+    # `_simplify` turns arrays, and nothing else but bytes, into bytes: their digests.
     return [(name, digest) for name, digest in simplified if isinstance(digest, bytes)]
 
 
 def _simplify_code(code: CodeType, docstring: str | None = None) -> tuple[Any, ...]:
     """Return the code of a function in a form whose repr is the same in every process.
 
-    Its name, its place in the file and its docstring are left out.
+    Name, line numbers and docstring are left out, as a change of these does not change
+    what the function computes. Names of local variables are left out for that reason.
+
+    Args:
+        code: compiled code of the function.
+        docstring: docstring of the function, which is among its constants; None for
+            code without one. Then constants that are None are left out, which does no
+            harm.
     """
     constants = [
         _simplify_code(constant)
@@ -370,7 +383,10 @@ class Journal:
         return self.evaluator.problem
 
     def __post_init__(self) -> None:
-        # once, and not for another problem of the same run
+        """Read from the store which machines and how many rows the run has.
+
+        A copy for another problem of the same run has these already.
+        """
         if self.run is not None and not self._opened:
             self.machines |= self.get_note(MACHINES_NOTE) or {}
             self._counts |= self.run.store.count_by_kind()
@@ -395,6 +411,7 @@ class Journal:
             on_replay: called with every query of a search that is read from the store.
         """
         stored = [self._read(query) for query in queries]
+        # those without a stored evaluation, to evaluate in one call
         new_queries = [
             query
             for query, evaluation in zip(queries, stored, strict=True)
@@ -419,10 +436,11 @@ class Journal:
             yield evaluation
 
     def _trials_of(self, kind: str) -> dict[int, Evaluation]:
-        """Return the evaluated trials of a kind by their numbers, to add new ones to.
+        """Return the evaluated trials of a kind by their numbers.
 
-        Those of the store are read at the first call for the kind, which also counts
-        those that were lost with their workers.
+        It is the journal's own dictionary, to which `store` adds new trials. The first
+        call for a kind reads its rows from the store, and counts those that were lost
+        with their workers.
         """
         if kind in self._trials:
             return self._trials[kind]
@@ -433,8 +451,8 @@ class Journal:
         for row in rows:
             # Rows of old runs may have no judgement.
             if row.correct is not None:
-                # samples per pixel of the prediction, which such a row has as its spp;
-                # 0 for a rendered image, whose row has a seed
+                # A row without a seed is that of a predicted image, and its spp are the
+                # samples per pixel of the prediction. For a rendered image this is 0.
                 predicted = 0
                 if row.seed is None:
                     predicted = row.spp or 1
@@ -451,8 +469,8 @@ class Journal:
     def _read(self, query: Query) -> Evaluation | None:
         """Return the stored evaluation of a query; None if there is none.
 
-        The renderer of the problem then counts the non-finite values of the gradient
-        again, as it did when the query was evaluated.
+        Non-finite values of the stored gradient are added to the renderer's count, as
+        when the query was evaluated.
 
         Raises:
             InputError: the stored evaluation is one of another configuration.
@@ -487,12 +505,13 @@ class Journal:
     ) -> list[Row]:
         """Store evaluations in one transaction, a row each.
 
-        Gradient and image of a search's evaluation are stored with its row.
+        For an evaluation of a search, gradient and image are stored with the row; it
+        has to come alone.
 
         Args:
             evaluated: queries and their evaluations.
-            id_is_number: whether the id of a row is the number of its query, in
-                whatever order they come.
+            id_is_number: whether the id of a row follows from the number of its query
+                (number + 1). So rows that come in any order have the same ids.
 
         Returns:
             The rows.
@@ -510,8 +529,8 @@ class Journal:
                     trials = self._trials_of(query.kind)
                     trials[query.index] = replace(evaluation, picture=None)
             elif query.index < self._counts.get(query.kind, 0):
-                # The run was complete when it was opened: its rows are there, without
-                # what is stored beside them.
+                # The store has this row, but not its gradient, which a complete run
+                # deletes. So it was evaluated again, and is not stored twice.
                 continue
             else:
                 row, cached = self._row_of_search(query, evaluation)
@@ -525,18 +544,20 @@ class Journal:
         return rows
 
     def _append_in_memory(self, rows: Iterable[Row]) -> None:
-        """Append rows to those of a journal without a run, with the id and the time
-        that the store of a run would add.
+        """Append rows to those of a journal without a run.
+
+        They get the id and the time that the store of a run would add.
         """
         for row in rows:
             row_id = row.id or len(self.rows) + 1
             self.rows.append(replace(row, id=row_id, time=time.time()))
 
     def _note_machine(self, name: str | None) -> None:
-        """Store the description of a machine that differs from this one, at its first
-        row.
+        """Store the description of a machine that differs from this one.
 
-        `name` is None for machines that are like this one.
+        Args:
+            name: name of the machine in its rows; None for one that is like this one.
+                Nothing is done for a name that is stored already.
         """
         if name is None or name in self.machines:
             return
@@ -550,7 +571,8 @@ class Journal:
     def _row_of_trial(self, query: Query, evaluation: Evaluation) -> Row:
         """Return the row of a trial.
 
-        With random conditions the row has their values, too.
+        The row has the values that the query states and, if its conditions are random,
+        the values of these.
         """
         values = dict(query.values)
         if query.draws_conditions:
@@ -558,8 +580,8 @@ class Journal:
         row = make_trial_row(
             query.kind,
             query.index,
-            # a predicted image has no noise of its own, and the samples per pixel of
-            # the prediction instead of those of a render
+            # A predicted image has no noise, hence no seed. Its row has the samples per
+            # pixel of the prediction in place of those of a render.
             seed=None if evaluation.predicted else query.seed,
             spp=evaluation.predicted or query.spp,
             judgement=evaluation.required_judgement,
@@ -576,8 +598,14 @@ class Journal:
     def _row_of_search(
         self, query: Query, evaluation: Evaluation
     ) -> tuple[Row, CachedEvaluation]:
-        """Return the row of a search's evaluation, and what is stored beside it so that
-        the search can be resumed.
+        """Return the row of a search's evaluation, and what resuming it needs.
+
+        That is what the row does not have: digest of the configuration, cost, gradient
+        and image. It is deleted when the run is done.
+
+        Args:
+            query: the query.
+            evaluation: its evaluation.
         """
         problem = self.problem
         is_finite = evaluation.is_finite
@@ -586,7 +614,8 @@ class Journal:
             query.kind,
             query.index,
             query.seed,
-            # a predicted image was not rendered: it has neither samples nor renders
+            # A predicted image was not rendered: it has neither samples nor renders.
+            # The cost of a rendered one counts images under each condition.
             spp=None if is_predicted else problem.spp * query.samples,
             objective=evaluation.objective if is_finite else math.nan,
             success=evaluation.success and is_finite,
@@ -619,14 +648,15 @@ class Journal:
     ) -> Callable[[int], bool] | None:
         """Return a function that tells whether the time of a search is over.
 
-        It takes the number of evaluations so far. Time that was spent before the run
-        was resumed counts. Evaluations that are read from the store take no time, and
-        never end the search before the last of them. If the store has renders of the
-        ranking already, the search had ended by then, and ends there again.
+        The function takes the number of evaluations so far. Time that was spent before
+        the run was resumed counts. Evaluations that are read from the store take no
+        time, and the search never ends before the last of them. If the store has rows
+        of the ranking, the search had ended before these, and ends there again.
 
         Args:
-            kind: kind of the search.
-            seconds: its limit; None for none, and then the result is None.
+            kind: kind of the search, such as "search".
+            seconds: time limit of the search; None for no limit, and then the result is
+                None.
         """
         if seconds is None:
             return None
@@ -645,11 +675,12 @@ class Journal:
         started = time.perf_counter()
 
         def is_out_of_time(n_evaluations: int) -> bool:
+            """Return whether the search must end after `n_evaluations`."""
             nonlocal started
             is_from_store = n_evaluations < n_stored
             if is_from_store:
-                # the clock starts again until the last one is read, so that reading
-                # takes none of the time
+                # The clock is reset as long as evaluations are read from the store, so
+                # that reading them takes none of the time.
                 started = time.perf_counter()
                 return False
             return has_ranking or time.perf_counter() - started >= seconds_left
@@ -689,7 +720,12 @@ def compute_digest(u: Tensor) -> bytes:
 
 
 def _restore_evaluation(row: Row, cached: CachedEvaluation) -> Evaluation:
-    """Return a search's evaluation from its row and what is stored beside it."""
+    """Return a search's evaluation as it was when it was stored.
+
+    Args:
+        row: row of the evaluation.
+        cached: gradient, image and cost, which the row does not have.
+    """
     gradient = None
     if cached.gradient is not None:
         gradient = torch.from_numpy(cached.gradient.copy())

@@ -65,10 +65,12 @@ MAIN = "__main__"
 def metrics_to_settings(metrics: Mapping[str, str | Metric]) -> dict[str, str]:
     """Return metrics by name as a file states them: "package.module:function".
 
-    A function that cannot be imported so has its bare name.
+    A function that cannot be imported by such a text, as a lambda, is stated by its
+    bare name.
 
     Args:
-        metrics: functions of (image, output, truth) by name, or such texts.
+        metrics: functions of (image, output, truth) by name, or texts
+            "package.module:function".
 
     Raises:
         InputError: no mapping of functions, a function with other parameters, or a name
@@ -110,7 +112,7 @@ def _import_name(function: Metric) -> str:
     """
     module_name = str(getattr(function, "__module__", None))
     qualified_name = str(getattr(function, "__qualname__", None))
-    # what an import by this name would give
+    # Follow the names as an import would, and see whether that leads to the function.
     imported: Any = sys.modules.get(module_name)
     for attribute in qualified_name.split("."):
         imported = getattr(imported, attribute, None)
@@ -163,7 +165,16 @@ def load_metrics(
 
 
 def _import_metric(name: str, import_name: str) -> Any:
-    """Import a metric, "package.module:function"."""
+    """Import a metric function.
+
+    Args:
+        name: name of the metric, for messages.
+        import_name: "package.module:function".
+
+    Raises:
+        InputError: the text has another form, the import fails, or what it imports is
+            no function.
+    """
     module, colon, attribute = import_name.partition(":")
     if not colon or not attribute:
         raise InputError(
@@ -194,15 +205,15 @@ def judge_images(
     truths: Sequence[Truth],
     metrics: Metrics = MappingProxyType({}),
 ) -> list[Judgement]:
-    """Return the judgement of the task and the metrics on each image.
+    """Return the judgement of each image, with the values of the user's metrics.
 
-    A run judges images here and nowhere else.
+    This is the only place where a run judges images.
 
     Args:
         task: judges the output.
         output: output of the model for all N images.
         images: (N, H, W, 3) sRGB in [0, 1].
-        truths: N, or one that holds for all images.
+        truths: what is true of each of the N images, or one truth that holds for all.
         metrics: user functions by name.
     """
     with torch.no_grad():
@@ -226,12 +237,15 @@ def judge_images(
 
 
 def add_visible_things(judgement: Judgement, things: JsonObject | None) -> Judgement:
-    """Return a judgement whose payload has what the image shows of each thing.
+    """Return a judgement whose payload states what the image shows of each thing.
 
-    `things` are those of `find_visible_things`, which has every thing of the scene,
-    visible or not; None if there is only the object. They complete what the task itself
-    has stated of things, which is not replaced. The judgement of an output that is NaN
-    stays as it is.
+    Where the task itself has stated something of a thing, that is kept. The judgement
+    of an output that is NaN stays as it is.
+
+    Args:
+        judgement: judgement of the image.
+        things: box, pixel count and more by thing, from `find_visible_things`, also for
+            things that are hidden; None if the scene has only the object.
     """
     if things is None or judgement.is_non_finite:
         return judgement
@@ -247,16 +261,18 @@ def add_visible_things(judgement: Judgement, things: JsonObject | None) -> Judge
 def add_metrics(
     judgement: Judgement, metrics: Metrics, image: Tensor, output: Output, truth: Truth
 ) -> Judgement:
-    """Return a judgement with the values of metrics.
+    """Return a judgement with the values of the user's metrics.
 
-    Metrics get copies: no function of a user can change what a run computes with.
+    Metrics get copies of image, output and truth, so that a function that changes its
+    arguments cannot change the run.
 
     Args:
         judgement: judgement of the image.
         metrics: functions by name.
         image: (H, W, 3) sRGB in [0, 1].
         output: output of the model, for a batch of this one image.
-        truth: truth of the image; a metric gets it as an objective does.
+        truth: what is true of the image; a metric gets it in the form in which an
+            objective gets it, such as the index of the right class.
 
     Raises:
         InputError: a metric returns no number and no mapping of numbers.
@@ -278,8 +294,13 @@ def add_metrics(
 
 
 def _to_metric_value(name: str, result: Any) -> float | None:
-    """Return what a metric returned as a number; None for NaN and infinity, which
-    neither JSON nor a column of rows has.
+    """Return what a metric returned as a number.
+
+    None stands for NaN and infinity, which JSON does not have.
+
+    Args:
+        name: name of the metric, for the message.
+        result: what it returned.
 
     Raises:
         InputError: it is no number.
@@ -295,9 +316,10 @@ def _to_metric_value(name: str, result: Any) -> float | None:
 
 
 def _unbatch(output: Output, truth: Truth) -> tuple[Any, Any]:
-    """Return output and truth of the only image of a batch, as a metric gets them.
+    """Return output and truth of the only image of a batch, without the batch axis.
 
-    For several models both are tuples with one item for each model.
+    Metrics are called with these. For an ensemble both are tuples with one item for
+    each model.
     """
     first_output = output[0]
     is_of_several_models = isinstance(first_output, (tuple, list))
@@ -351,15 +373,16 @@ def calibrate_task(
 ) -> Task:
     """Return the task, calibrated by what its model predicts on clean images.
 
-    Scenes are rendered in turn until it is clear how predictions are to be read. A task
-    that does not calibrate is returned as it is.
+    A task calibrates if the model's output can be read in several ways: a depth model,
+    for example, may return depths or their inverse. Scenes are rendered in turn until
+    the right reading is clear. Any other task is returned as it is.
 
     Args:
         task: task of the model.
         model: model that predicts.
         scenes: scenes in order.
-        label: what is right; None for the label of each object.
-        judge: the thing that is judged.
+        label: the right label; None for the own label of each object.
+        judge: name of the thing that is judged: "object", "all", or a thing's name.
         image_settings: keywords of `render` for the images that the model sees, see
             `SceneConfig.image_settings`.
 
@@ -379,7 +402,7 @@ def calibrate_task(
             spp=CALIBRATION_SPP,
             **image_settings,
         )
-        view = rendering.views[0]
+        view = rendering.views[0]  # `render` made one, as `around` was not given
         task = task.after_calibration(view.output, view.truth)
         if not task.ambiguities:
             return task
@@ -407,14 +430,19 @@ def check_truth(
 ) -> None:
     """Check that the task can tell what is right in a scene, before a run is prepared.
 
-    `image_settings` are as for `calibrate_task`.
+    Args:
+        task: task of the model.
+        model: model that predicts.
+        scene: the clean scene.
+        facts: names, labels and measures of the scene that the task judges by.
+        image_settings: keywords of `render` for the images that the model sees.
 
     Raises:
-        InputError: it cannot. Where no label is stated, the message has the model's
-            first predictions of a clean image.
+        InputError: it cannot. If the user stated no label, the message has the model's
+            first predictions of a clean image, and suggests one of them.
     """
     try:
-        # each thing that is judged, or else the only one
+        # `each` has the facts of every thing if all are judged, else it is empty
         for facts_of_thing in facts.each.values() or (facts,):
             task.check(facts_of_thing)
     except InputError as error:
@@ -442,12 +470,15 @@ def check_truth(
 def find_label_warnings(
     models: Sequence[Model], label: str | None, objects: Mapping[str, str | None]
 ) -> list[str]:
-    """Return a warning if a label for all objects is another class than that of some.
+    """Return a warning if one label is stated for objects of different classes.
+
+    With objects "mug" and "car", `label="mug"` would count the car as a mug.
 
     Args:
         models: models with names of classes.
-        label: stated for all objects; None if each has its own.
-        objects: label of each object, by name.
+        label: label that the user stated for all objects; None if there is none, so
+            that each object has its own.
+        objects: own label of each object, by the object's name.
     """
     if label is None or len(objects) < 2:
         return []
@@ -465,12 +496,17 @@ def find_label_warnings(
 
 
 def _has_disjoint_classes(models: Sequence[Model], first: str, second: str) -> bool:
-    """Return whether any model has classes for both labels, and none in common.
+    """Return whether two labels name different classes of some model.
 
-    `first` is an object's own label, which a model may lack.
+    They do if the model has classes for both labels, and no class has both.
+
+    Args:
+        models: models with names of classes.
+        first: an object's own label. A model that lacks it is passed over.
+        second: the label that the user stated.
 
     Raises:
-        InputError: a model lacks `second`, the label that the user states.
+        InputError: a model lacks `second`.
     """
     for model in models:
         try:
@@ -498,8 +534,9 @@ def make_domain(
 
     Args:
         controls: controls in the order of u.
-        start: (d,); None for that of the controls, which leaves the scene unchanged.
-        **more: fields of `Domain`.
+        start: (d,) where the search starts; None for the start of the controls, which
+            leaves the scene unchanged.
+        **more: other fields of `Domain`, such as `gradient_cost`.
     """
     blocks = []
     for control in controls:
@@ -530,7 +567,9 @@ class StackedTensors(Mapping[str, Tensor]):
         self._tensors_of_configuration = each
 
     def __getitem__(self, name: str) -> Tensor:
-        # `get` is caught too: an unknown name is an error, and not None.
+        """Return the tensors with a name, stacked to (N, ...)."""
+        # Not a KeyError, which `Mapping.get` would turn into None: an unknown name is
+        # an error there, too.
         if name not in self:
             raise UnknownNameError(self._kind, name, self._tensors_of_configuration[0])
         return torch.stack(
@@ -664,6 +703,8 @@ def mean_variation(colors: Tensor) -> Tensor:
 def printable_distance(colors: Tensor, palette: Tensor | None = None) -> Tensor:
     """Return the mean Euclidean distance of pixels from the nearest printable color.
 
+    The derivative moves each pixel towards its nearest color.
+
     Args:
         colors: (h, w, 3) sRGB; or (h, w, 4), of which only pixels with a last channel
             over 0 count.
@@ -671,12 +712,13 @@ def printable_distance(colors: Tensor, palette: Tensor | None = None) -> Tensor:
     """
     is_masked = colors.shape[-1] != 3
     if is_masked:
-        # (N, 1, 3): an image of one column
+        # The N pixels that count, as an image (N, 1, 3) of one column.
         colors = colors[colors[..., 3] > 0][:, None, :3]
     # which color is nearest has no derivative
     fixed_colors = colors.detach()
     if palette is None:
-        # of the grid: rounded to its steps
+        # The nearest color of the grid: each channel is rounded to a multiple of the
+        # step.
         nearest = (
             MIN_PRINTABLE
             + PRINTABLE_STEP * ((fixed_colors - MIN_PRINTABLE) / PRINTABLE_STEP).round()
@@ -690,7 +732,13 @@ def printable_distance(colors: Tensor, palette: Tensor | None = None) -> Tensor:
 
 
 def _compute_print_terms(space: Space, u: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the variation and the printable distance of all searched colors.
+    """Return how rough the searched colors are, and how far from printable ones.
+
+    Both are sums over the controls with searched colors, such as `texture`.
+
+    Args:
+        space: the searched controls.
+        u: (d,) the configuration.
 
     Raises:
         InputError: no control has searched colors.
@@ -717,10 +765,15 @@ def measure_print_terms(space: Space, u: Tensor) -> PrintTerms:
 def subtract_print_penalty(
     evaluation: Evaluation, space: Space, u: Tensor
 ) -> Evaluation:
-    """Return an evaluation of u (d,) from which both weighted print terms are
-    subtracted.
+    """Return an evaluation whose objective prefers colors that can be printed.
 
-    That is from its objective; their derivative is subtracted from its gradient.
+    Both print terms, times `PRINT_WEIGHT`, are subtracted from the objective, and their
+    derivative from the gradient.
+
+    Args:
+        evaluation: evaluation of u.
+        space: the searched controls.
+        u: (d,) the configuration.
     """
     variable_u = u.detach().clone().requires_grad_()
     with torch.enable_grad():
@@ -766,8 +819,9 @@ def make_objective(
         model: whose output is maximised.
         renderer: renders the clean image for an objective that compares features.
         seed: seed of the noise of that image.
-        ensemble: how the objectives of several models become one. None for their mean;
-            of several tasks, whose units differ, for the smallest.
+        ensemble: how the objectives of several models become one, "mean" or "worst".
+            None for their mean, or for the smallest if each model has the objective of
+            its own task, since units of tasks differ.
 
     Raises:
         InputError: an objective of features, and several models.
@@ -789,10 +843,18 @@ def make_objective(
 def _make_feature_objective(
     requested: AnyObjective, task: Task, model: Model, renderer: Renderer, seed: int
 ) -> tuple[Objective, str]:
-    """Return an objective that compares features of an image with those of the clean
-    image; arguments and results are those of `make_objective`.
+    """Return an objective that compares features of an image with the clean image's.
 
-    The remark says what the features are if they are not those before the last layer.
+    Args:
+        requested: name of an objective that needs features.
+        task: task of the model.
+        model: model whose features are compared.
+        renderer: renders the clean image.
+        seed: seed of the noise of that image.
+
+    Returns:
+        The objective, and a remark. The remark states which features are compared if
+        they are not those before the last layer; else it is "".
     """
     # if the task reads no logits, the output of the model itself is compared
     features = features_of(model) if task.reads_logits else None
@@ -810,8 +872,15 @@ def _make_feature_objective(
 def _make_ensemble_objective(
     requested: AnyObjective, task: EnsembleTask, ensemble: EnsembleReduction | None
 ) -> Objective:
-    """Return the objective of several models; arguments as of `make_objective`."""
-    # unless the user chooses one for all models, each has that of its own task
+    """Return the objective of several models.
+
+    Args:
+        requested: name of an objective, or a function, for all models.
+        task: joint task of the models.
+        ensemble: "mean" or "worst" of the models' objectives; None for the default.
+    """
+    # Unless the user chose an objective for all models, each model has the objective of
+    # its own task.
     uses_task_objectives = requested == EnsembleTask.objective
     objectives = [
         get_objective(part.objective if uses_task_objectives else requested, part)
@@ -829,8 +898,12 @@ def reduce_objectives(
 
     With "worst" it is the smallest: the model that is hardest to mislead counts, and
     the objective is over 0 only where every model is misled. The mean may be large
-    because of one model; but its gradient reaches all of them. Arguments of the
-    returned function are tuples with an item for each model.
+    because of one model, but its gradient reaches all of them. The returned function
+    takes outputs of all models and a tuple of their truths.
+
+    Args:
+        objectives: objective of each model.
+        reduction: "mean" or "worst".
     """
 
     def objective(
@@ -840,6 +913,7 @@ def reduce_objectives(
         more: ReadInput = reject_inputs,
         /,
     ) -> Tensor:
+        """Return the objective (N,) of images (N, H, W, 3) for all models together."""
         values = [
             objective_of_model(output_of_model, images, truth_of_model, more)
             for objective_of_model, output_of_model, truth_of_model in zip(

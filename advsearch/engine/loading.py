@@ -127,8 +127,8 @@ class Scene:
             resolution: side, or (height, width), in pixels.
             denoise: "oidn" or "none".
             seed: root of the noise; the `seed` of each call counts on from it.
-            estimators: how derivatives are obtained, by "control.parameter", "control"
-                or "*"; see `advsearch check`.
+            estimators: how derivatives are computed, by "control.parameter", "control"
+                or "*". `advsearch check` shows which estimators there are.
             sampler: "multijitter", or "independent", which has more noise; the first
                 rounds sample counts up to products of two near numbers.
 
@@ -153,8 +153,11 @@ class Scene:
     def with_environment(self, environment: EnvironmentAsset | None) -> Scene:
         """Return the scene under another environment; None for no environment map.
 
-        The environment counts as chosen by the user. In a folder of photographs, the
-        scene in each of them gets it.
+        The environment then counts as chosen by the user, and not as the default. If
+        the scene is in a folder of photographs, the scene in each photograph gets it.
+
+        Args:
+            environment: the environment; None for no environment map.
 
         Raises:
             InputError: the ground of the scene shows the photograph of its environment,
@@ -201,7 +204,11 @@ class Scene:
         return f"Scene({names}{fixed})"
 
     def with_texture(self, texture: Texture) -> Scene:
-        """Return the scene with another texture of the object; see `load_scene`.
+        """Return the scene with another texture of the object.
+
+        Args:
+            texture: a picture file, or (h, w, 3) sRGB in [0, 1] or of 8 bits, row 0 on
+                top.
 
         Raises:
             FileFormatError: the file is no picture.
@@ -217,6 +224,9 @@ class Scene:
     def with_settings(self, overrides: SettingValues) -> Scene:
         """Return the scene with some of its parameters fixed to other values.
 
+        Args:
+            overrides: new values by parameter, such as {"camera.azimuth": 130.0}.
+
         Raises:
             InputError: a name is unknown or a value out of range.
         """
@@ -226,7 +236,8 @@ class Scene:
         if description.camera_model is not None:
             description.camera_model.check_no_fov(overrides)
         values = {**description.values, **{name: resolved[name] for name in overrides}}
-        # the height of the camera would set another elevation
+        # A camera that has a height gets its elevation from that. So a stated elevation
+        # removes the height.
         if "camera.elevation" in overrides:
             values["camera.height"] = None
         changed = with_requested_ground(
@@ -321,7 +332,7 @@ def load_scene(
         object_spec = f"{scene}#{object}"
     fixed_values = None if settings is None else to_python(settings)
     has_environment = environment is not None
-    # of a folder, each photograph has its own light, which is read with it below
+    # In a folder, each photograph has its own light, which is read with it below.
     if environment is None and not is_photograph_folder(backdrop):
         environment = find_photographed_light(backdrop)
     description = load_description(
@@ -366,15 +377,17 @@ def _put_into_photographs(
 
     Args:
         description: the scene.
-        spec: the photograph, or the folder.
-        camera: as for `load_scene`.
-        occluder: likewise.
+        spec: path of the photograph, or of the folder.
+        camera: name or file of the camera that took the photographs; None for the
+            camera file next to each photograph.
+        occluder: file of a mask, white where the photograph shows what is in front of
+            the object; None if nothing is.
         has_environment: whether the user chose the light. If not, the scene in each
             photograph of a folder is lit by the map beside the photograph.
     """
     is_folder = is_photograph_folder(spec)
     if not is_folder:
-        # its light was chosen when the scene was loaded
+        # The scene has its light already: `load_scene` found it.
         view = read_photograph_view(spec)
         return put_into_photograph(description, view, camera, occluder)
     if occluder is not None:
@@ -384,7 +397,7 @@ def _put_into_photographs(
         )
     scenes: dict[str, SceneDescription] = {}
     with track_opened_files(spec):
-        # of many photographs, parsed once
+        # a file with the cameras of all photographs is parsed only once
         cameras = read_photograph_cameras(camera) if camera is not None else None
         views = read_photograph_folder(spec, has_camera=camera is not None)
         for name, view in views.items():
@@ -395,14 +408,19 @@ def _put_into_photographs(
                 lit_scene = Scene(description).with_environment(environment).description
             scenes[name] = put_into_photograph(lit_scene, view, cameras or camera)
     folder = PhotographFolder(str(spec), camera, scenes)
-    # the first photograph, until a control chooses another one
+    # The scene shows the first photograph, until a control chooses another one.
     return replace(next(iter(scenes.values())), photographs=folder)
 
 
 def _check_no_photograph(
     fixed_values: SettingValues, occluder: str | Path | None
 ) -> None:
-    """Raise InputError for settings of a photograph in a scene that has none."""
+    """Raise InputError for settings of a photograph in a scene that has none.
+
+    Args:
+        fixed_values: parameters that the user fixed, such as "ground.level".
+        occluder: the mask that the user stated, if any.
+    """
     stated = [name for name in fixed_values if name in PHOTOGRAPH_SETTINGS]
     if occluder is not None:
         stated.append("occluder")
@@ -444,8 +462,8 @@ def _array_to_texels(texture: npt.ArrayLike | Tensor) -> Float32Array:
 def scene_to_settings(scene: Scene) -> dict[str, Any]:
     """Return the settings by which a configuration names a loaded scene.
 
-    The keys are those of `SceneConfig`; a scene with `list_session_only_controls` has
-    parts that these settings cannot name.
+    The keys are those of `SceneConfig`. Of a scene with `is_session_only` these
+    settings are incomplete, since no file can name its Python objects.
     """
     description = scene.description
     photograph = description.backdrop_photograph
@@ -470,10 +488,11 @@ def scene_to_settings(scene: Scene) -> dict[str, Any]:
 
 
 def _camera_setting(description: SceneDescription) -> str | None:
-    """Return how the `camera` setting states a scene's camera.
+    """Return the value of the `camera` setting that names a scene's camera.
 
-    It is the first of these that there is: a rig, a preset, a lens, a camera of the
-    scene file; None for the pinhole that orbits.
+    The first that the scene has decides: a rig of several cameras, a preset such as
+    "dashcam", a lens such as "fisheye", or a camera of the scene file. None stands for
+    the default, a pinhole that orbits the object.
     """
     if description.rig:
         return description.rig_spec
@@ -490,11 +509,13 @@ def _fit_photographs(
     photograph: BackdropPhotograph,
     size: tuple[int, int],
 ) -> SceneDescription:
-    """Return a scene fitted to a picture size in its photograph, and in any others.
+    """Return a scene whose camera and photographs are fitted to a picture size.
+
+    In a folder of photographs the scene in each of them is fitted.
 
     Args:
         description: the scene.
-        photograph: photograph that the scene is in.
+        photograph: photograph that the scene is rendered into.
         size: height and width of the picture in pixels.
     """
     folder = description.photographs
@@ -512,8 +533,9 @@ def fit_camera(
 ) -> SceneDescription:
     """Return the scene with its camera fitted to a picture size.
 
-    Its aspect becomes that of the picture. Bundled lenses are made for it, and
-    raindrops get a camera model. In a photograph the photograph's own size decides.
+    The camera gets the aspect of the picture, and a bundled lens such as "fisheye" is
+    made anew for it. A scene with raindrops on the lens gets a camera model if it has
+    none. A scene in a photograph is fitted to the size of the photograph instead.
 
     Args:
         description: the scene.
@@ -536,8 +558,9 @@ def fit_camera(
             raise InputError(
                 "`set` camera.drops: of one camera, not of several; leave it out"
             )
-        # Drops need a camera model, whose rays are computed one by one: a pinhole. One
-        # without a name is the pinhole of an earlier call, and has an older aspect.
+        # Drops bend the ray of each pixel. So they need a camera model, which has the
+        # rays as a table. A model without a name was made here by an earlier call,
+        # perhaps for another aspect, and is replaced.
         if camera_model is None or not camera_model.name:
             camera_model = make_pinhole(description.get_number("camera.fov"), aspect)
     if camera_model is not None:
@@ -586,13 +609,15 @@ def make_renderer(
         resolution: side, or (height, width), in pixels.
         denoise: "oidn" or "none".
         seed: root of the noise.
-        estimators: as for `Scene.renderer`.
-        leave_out: what may be left out of the scene where it makes no difference.
+        estimators: how derivatives are computed, by "control.parameter", "control" or
+            "*".
+        leave_out: names of what may be left out of the Mitsuba scene to save time,
+            where that changes no image.
         sampler: "multijitter" or "independent".
-        differentiated: whether images are differentiated with respect to coordinates.
-            If not, it is not measured how fast coordinates move outlines, which takes a
-            third of the time in which a scene is loaded and a few small images are
-            rendered.
+        differentiated: whether images are differentiated by the coordinates. If not,
+            the measurement of how fast each coordinate moves outlines is skipped. It
+            takes a third of the time that it takes to load a scene and render a few
+            small images.
 
     Raises:
         InputError: the scene has no light, or its cameras differ in time and nothing
@@ -614,7 +639,8 @@ def make_renderer(
     )
     has_exposure_time = any(space.exposure)
     _check_rig_times(description, space)
-    # how points move in the image: for derivatives at outlines, and for blur
+    # `Motion` tells how points move in the image. Derivatives at outlines need it, and
+    # the number of moments for motion blur.
     motion = None
     if differentiated or has_exposure_time:
         motion = Motion(description, size, scene.assembly)
@@ -634,9 +660,14 @@ def make_renderer(
 
 
 def _check_rig_times(description: SceneDescription, space: Space) -> None:
-    """Check a rig whose cameras take their images one after the other.
+    """Check a rig of which some cameras take their image later than others.
 
-    Such a rig needs something that changes with time, and no motion blur.
+    Such a rig is pointless unless something in the scene changes with time. It cannot
+    have motion blur or a rolling shutter.
+
+    Args:
+        description: the scene, whose rig states a delay for each camera.
+        space: the controls.
 
     Raises:
         InputError: nothing changes with time, or an image has motion blur.
@@ -652,7 +683,7 @@ def _check_rig_times(description: SceneDescription, space: Space) -> None:
             f"{prefix}, and can not have motion blur or a rolling shutter; "
             "leave that out"
         )
-    # `advance_time` returns the same object for a control that is static.
+    # One second later: `advance_time` returns the same object for a static control.
     controls_later = space.advance_time(1.0).controls
     changes_with_time = any(
         control is not control_later
@@ -674,18 +705,19 @@ def choose_moments(
 ) -> tuple[Moment, ...]:
     """Return the moments of an exposure at which an image is rendered.
 
-    There are so many that no point moves far in the image between two of them
-    (`MOMENTS_PER_PIXEL`), and that a flashing light is on in some and off in others; at
-    least `MIN_MOMENTS` and at most `MAX_MOMENTS`.
+    The average of these images has motion blur. The faster points move in the image,
+    the more moments there are (`MOMENTS_PER_PIXEL`), so that the blur shows no steps. A
+    flashing light needs `MOMENTS_PER_FLASH`, so that it is on in some moments and off
+    in others. There are at least `MIN_MOMENTS` and at most `MAX_MOMENTS`.
 
     Args:
-        space: whose controls state the exposure.
+        space: the controls, which state how long an exposure takes.
         motion: projects points of the scene into the image.
         assembly: turns the inputs of the space into those of the scene.
         height: height of the image in pixels.
     """
-    # seconds that a row is exposed, and seconds between the first row and the last
-    # (negative from the bottom up)
+    # `shutter`: seconds for which each row is exposed. `rolling`: seconds between the
+    # first row and the last, negative if rows are read from the bottom up.
     shutter, rolling = space.exposure
     duration = shutter + abs(rolling)
     max_pixels_moved = _measure_max_motion(space, motion, assembly, duration)
@@ -703,11 +735,17 @@ def choose_moments(
 def _measure_max_motion(
     space: Space, motion: Motion, assembly: Assembly, duration: float
 ) -> float:
-    """Return how many pixels a point of the image moves at most in some seconds.
+    """Return how many pixels a point moves in the image at most during an exposure.
 
     It is measured on `N_MOTION_SAMPLES` random configurations of the controls that
-    move, from half the duration before to half after, on points that are visible at
-    both ends.
+    move. The exposure is centered at time 0. Only points that are visible at its begin
+    and at its end count.
+
+    Args:
+        space: all controls; static ones are left out.
+        motion: projects points of the scene into the image, in pixels.
+        assembly: turns the inputs of the space into those of the scene.
+        duration: length of the exposure in seconds.
     """
     moving_controls = tuple(
         control for control in space.controls if any(control.exposure)
@@ -718,6 +756,7 @@ def _measure_max_motion(
     configurations = torch.rand(
         N_MOTION_SAMPLES,
         len(moving_space.start),
+        # a fixed seed: the number of moments must not differ between two runs
         generator=torch.Generator().manual_seed(0),
     )
     max_moved = 0.0
@@ -736,10 +775,10 @@ def _measure_max_motion(
 
 
 def controls_to_settings(controls: Controls) -> dict[str, dict[str, object]]:
-    """Return settings by name, as a file holds them, for controls in any form.
+    """Return the settings of controls by name, as a file holds them.
 
-    An instance of a control is written with all of its settings, a name with those that
-    the caller stated.
+    Controls may be given as names, instances or a mapping. An instance is written with
+    all of its settings, a name only with those that the caller stated.
     """
     control_by_name = normalize_controls(controls)
     if not isinstance(controls, Mapping):
@@ -753,7 +792,11 @@ def controls_to_settings(controls: Controls) -> dict[str, dict[str, object]]:
 
 
 def make_controls(controls: Controls) -> tuple[Control, ...]:
-    """Return control instances for controls in any form, in the caller's order.
+    """Return control instances in the caller's order.
+
+    Args:
+        controls: one or several names or instances, or a mapping from names to settings
+            or instances.
 
     Raises:
         InputError: a control is unknown, has wrong settings, or comes twice.
@@ -783,9 +826,10 @@ def make_controls(controls: Controls) -> tuple[Control, ...]:
 
 
 def normalize_controls(controls: Controls) -> dict[str, Control | Mapping[str, object]]:
-    """Return controls in any form by name: an instance, or settings.
+    """Return the instance or the settings of each control by its name.
 
-    They have the caller's order.
+    They have the caller's order. Controls may be given as names, instances or a
+    mapping.
 
     Raises:
         InputError: something else than names, settings and instances, or a name that
@@ -811,7 +855,9 @@ def normalize_controls(controls: Controls) -> dict[str, Control | Mapping[str, o
 
 
 def _read_control_mapping(controls: Mapping[str, object]) -> dict[str, object]:
-    """Return the controls of a mapping by name, with Python distributions as settings.
+    """Return the controls of a mapping by name, each an instance or settings.
+
+    A distribution that is a Python object becomes the setting that describes it.
 
     Raises:
         InputError: a class, or an instance under another name than its own.
@@ -842,7 +888,9 @@ def _read_control_mapping(controls: Mapping[str, object]) -> dict[str, object]:
 def _read_control_list(
     controls: str | Control | Sequence[str | Control],
 ) -> dict[str, object]:
-    """Return one control or several, which are names or instances, by name.
+    """Return one control or several by name, each an instance or settings.
+
+    A text is parsed into a name and settings, as on the command line.
 
     Raises:
         InputError: something else than names and instances, or a name that comes twice.
@@ -882,8 +930,8 @@ def list_control_instances(controls: object) -> list[Control]:
 def list_session_only_controls(controls: Controls) -> list[str]:
     """List the controls and parameters that exist in this Python session only.
 
-    These are classes of controls without a name by which a file or another process
-    could load them, and parameters whose values a Python function samples.
+    No file and no other process can load them. These are controls of classes that are
+    not registered, and parameters whose values a Python function samples.
     """
     session_only = [
         type(control).__name__

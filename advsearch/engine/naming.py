@@ -56,10 +56,10 @@ def load_configured_scene(
 
     Args:
         config: the configuration.
-        name: object of the scene; None for that of the configuration. A scene that a
-            Python caller passed in place of this is returned as it is.
-        environment: environment of a named object; that of the configuration belongs to
-            its own object.
+        name: object of the scene; None for the object of the configuration. If a Python
+            caller passed a loaded scene in place of that, it is returned as it is.
+        environment: environment for `name`. Without a name, the environment of the
+            configuration is used.
     """
     if name is None:
         scene: Scene | None = config.python_object(SCENE, config.object)
@@ -80,7 +80,9 @@ def make_scene_kwargs(config: SceneConfig) -> dict[str, Any]:
 
 
 def collect_scene_parameters(config: SceneConfig) -> SettingValues:
-    """Return the parameters that a scene is loaded with: `set` and `exposure`.
+    """Return the parameters that a scene is loaded with, by name.
+
+    They are those of the setting `set`, and `exposure` as "camera.exposure".
 
     Raises:
         InputError: both state an exposure.
@@ -112,9 +114,9 @@ def load_models(
 
     Args:
         models: names, or models that a Python caller passed.
-        task: task of the models. Several tasks (`EnsembleTask`) are for one model each,
-            and these models are joined into one.
-        config: has their labels, prompt, range of values, camera and number of threads.
+        task: task of the models. An `EnsembleTask` has a task for each model, and these
+            models are joined into one.
+        config: states labels, prompt, range of values, camera and number of threads.
 
     Returns:
         The models, and their warnings as sentences of the run.
@@ -134,14 +136,14 @@ def load_models(
             f"model: expected {len(tasks)}, one for each task, got {len(models)}"
         )
     with warnings.catch_warnings(record=True) as caught:
-        # each of them, also one that was issued before
+        # Python shows an equal warning only once, and "always" records every one
         warnings.simplefilter("always", ModelWarning)
         loaded = tuple(
             _load_for_task(
                 model,
                 task_of_model,
                 config,
-                # not one of several
+                # False for the tasks of an `EnsembleTask`
                 is_only_task=task_of_model is task,
             )
             for model, task_of_model in zip(models, tasks, strict=True)
@@ -164,13 +166,18 @@ def _load_for_task(
 ) -> Model:
     """Load one model for its task.
 
-    The labels and the prompt of the configuration are for the only task, or, of
-    several, for each one that takes labels and has no names of its own.
+    Args:
+        model: name of the model, or a loaded one.
+        task: task of the model.
+        config: states labels, prompt and range of values.
+        is_only_task: whether all models have this task. If each model has its own task,
+            the labels and the prompt of the configuration are only for tasks that take
+            labels and have no names of classes by themselves.
     """
     single_image_task = task.single_image_task
     labels = None
     prompt = None
-    # it reads classes, and the names of these come from nothing else
+    # whether the task reads classes whose names the user has to give
     needs_names = single_image_task.labelled and not single_image_task.names_source
     if is_only_task or needs_names:
         labels = config.labels
@@ -201,8 +208,12 @@ def _take_model_warnings(caught: Iterable[warnings.WarningMessage]) -> list[str]
 
 
 def _check_task_of_rig(task: Task, camera: str, n_cameras: int) -> None:
-    """Raise InputError if a task cannot judge the images of several cameras, which
-    `camera` names.
+    """Raise InputError if a task cannot judge the images of several cameras.
+
+    Args:
+        task: task of the run.
+        camera: setting that names the cameras, for the message.
+        n_cameras: their number.
     """
     if not task.judges_rig:
         raise InputError(
@@ -213,9 +224,7 @@ def _check_task_of_rig(task: Task, camera: str, n_cameras: int) -> None:
 
 
 def _check_n_images(model: Model) -> None:
-    """Raise InputError if a model takes another number of images than there are
-    cameras.
-    """
+    """Raise InputError if a model takes more or fewer images than there are cameras."""
     module = model.module
     if isinstance(module, AllAtOnce) and module.cameras != model.cameras:
         verb = "is" if model.cameras == 1 else "are"
@@ -265,7 +274,11 @@ def is_session_only(model: AnyModel) -> bool:
 
 
 def check_distinct(names: Sequence[str], setting: str) -> Sequence[str]:
-    """Return the names.
+    """Return the names if they are all different.
+
+    Args:
+        names: names, such as those of models.
+        setting: setting that states them, for the message.
 
     Raises:
         InputError: there are none, or one comes twice.
@@ -306,7 +319,10 @@ def check_no_scene_settings(settings: Mapping[str, object]) -> None:
 
 
 def check_no_worker_settings(settings: Mapping[str, object]) -> None:
-    """Raise InputError for settings of workers, where the run has loaded objects."""
+    """Raise InputError for settings of workers if the run has loaded objects.
+
+    Workers are other processes, which can only load objects by name.
+    """
     for name in ("workers", "cluster"):
         if settings.get(name) is not None:
             raise InputError(
@@ -333,7 +349,10 @@ def collect_run_settings(
 ) -> dict[str, Any]:
     """Return the settings that a configuration states for its controls, by name.
 
-    Where the controls vary by chance (not `are_searched`), without those of searches.
+    Args:
+        config: the configuration.
+        are_searched: whether the controls are searched. If they vary by chance instead,
+            settings of searches, such as `epsilon`, are left out.
     """
     values = {name: getattr(config, name, None) for name in RUN_SETTINGS}
     return {
@@ -346,9 +365,15 @@ def collect_run_settings(
 def make_configured_controls(
     config: SceneConfig, controls: Controls, *, are_searched: bool = True
 ) -> tuple[Control, ...]:
-    """Return control instances; settings of the run complete what they do not state.
+    """Return control instances, completed by the settings of the run.
 
-    Controls that vary by chance are not `are_searched`.
+    For example, `path` of the configuration is added to each control that takes a path
+    and does not state one.
+
+    Args:
+        config: the configuration.
+        controls: names, instances, or a mapping from names to settings.
+        are_searched: whether the controls are searched, and do not vary by chance.
 
     Raises:
         InputError: a control that was passed as an instance would take a setting of the
@@ -376,7 +401,10 @@ def make_configured_controls(
 def _check_takes_no_run_setting(
     run_settings: Mapping[str, Any], control: Control
 ) -> None:
-    """Raise InputError if an instance would take a setting that the run states."""
+    """Raise InputError if an instance would take a setting that the run states.
+
+    An instance is complete: the setting could not be added to it.
+    """
     for choice in _list_active_choices(type(control), control.to_settings()):
         if choice.run_setting in run_settings:
             raise InputError(
@@ -391,9 +419,16 @@ def _select_settings(
     qualified_name: str,
     control_settings: Mapping[str, object],
 ) -> dict[str, object]:
-    """Return those settings of the run that a control takes, by its own names for them.
+    """Return the settings of the run that a control takes.
 
-    A setting of the run may be a mapping by the names of controls.
+    Args:
+        run_settings: settings by name, such as `epsilon`. A value may be a mapping with
+            a value for each of some controls.
+        qualified_name: kind and name of the control, such as "light:key".
+        control_settings: settings that the user stated for the control.
+
+    Returns:
+        Values by the control's own name of the setting.
     """
     selected: dict[str, object] = {}
     choices = _list_choices(qualified_name, control_settings)
@@ -414,8 +449,8 @@ def select_run_settings(
     """Return the run's settings for a run over a single one of its controls.
 
     Args:
-        config: config of the run over all controls.
-        qualified_name: kind and name of the control, as the configuration has it.
+        config: configuration of the run over all controls.
+        qualified_name: kind and name of the control, such as "light:key".
         control_settings: settings of the control.
 
     Returns:
@@ -439,7 +474,8 @@ def select_run_settings(
 def check_run_settings(config: SceneConfig) -> None:
     """Check that every setting of a run is taken by one of its controls.
 
-    Settings of searches are looked for among the searched controls only.
+    A setting of searches, such as `epsilon`, has to be taken by a searched control. Any
+    other may also be taken by a control that varies by chance (`over`).
 
     Raises:
         InputError: no control takes a setting, or the one that it names does not.
@@ -488,7 +524,7 @@ def _check_named_controls(
         UnknownNameError: there is no such control.
         InputError: a control does not take the setting.
     """
-    # the setting has only the name: "key"
+    # The setting names a control as "key", and `controls` as "light:key".
     qualified_names = {
         parse_control_name(qualified_name, control_settings)[1]: qualified_name
         for qualified_name, control_settings in controls.items()
@@ -506,7 +542,13 @@ def takes_setting(
 ) -> bool:
     """Return whether a control takes one of the run's settings.
 
-    A control that is not known counts as one that does.
+    A control of unknown kind counts as one that does, as its error is reported
+    elsewhere.
+
+    Args:
+        qualified_name: kind and name of the control, such as "light:key".
+        control_settings: settings that the user stated for the control.
+        setting: name of a setting of the run, such as "epsilon".
     """
     choices = _list_choices(qualified_name, control_settings)
     return choices is None or setting in {choice.run_setting for choice in choices}
@@ -515,7 +557,14 @@ def takes_setting(
 def _list_choices(
     qualified_name: str, control_settings: Mapping[str, object]
 ) -> list[Choice] | None:
-    """List the active choices of a control; None if its kind is not known."""
+    """List the choices of a control that have an effect; None for an unknown kind.
+
+    A choice is an option of a control besides its parameters, such as `epsilon`.
+
+    Args:
+        qualified_name: kind and name, such as "light:key", perhaps with a parameter.
+        control_settings: settings that the user stated for it.
+    """
     # a name may have a parameter behind it ("camera.azimuth"), which becomes a setting
     merged = merge_control_settings({qualified_name: control_settings})
     ((name, settings),) = merged.items()
@@ -530,16 +579,21 @@ def _list_active_choices(
 ) -> list[Choice]:
     """List the choices of a control that have an effect with these settings.
 
-    A choice may bound one parameter. It has no effect if that parameter is not
-    searched: it is set to a number, another choice fixes it, or it has no default range
-    and none is set.
+    A choice is an option of a control besides its parameters, such as `epsilon`, which
+    bounds a parameter. It has no effect if that parameter is not searched. A parameter
+    is not searched if it is set to a number, if another choice fixes it, or if it has
+    no default range and none is set.
+
+    Args:
+        kind: class of the control.
+        settings: settings that the user stated for it.
     """
-    # names of the parameters that a choice fixes, or that are set to a number
+    # names of parameters that do not vary: a choice fixes them, or a number is set
     fixed = {
         choice.fixes for choice in kind.choices if settings.get(choice.name) is not None
     }
     fixed |= {name for name, value in settings.items() if Parameter.is_number(value)}
-    # those with a default range, and those for which a range is set
+    # names of parameters that are searched: with a default range, or with a range set
     searched = {
         parameter.name for parameter in kind.parameters if parameter.search is not None
     }
@@ -553,7 +607,13 @@ def _list_active_choices(
 
 
 def _make_unsupported_error(setting: str, name: str, kind: str) -> InputError:
-    """Return the error of a setting that a control does not take."""
+    """Return the error of a setting that a control does not take.
+
+    Args:
+        setting: name of the setting, such as "epsilon".
+        name: name of the control.
+        kind: kind of the control, which decides what is advised.
+    """
     if setting == "epsilon":
         choices = CONTROLS[kind].choices if kind in CONTROLS else ()
         # parameters that an epsilon would bound if they were searched

@@ -84,8 +84,10 @@ MAX_CACHED_TRUTHS = 512
 
 
 def _add_to_cache(cached: dict[bytes, Any], key: bytes, value: Any) -> None:
-    """Add a value to a cache of at most `MAX_CACHED_TRUTHS`; the oldest ones make
-    room.
+    """Add a value to a cache, and remove its oldest values if it is full.
+
+    A cache has at most `MAX_CACHED_TRUTHS` values. A dict keeps the order in which keys
+    were added.
     """
     while len(cached) >= MAX_CACHED_TRUTHS:
         del cached[next(iter(cached))]
@@ -222,14 +224,18 @@ class Problem:
     def add_conditions(self, u: Tensor, draw_seed: int | None = None) -> Tensor:
         """Return the full configuration: u (d,), followed by conditions.
 
-        With a `draw_seed` they are sampled; without, they are those that leave the
-        scene unchanged.
+        Conditions are the coordinates of the controls that vary by chance, such as the
+        light. With a `draw_seed` they are sampled from their full range. Without one
+        they have the values that leave the scene unchanged.
         """
         if self.conditions is None:
             return u
         if draw_seed is None:
             return torch.cat([u, self.conditions.start])
+        # A stream of its own, so that the conditions do not depend on the noise, which
+        # has the same seed.
         generator = torch.Generator().manual_seed(seeds.stream(draw_seed, "conditions"))
+        # `sample` returns a batch (1, d) of one configuration
         return torch.cat([u, self.conditions.sample(generator)[0]])
 
     def picture(
@@ -252,9 +258,15 @@ class Problem:
             return round_to_8_bit(self.renderer(full_u, seed=seed, spp=spp))
 
     def judge(self, image: Tensor, full_u: Tensor) -> Judgement:
-        """Judge an image (H, W, 3) of a full configuration.
+        """Judge whether the model is right on an image, and by which margin.
 
-        The judgement has the value of the objective, if there is one.
+        Args:
+            image: (H, W, 3) sRGB in [0, 1].
+            full_u: full configuration of the image: searched coordinates, followed by
+                the conditions. It determines what is true of the image.
+
+        Returns:
+            The judgement. It has the value of the objective, if there is one.
         """
         if self.objective is None:
             # `{}`: no stated values in place of the configuration's
@@ -265,6 +277,7 @@ class Problem:
             values = self.objective(
                 output, image[None], truth, self.make_objective_inputs(full_u)
             )
+            # the batch has one image
             (judgement,) = self._judge_outputs(output, image[None], [truth], [full_u])
             return replace(judgement, objective=float(values[0]))
 
@@ -274,15 +287,16 @@ class Problem:
         full_configurations: Sequence[Tensor],
         stated_values: Sequence[Mapping[str, Value]],
     ) -> list[Judgement]:
-        """Judge images that the model sees in one batch, without an objective.
+        """Judge images that the model gets in one batch, without an objective.
 
-        If a margin is infinite or NaN, its judgement is that of a NaN output.
+        If a margin is infinite or NaN, the image counts as one for which the model
+        returned NaN.
 
         Args:
-            images: (N, H, W, 3).
-            full_configurations: N full configurations.
-            stated_values: N mappings of values that replace those of the
-                configurations, as for `find_truth`.
+            images: (N, H, W, 3) sRGB in [0, 1].
+            full_configurations: N full configurations, one for each image.
+            stated_values: N mappings from parameters such as "camera.azimuth" to exact
+                values, which replace the single-precision ones of the configurations.
         """
         with torch.no_grad():
             output = self.model(images)
@@ -318,11 +332,18 @@ class Problem:
         truths: Sequence[Truth],
         full_configurations: Sequence[Tensor],
     ) -> list[Judgement]:
-        """Judge a model's output for images (N, H, W, 3) by task and metrics.
+        """Judge a model's output by the task and the user's metrics.
 
-        If other things stand beside the object, the payload of each judgement gets what
-        is visible of each. That is rendered once for all configurations that differ in
-        colors alone, and cached.
+        If the scene has other things than the object, such as a car next to it, the
+        payload of each judgement gets the visible part of each thing. It is rendered
+        and cached once for all configurations that differ only in colors, since colors
+        hide nothing.
+
+        Args:
+            output: the model's output for all N images.
+            pictures: (N, H, W, 3) sRGB in [0, 1].
+            truths: N truths, or one that holds for all images.
+            full_configurations: N full configurations (d,).
         """
         judged = list(judge_images(self.task, output, pictures, truths, self.metrics))
         has_other_things = self.space.scene is not None and self.space.scene.things
@@ -348,9 +369,12 @@ class Problem:
     ) -> ComparedView:
         """Compare a predicted image with traced images of the same configuration.
 
+        The start of the search is predicted as well. So the comparison can tell the
+        error of the prediction from the change that the search makes.
+
         Args:
-            predict: from a full configuration to an image (H, W, 3).
-            full_u: the full configuration.
+            predict: function from a full configuration to an image (H, W, 3).
+            full_u: the full configuration: searched coordinates, then conditions.
             seed: seed of the noise of the traced images.
             spp: samples per pixel of a rendered image.
             is_random: (d,) bool, the searched coordinates that are random here, and not
@@ -383,16 +407,26 @@ class Problem:
         )
 
     def find_marks(self, image: Tensor, full_u: Tensor) -> list[Mark]:
-        """Return the marks of the model's prediction on an image (H, W, 3)."""
+        """Return the boxes and masks of prediction and truth on an image (H, W, 3)."""
         return self.predict_with_marks(image, full_u)[1]
 
     def predict_with_marks(
         self, image: Tensor, full_u: Tensor
     ) -> tuple[bool, list[Mark]]:
-        """Return whether the model is right on an image (H, W, 3), and its marks."""
+        """Return whether the model is right on an image, and what to draw into it.
+
+        Args:
+            image: (H, W, 3) sRGB in [0, 1].
+            full_u: full configuration of the image, by which its truth is found.
+
+        Returns:
+            Whether the prediction is right; and the marks, which are boxes and masks of
+            the prediction and of the truth.
+        """
         with torch.no_grad():
             output = self.model(image)
             truth = self.find_truth(full_u)
+            # the task answers for a batch, which has one image here
             is_right = self.task.judge(output, truth)[0].right
             return is_right, self.task.marks(output, truth)[0]
 
@@ -401,10 +435,12 @@ class Problem:
         full_u: Tensor | None = None,
         stated_values: Mapping[str, Value] | None = None,
     ) -> Truth:
-        """Return what is true of the scene at a full configuration; None for the start.
+        """Return what is true of the scene at a full configuration, such as a distance.
 
-        `stated_values` replace values of the configuration, which has single precision
-        only.
+        Args:
+            full_u: the full configuration; None for the start of the search.
+            stated_values: exact values by parameter ("camera.azimuth"). They replace
+                those of the configuration, which has single precision only.
         """
         if full_u is None or not self.task.varies:
             return self._start_truth
@@ -424,7 +460,7 @@ class Problem:
             return {name: stated.get(name, value) for name, value in values.items()}
 
         n_rig_cameras = 0 if self.space.scene is None else len(self.space.scene.rig)
-        # of the main camera, then of each camera of a rig
+        # one function for the main camera, then one for each camera of a rig
         renders = list_camera_renders(self.renderer, full_u, n_rig_cameras)
         facts, *camera_facts = [
             self.make_facts(describe, render_surfaces) for render_surfaces in renders
@@ -457,8 +493,8 @@ class Problem:
         color_inputs = find_linear_inputs(self.renderer)
         is_geometric = torch.ones(len(self.space.start), dtype=torch.bool)
         for group in self.space.groups:
-            # the inputs of the scene that the group changes; None if it changes none,
-            # but the finished image
+            # The inputs of the scene that the group changes. It is None for a group
+            # that changes no input but the finished image, as a blur does.
             route = self.renderer.routes.get(group.name)
             only_colors = bool(route and route <= color_inputs)
             is_geometric[group.coordinates] = not only_colors
@@ -473,8 +509,10 @@ class Problem:
     def describe(self, u: Tensor, draw_seed: int | None = None) -> dict[str, Value]:
         """Describe the searched controls of a configuration in values with units.
 
-        `draw_seed` is the seed of the conditions; without, they leave the scene
-        unchanged.
+        Args:
+            u: (d,) the searched coordinates.
+            draw_seed: seed of the conditions, on which values may depend. Without one
+                the conditions leave the scene unchanged.
         """
         return self.space.describe(
             self.add_conditions(u, draw_seed), self.space.controls[: self.n_searched]
@@ -494,10 +532,11 @@ class Problem:
         """Return a group's step of finite differences in its parameter's unit, such as
         degrees, and the unit.
 
-        It is half the difference of the values one step above and below the middle of
-        the range. (None, "") for a group of several coordinates, without a step, or
-        whose value is no number.
+        It is half the difference between the values one step above and one step below
+        the middle of the range. The result is (None, "") if the group has several
+        coordinates, has no step, or has a value that is no number.
         """
+        # without a reason for its step, the group has no finite differences
         if not group.step_reason or group.size != 1:
             return None, ""
         u = self.add_conditions(self.domain.start).clone()
@@ -530,8 +569,11 @@ class Problem:
     ) -> Iterator[Evaluation]:
         """Evaluate queries lazily, in their order.
 
-        `preparation` has the plan, sample count and depth of light paths that another
-        process has found for the same problem; they are set first.
+        Args:
+            queries: the queries.
+            preparation: gradient plan, samples per pixel and depth of light paths that
+                another process measured for the same problem. They are set first, so
+                that both processes compute the same.
         """
         if preparation is not None:
             self.spp = preparation.spp
@@ -544,7 +586,9 @@ class Problem:
     def evaluate(self, query: Query) -> Evaluation:
         """Evaluate one query: collect light, render an image, or judge one.
 
-        A run renders, predicts and judges here only.
+        This is the only place where a run renders, predicts and judges. A query asks
+        for one of four things: light for a predictor, an image for a file, a trial of
+        the verification (it has no phase), or an evaluation of the search.
         """
         non_finite_before = self.renderer.non_finite
         if query.product == "light":
@@ -570,7 +614,11 @@ class Problem:
         return evaluation
 
     def _evaluate_trial(self, query: Query) -> Evaluation:
-        """Evaluate a trial: judge the image as a file would hold it."""
+        """Evaluate a trial of the verification: render an image anew and judge it.
+
+        The image has 8 bits, as a file would hold it. Its conditions are sampled only
+        if the query wants that.
+        """
         image = self.picture(
             query.u, query.seed, query.spp, with_conditions=query.draws_conditions
         )
@@ -585,8 +633,10 @@ class Problem:
     def _evaluate_over_conditions(self, query: Query) -> Evaluation:
         """Evaluate a query of a search by its mean over sampled conditions.
 
-        Each condition has an image, whose noise has the same seed as the condition. The
-        image of the evaluation, if it is requested, is one without conditions.
+        Each of the `n_draws` conditions is rendered once. The noise of its image has
+        the same seed as the condition. If the query wants an image, it is rendered
+        under conditions that leave the scene unchanged, as no sampled one stands for
+        all.
         """
         condition_seeds = [
             seeds.stream(query.seed, "draw", index) for index in range(self.n_draws)
@@ -611,7 +661,14 @@ class Problem:
         truth: Truth,
         inputs: ConfigurationInputs,
     ) -> Tensor:
-        """Return the objective (N,) of images (N, H, W, 3), with a graph."""
+        """Return the objective (N,) of images, with a graph for its derivative.
+
+        Args:
+            outputs: the model's output for all N images.
+            pictures: (N, H, W, 3) sRGB in [0, 1].
+            truth: what is true of all images.
+            inputs: what the objective may read of the configurations, such as "u".
+        """
         if self.objective is None:
             raise RuntimeError("a sweep has no objective")
         return self.objective(outputs, pictures, truth, inputs)
@@ -625,17 +682,22 @@ class Problem:
     ) -> LinearRenderer:
         """Return a renderer that predicts images near a full configuration.
 
+        It collects the light of the scene once. Images are linear in that light, so
+        that other colors and intensities need no further rays.
+
         Args:
-            full_u: the full configuration.
+            full_u: the full configuration: searched coordinates, then conditions.
             seed: seed of the noise.
             spp: samples per pixel.
-            collected_light: light that was collected there; None to collect it now.
+            collected_light: light that an earlier call collected at `full_u`; None to
+                collect it now.
         """
         searched_names = {control.name for control in self.searched_space.controls}
         searched_groups = [
             group.name for group in self.plan.groups if group.control in searched_names
         ]
-        # the inputs of the scene through which each group acts
+        # the inputs of the scene that each group changes, such as
+        # "object.base_color"
         routes = [
             self.renderer.routes.get(name, frozenset()) for name in searched_groups
         ]
@@ -658,9 +720,12 @@ class Problem:
     ) -> tuple[Evaluation, Output]:
         """Evaluate a query of a search by one image of a full configuration.
 
+        The gradient has two parts: one goes through the image and is estimated by the
+        renderer, the other exists if the objective reads the configuration itself.
+
         Args:
-            query: query of a search.
-            full_u: the full configuration.
+            query: the query, which states whether a gradient is wanted.
+            full_u: the full configuration: searched coordinates, then conditions.
             seed: seed of the noise.
             renderer: another one than that of the problem, such as a predictor.
 
@@ -673,8 +738,8 @@ class Problem:
         truth = self.find_truth(full_u)
         variable_u = full_u.detach().clone().requires_grad_(bool(query.gradient))
         inputs = self.make_objective_inputs(variable_u)
-        # image and output of each call of the loss; the first is that of u itself, any
-        # others are of finite differences
+        # Image and output of each call of the loss. The first call is at u itself; any
+        # later ones are at neighbors of u, for finite differences.
         calls: list[tuple[Tensor, Output]] = []
         # derivative of the objective by u that does not go through the image
         input_gradient = torch.zeros(())
@@ -717,7 +782,10 @@ class Problem:
         ), output
 
     def _limit_search_depth(self, renderer: Renderer) -> AbstractContextManager[None]:
-        """Shorten the light paths of a renderer to those of a search in a block."""
+        """Return a context in which light paths are as short as those of a search.
+
+        Without a `search_depth` the context changes nothing.
+        """
         if self.search_depth is None:
             return nullcontext()
         return renderer.scene.limit_depth(self.search_depth)
@@ -729,18 +797,18 @@ class Problem:
         u: Tensor,
         gradient: WhichGradient,
     ) -> tuple[list[tuple[Evaluation, Output]], Tensor | None]:
-        """Evaluate several images of one u in one batch of the model.
+        """Evaluate images of one u under N conditions in one batch of the model.
 
         Args:
-            render: render from u (d,) to images (N, H, W, 3), with a graph.
-            full_configurations: full configuration of each image.
+            render: function from u (d,) to images (N, H, W, 3), with a graph.
+            full_configurations: N full configurations, which differ in conditions only.
             u: (d,) the searched coordinates, equal in all of them.
             gradient: whether a derivative is computed.
 
         Returns:
-            For each image an evaluation without derivative and the model's output; and
-            the derivative (d,) of the sum of their objectives, weighted by
-            `compute_condition_weights`, or None.
+            First, for each image, an evaluation without derivative and the model's
+            output. Second, the derivative (d,) by u of the sum of the objectives, each
+            weighted by `compute_condition_weights`; None if no gradient is wanted.
         """
         variable_u = u.detach().clone().requires_grad_(bool(gradient))
         with torch.set_grad_enabled(bool(gradient)):
@@ -749,7 +817,8 @@ class Problem:
             outputs_of_images = _split_batch(outputs, len(full_configurations))
             truths = [self.find_truth(full_u) for full_u in full_configurations]
             variable_configurations = [
-                # an objective may ask for the configuration itself
+                # An objective may read the configuration itself. So the searched
+                # coordinates in it are those with a graph.
                 torch.cat([variable_u, full_u[len(variable_u) :]])
                 for full_u in full_configurations
             ]
@@ -783,7 +852,16 @@ class Problem:
         truths: Sequence[Any],
         full_configurations: Sequence[Tensor],
     ) -> Tensor:
-        """Return the objectives (N,) of images (N, H, W, 3) with a truth of each."""
+        """Return the objectives (N,) of images of which each has its own truth.
+
+        An objective takes a single truth, so that it is called once for each image.
+
+        Args:
+            outputs: N outputs of the model, each for a batch of one image.
+            images: (N, H, W, 3) sRGB in [0, 1].
+            truths: N truths.
+            full_configurations: N full configurations (d,).
+        """
         objectives = []
         for output, image, truth, full_u in zip(
             outputs, images.split(1), truths, full_configurations, strict=True
@@ -800,11 +878,11 @@ class Problem:
         gradient: WhichGradient,
         batch_size: int,
     ) -> Evaluation:
-        """Evaluate the mean over conditions whose images are predicted, in batches.
+        """Evaluate u by its mean over conditions whose images are predicted.
 
         Args:
-            render: render from a slice of the conditions and u to images (N, H, W, 3),
-                with a graph.
+            render: function from a slice of the conditions and u (d,) to their images
+                (N, H, W, 3), with a graph.
             full_configurations: full configuration of each condition.
             u: (d,) the searched coordinates.
             gradient: whether a derivative is computed.
@@ -836,16 +914,18 @@ class Problem:
     ) -> Evaluation:
         """Return the evaluation of u (d,) that is the mean over conditions.
 
-        It is a success if enough of the evaluations are (`OVER_CONDITIONS`). A cost of
-        1 stands for an image under every condition, so that costs are not added up.
+        It is a success if enough of the evaluations are successes: the percentage is
+        that of the rule `OVER_CONDITIONS`. A cost of 1 means one image under each of
+        the conditions, so that the cost is the maximum and not the sum.
 
         Args:
             evaluated: an evaluation and the model's output for each condition.
             u: (d,) the searched coordinates.
-            gradient: (d,) of the mean, where the evaluations have none.
+            gradient: (d,) gradient of the mean; it is used if the evaluations have no
+                gradients of their own.
         """
         evaluations, outputs = zip(*evaluated, strict=True)
-        # of the searched coordinates only, which come first
+        # without the derivatives by the conditions, which come last
         gradients = [
             evaluation.gradient[: u.numel()]
             for evaluation in evaluations
@@ -876,9 +956,14 @@ class Problem:
     ) -> Judgement:
         """Return the judgement over several conditions.
 
-        If the truth varies with the conditions, scores and margins are averaged, and
-        the most frequent prediction is taken; otherwise the task judges the average of
-        the outputs.
+        If one truth holds under all conditions, the task judges the average of the
+        outputs. If the truth varies with the conditions, no single truth fits that
+        average: then scores and margins are averaged, and the most frequent prediction
+        is taken.
+
+        Args:
+            judged: judgement under each condition.
+            outputs: the model's output under each condition, for one image each.
         """
         if self.task.varies:
             most_frequent = most_frequent_judgement(judged)
@@ -900,11 +985,18 @@ class Problem:
 
 
 def _differentiate_by_inputs(objective: Tensor, variable_u: Tensor) -> Tensor:
-    """Return the derivative (d,) of an objective by u that does not go through the
-    image; a zero without axes if the objective does not depend on u otherwise.
+    """Return the part of an objective's derivative by u that bypasses the image.
 
-    An objective may read the configuration itself (`ConfigurationInputs`). This part of
-    the derivative is exact, whatever the plan does with the image.
+    An objective may read the configuration itself, such as a texture that it wants to
+    be smooth. That part of the derivative is exact; only the part that goes through the
+    image is estimated, as the gradient plan states.
+
+    Args:
+        objective: the objective, without axes.
+        variable_u: (d,) the coordinates, which require a gradient.
+
+    Returns:
+        The derivative (d,), or a zero without axes if there is no such part.
     """
     if objective.requires_grad:
         (gradient,) = torch.autograd.grad(

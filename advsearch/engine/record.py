@@ -125,14 +125,14 @@ def make_trial_row(
     """Return the row of a trial in the store.
 
     Args:
-        kind: kind of the row.
+        kind: kind of the row, such as "verification" or "control".
         number: number of the trial among those of the kind.
         seed: seed of the noise; None for a predicted image.
         spp: samples per pixel.
         judgement: judgement of its image.
         values: values of the configuration.
-        has_success: whether a search seeks some prediction; else the row has no
-            success.
+        has_success: whether some prediction is sought. If not, as in a sweep, the row
+            has None for its success.
     """
     # a trial costs one render, unless the caller replaces that
     row = Row(
@@ -149,7 +149,7 @@ def make_trial_row(
 
 
 def add_judgement(row: Row, judgement: Judgement) -> Row:
-    """Return a row with the values of a judgement."""
+    """Return a row with the values of a judgement; a NaN becomes None."""
     prediction = judgement.prediction
     return replace(
         row,
@@ -173,8 +173,8 @@ def _none_if_nan(value: float | None) -> float | None:
 def read_judgement(row: Row) -> Judgement:
     """Return the judgement that a row has, the inverse of `add_judgement`.
 
-    A row has None where the judgement has NaN; without a label it is the row of an
-    output that was NaN itself.
+    A None in the row stands for a NaN in the judgement. A row without a label is that
+    of an output that was NaN.
     """
     prediction = Prediction(row.label or NOT_A_NUMBER, row.label_index, row.probability)
     return Judgement(
@@ -205,9 +205,9 @@ def make_rate(
 
     Args:
         counts: counts of the trials.
-        trials: the judgements that count; the mean score is over those that are a
-            number.
-        successes: the judgements whose labels and outcomes are counted.
+        trials: judgements of the trials that count. The mean margin is over those whose
+            score is not NaN.
+        successes: judgements of the successes, whose labels and outcomes are counted.
     """
     labels = Counter(trial.prediction.label for trial in successes)
     # A margin is the score with the opposite sign. It is 0.0 - x and not -x, so that the
@@ -224,7 +224,12 @@ def make_rate(
 
 
 def make_control_group(trials: Sequence[Judgement], spp: int) -> ControlGroup:
-    """Return the trials of the clean configuration as a result stores them."""
+    """Return the trials of the clean configuration as a result stores them.
+
+    Args:
+        trials: judgements of the trials.
+        spp: samples per pixel of their images.
+    """
     right = count_right(trials, spp)
     outcomes = count_outcomes(trial.payload for trial in trials if not trial.right)
     return ControlGroup(

@@ -110,10 +110,10 @@ class Rendering:
     warnings: tuple[str, ...] = ()
 
     def save(self, path: str | Path) -> tuple[int, int]:
-        """Write the image atomically; return its height and width in pixels.
+        """Write the image atomically, and return its height and width in pixels.
 
         Several views become one sheet with the predictions under each. A .png holds
-        what the model sees, an .exr linear radiance times the gain; an older file is
+        what the model sees, an .exr linear radiance times the gain. An existing file is
         replaced.
 
         Raises:
@@ -132,8 +132,12 @@ class Rendering:
     def save_aov(self, path: str | Path, aovs: Sequence[str]) -> Path:
         """Write ground truth of the view atomically as layers of one EXR file.
 
-        It is written beside the image of this path, as ``NAME.aov.exr``, which is
-        returned. `aovs` are names of `advsearch.scene.formation.AOVS`.
+        Args:
+            path: path of the image, ``NAME.png``. The file gets its name and folder.
+            aovs: names of the layers, from `advsearch.scene.formation.AOVS`.
+
+        Returns:
+            The path of the file, ``NAME.aov.exr``.
 
         Raises:
             InputError: `render` was called without `aov`, or with several views
@@ -165,8 +169,12 @@ class Rendering:
     def save_predictions(self, path: str | Path) -> Path | None:
         """Write the image or the sheet with the predicted boxes and masks.
 
-        It is written beside the image of this path, as NAME-prediction.png, which is
-        returned; None where the task draws nothing.
+        Args:
+            path: path of the image without them, ``NAME.png``.
+
+        Returns:
+            The path of the file, ``NAME-prediction.png``, next to that image; None if
+            the task draws nothing, as in classification.
 
         Raises:
             StorageError: it could not be written.
@@ -312,8 +320,8 @@ def render(
             options, an instance, or a function.
         label: the right labels, for a task that draws what is true; None for the
             object's own.
-        judge: the thing of which that is drawn: "object", the name of one beside it, or
-            "all".
+        judge: the thing whose truth is drawn: "object", the name of another thing of
+            the scene, or "all".
         controls: what differs from the scene: names, instances, or a mapping from names
             to settings. A parameter with a range stays where a search would start.
         around: number of views, from azimuths all around the object; None for one, from
@@ -339,6 +347,7 @@ def render(
         scene = scene.with_texture(texture)
     description = scene.description
     unbound_task = make_task(task)
+    # A model predicts one image at a time, also for a task that judges several.
     model = load_model(model, task=unbound_task.single_image_task)
     # a scene without a rig has one camera
     model = replace(model, cameras=max(1, len(description.rig)))
@@ -393,10 +402,11 @@ def render(
 
 
 def _list_view_warnings(rendered_views: Sequence[_RenderedView]) -> list[str]:
-    """Return the warnings of the task about some views, as sentences.
+    """Return the task's warnings about the views, as sentences.
 
-    They are why no truth could be drawn into a view, if so, and the task's remarks on
-    the first view that has any.
+    One states why the truth could not be drawn into a view, if that happened. The
+    others are the task's remarks on the first view that has any, since those on further
+    views say the same.
     """
     sentences = list[str]()
     truth_errors = [
@@ -428,7 +438,14 @@ def _render_view(
 ) -> _RenderedView:
     """Render one view, and predict with the model what it shows.
 
-    The truth is only found if it depends on the configuration (`Task.varies`).
+    What is true, such as the box of the object, is found only if the task's truth
+    depends on the configuration (`Task.varies`). Finding it takes further rays.
+
+    Args:
+        description: the scene, with the camera of this view.
+        model: model that predicts.
+        task: task that reads the predictions, as calibrated by the views before.
+        settings: the arguments of `render` that are the same for all views.
     """
     description = fit_camera(description, settings.size)
     space = compose(settings.controls, description)
@@ -497,10 +514,18 @@ def _make_view_facts(
     u: Tensor,
     settings: _ViewSettings,
 ) -> Facts:
-    """Return the facts of a configuration (d,).
+    """Return the facts of a configuration by which a task judges the view.
 
-    For the cameras of a rig, `views` has the facts of each.
+    If the scene has a rig of several cameras, the field `views` has the facts of each.
+
+    Args:
+        description: the scene.
+        space: space of the controls.
+        renderer: renders what each camera sees.
+        u: (d,) the configuration.
+        settings: label and judged thing are taken from these arguments of `render`.
     """
+    # the first is the main camera, the others are those of a rig
     facts, *camera_facts = [
         make_facts(
             description,
@@ -517,6 +542,10 @@ def _make_view_facts(
 
 def check_judged_thing(description: SceneDescription, judge: str) -> None:
     """Check that a scene has the thing that is to be judged.
+
+    Args:
+        description: the scene.
+        judge: "object", the name of another thing, or "all".
 
     Raises:
         UnknownNameError: nothing in the scene has that name.
@@ -539,10 +568,17 @@ def check_judged_thing(description: SceneDescription, judge: str) -> None:
 def list_camera_renders(
     renderer: Renderer, u: Tensor, n_rig_cameras: int
 ) -> list[Callable[[], Surfaces]]:
-    """Return functions that render which surfaces are visible at a configuration (d,).
+    """Return functions that render which surfaces each camera sees.
 
-    The first is for the main camera; one follows for each of the `n_rig_cameras` of a
-    rig. Nothing is rendered until they are called.
+    Nothing is rendered until they are called.
+
+    Args:
+        renderer: renders the surfaces.
+        u: (d,) the configuration.
+        n_rig_cameras: number of cameras of the scene's rig; 0 without a rig.
+
+    Returns:
+        A function for the main camera, followed by one for each camera of the rig.
     """
     return [
         partial(renderer.surfaces, u),
@@ -563,15 +599,20 @@ def make_facts(
 ) -> Facts:
     """Return the facts of a scene by which a task judges predictions.
 
+    Facts are names, labels, parameters ("camera.azimuth") and how the camera sees each
+    thing. Whatever takes time is computed when a task reads it.
+
     Args:
         description: the scene.
         name: name of its object.
-        label: right label of the thing that is judged, or of the object if all things
-            are; None for its own label, which all others have.
-        describe: describes the configuration; other parameters have the values of the
-            scene.
-        render_surfaces: renders what the camera sees; it is called once at most.
-        judge: the thing that is judged: `OBJECT`, the name of one beside it, or
+        label: right label of the judged thing, or of the object if all things are
+            judged. None for the own label of that thing. Other things always have their
+            own labels.
+        describe: returns the values of the configuration by parameter; parameters that
+            it lacks have the values of the scene.
+        render_surfaces: renders what the camera sees, and is called at most once; None
+            if the camera's view is not needed.
+        judge: the thing that is judged: `OBJECT`, the name of another thing, or
             `ALL_THINGS`.
 
     Raises:
@@ -584,14 +625,16 @@ def make_facts(
 
     def make_thing_facts(mesh: str) -> Facts:
         """Return the facts of a single thing, the object or another one."""
+        # the one thing to which the stated label belongs; None as the right label of a
+        # thing means that its own label is right
         labelled_mesh = OBJECT if judge == ALL_THINGS else judge
-        # None: its own label is right
         right_label = label if mesh == labelled_mesh else None
         sight = None
         if cached_render is not None:
             metres = description.object.size_in_metres
             sight = partial(_look_at, cached_render, mesh, metres=metres)
-        # the object has the name that the caller states, any other thing its mesh's
+        # The object has the name that the caller states. Another thing has the name of
+        # its mesh.
         if mesh == OBJECT:
             own_label = description.object.label
             return Facts(name, right_label, own_label, collect_numbers, sight)
@@ -609,8 +652,11 @@ def make_facts(
 def _collect_numbers(
     description: SceneDescription, describe: Callable[[], Mapping[str, Value]]
 ) -> dict[str, float]:
-    """Return all parameters of a scene that are numbers, by name, with the values of
-    the configuration that `describe` describes.
+    """Return all parameters of a scene that are numbers, by name.
+
+    Args:
+        description: the scene, which has a value for every parameter.
+        describe: returns the values of the configuration, which replace those.
     """
     configuration = {key: value["value"] for key, value in describe().items()}
     all_values = {**description.values, **configuration}
@@ -644,23 +690,36 @@ def make_sight(
 ) -> Sight:
     """Return what a task may know of how the camera sees one mesh: its mask and depths.
 
-    `metres` is the size of the object in metres, if it is known.
+    Args:
+        surfaces: what each pixel shows.
+        mesh: name of the mesh.
+        metres: size of the object in metres, which is the unit of length of the scene;
+            None if it is not known.
     """
     return Sight(surfaces.visible_mask(mesh), surfaces.depth, surfaces.z_depth, metres)
 
 
 def find_visible_things(renderer: Renderer, u: Tensor) -> JsonObject | None:
-    """Return what the image of a configuration (d,) shows of each thing, by name.
+    """Return what the image of a configuration shows of each thing, by name.
 
-    None where nothing stands beside the object. See `runs.results.ThingSeen`.
+    That is box, pixel count, visible fraction and distance; see
+    `runs.results.ThingSeen`.
+
+    Args:
+        renderer: renders what the camera sees.
+        u: (d,) the configuration.
+
+    Returns:
+        An entry for the object and for each other thing; None if the scene has only
+        the object.
     """
     description = renderer.scene.definition[0]
     if not description.things:
         return None
     names = (OBJECT, *description.things)
     labels = {name: description.meshes[name].label for name in names}
-    # At first as for things that the image does not show; those that are found in it
-    # are replaced below.
+    # Every thing gets the entry of a thing that the image does not show. The loop below
+    # replaces the entries of those that it does show.
     things: JsonObject = {
         name: {
             "label": labels[name],
@@ -689,6 +748,10 @@ def find_visible_things(renderer: Renderer, u: Tensor) -> JsonObject | None:
 def check_image_path(path: str | Path, n_views: int) -> Path:
     """Return the path of an image if its name is one that can be written.
 
+    Args:
+        path: path of a .png or .exr file.
+        n_views: number of views that the image shows.
+
     Raises:
         InputError: another suffix, an .exr of several views, or a directory.
     """
@@ -711,7 +774,15 @@ def check_image_path(path: str | Path, n_views: int) -> Path:
 def _orbit_scene(
     description: SceneDescription, around: int | None
 ) -> Iterator[SceneDescription]:
-    """Yield the scene from `around` azimuths, or once as it is where that is None."""
+    """Yield the scene from azimuths all around the object.
+
+    Args:
+        description: the scene. Its own azimuth is the first.
+        around: number of azimuths, evenly spaced; None to yield the scene as it is.
+
+    Raises:
+        InputError: the scene's camera does not orbit the object.
+    """
     if around is None:
         yield description
         return

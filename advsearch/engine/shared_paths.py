@@ -13,11 +13,12 @@ OPACITY_SUFFIX = ".opacity"
 
 
 def find_shared_paths(problem: Problem) -> SharedPaths | None:
-    """Return what traces the common paths of trials once; None if each is traced in
-    full.
+    """Return what lets trials share light paths; None if each is traced in full.
 
-    They may share paths where the search changes nothing but surfaces, which stay where
-    they are, and emit and pass no light.
+    Trials of one seed trace the same paths if the search changes only the look of
+    surfaces, such as a texture. The surfaces must stay where they are, emit no light,
+    and let none through. Then paths are traced once, and only the colors along them
+    are computed again.
     """
     renderer = problem.renderer
     is_excluded = problem.conditions is not None or renderer.composition_reason

@@ -62,7 +62,7 @@ def find_surface_light_refusal(
 ) -> Refusal | None:
     """Return why light on surfaces does not predict a search; None if it may.
 
-    None does not say how good its predictions are, which is measured later.
+    Whether its predictions are accurate is measured later.
 
     Args:
         problem: problem of the search.
@@ -130,9 +130,9 @@ class SurfaceLight(PredictedSearch):
     def __post_init__(self) -> None:
         """Find which coordinates move cameras, change environments and color surfaces.
 
-        `_moving` are the searched coordinates (d,) that move cameras or change the
-        environment, unless they were given; `_needs_new_light` are the conditions'
-        coordinates that need the light to be computed anew.
+        Sets `_moving` (d,), whether a searched coordinate moves a camera or changes the
+        environment, unless the caller stated which do. Sets `_needs_new_light` (k,),
+        whether a coordinate of the conditions needs the light to be computed anew.
         """
         problem = self.problem
         space = problem.space
@@ -154,20 +154,23 @@ class SurfaceLight(PredictedSearch):
         is_coloring = self._find_coordinates(frozenset({COLOR_INPUT}))[:n_searched]
         self._searches_colors = bool(is_coloring.any())
         self.draws_conditions = problem.conditions is not None and self._searches_colors
-        # The base color is an input of its own: where the searched controls set nothing
-        # else, the inputs of the conditions are enough.
+        # If the searched controls set nothing but base colors, only the inputs of the
+        # conditions are computed for each image. Base colors are applied separately.
         self._input_space = space
         if not self._has_moving:
-            # (without `n_searched` there are no conditions: then all controls count)
+            # `n_searched` is None if there are no conditions. Then all controls count.
             conditions = space.controls[problem.n_searched or 0 :]
             self._input_space = replace(space, controls=conditions)
         self._needs_new_light = self._find_light_conditions()[n_searched:]
 
     def _find_coordinates(self, inputs: frozenset[str]) -> Tensor:
-        """Return which coordinates of the full space change some inputs, (d,) bool.
+        """Return which coordinates of the full space change given inputs, (d,) bool.
 
-        It is known for each control only: all of its coordinates count if any input of
-        `inputs` changes.
+        What changes is known for each control as a whole. So all coordinates of a
+        control count if it changes any of the inputs.
+
+        Args:
+            inputs: names of scene inputs, such as "environment.padded".
         """
         space = self.problem.space
         changes_inputs = torch.zeros(len(space.start), dtype=torch.bool)
@@ -180,9 +183,9 @@ class SurfaceLight(PredictedSearch):
     def _find_light_conditions(self) -> Tensor:
         """Return which coordinates of the full space need new light, (d,) bool.
 
-        They are those that change the environment. Under conditions, where the light of
-        many environments is stored, those that only scale its brightness are left out:
-        the same light serves both.
+        These are the coordinates that change the environment. If conditions vary, the
+        light of many environments is stored. Then coordinates that only scale the
+        brightness are left out, since the stored light can be scaled likewise.
         """
         needs_new_light = self._find_coordinates(frozenset({ENVIRONMENT_INPUT}))
         if self.problem.conditions is None:
@@ -196,12 +199,13 @@ class SurfaceLight(PredictedSearch):
     def _only_scales_environment(self, group: Group) -> bool:
         """Return whether a group only changes how bright the environment is.
 
-        Two environment maps are compared, at different values of all coordinates of the
-        group: one is a multiple of the other.
+        Two environment maps are computed, for two values of the coordinates of the
+        group. Only the brightness differs if one map is a multiple of the other.
         """
         start = self.problem.add_conditions(self.problem.domain.start)
         fingerprints = []
-        # any two different values within the range, off its ends
+        # Any two different values in (0, 1) would do. 0 and 1 might switch the
+        # environment off.
         for value in (0.3, 0.8):
             full_u = start.clone()
             full_u[group.coordinates] = value
@@ -232,8 +236,13 @@ class SurfaceLight(PredictedSearch):
         return Refusal(f"light on surfaces is {self.deviations[0].reason}")
 
     def count_predicted(self, kind: str, evaluations: int) -> int:
-        """Return how many of the first evaluations of a search were predicted: none, if
-        an earlier search has given predictions up.
+        """Return how many of the first evaluations of a search were predicted.
+
+        None were if an earlier search has given predictions up.
+
+        Args:
+            kind: kind of the search.
+            evaluations: how many evaluations it has had.
         """
         if "search" in self.first_traced and kind != "search":
             # another search is later, and is traced from its first evaluation on
@@ -241,10 +250,13 @@ class SurfaceLight(PredictedSearch):
         return super().count_predicted(kind, evaluations)
 
     def prepare(self, tick: ProgressCallback = lambda samples: None) -> None:
-        """Compute the light under every condition of the bank, and compare its first
-        images.
+        """Compute the light under every condition of the bank, and check its accuracy.
 
-        `tick` is called with what each light counts in the progress, `N_LIGHTS` in all.
+        The first predicted images are compared with traced ones.
+
+        Args:
+            tick: called after each light with the progress that it stands for. The sum
+                over all lights is about `N_LIGHTS`.
         """
         problem = self.problem
         u = problem.domain.start if self.light_u is None else self.light_u
@@ -267,13 +279,14 @@ class SurfaceLight(PredictedSearch):
     def _sample_bank_conditions(self) -> list[Tensor]:
         """Return the conditions (k,) of the bank, each of which gets its light.
 
-        Without conditions it is a single one, which has no coordinates.
+        If the problem has no conditions, the list has a single one without coordinates,
+        so that other code need not tell the cases apart.
         """
         problem = self.problem
         if problem.conditions is None:
             return [torch.empty(0)]
         seed = seeds.stream(problem.seed, "bank")
-        # where no condition needs a light of its own, one light serves all
+        # If no coordinate of the conditions needs new light, one light serves all.
         n_conditions = N_LIGHTS if bool(self._needs_new_light.any()) else 1
         return [
             sample_condition(problem.conditions, index, seed)
@@ -293,9 +306,13 @@ class SurfaceLight(PredictedSearch):
     ) -> Iterator[Evaluation]:
         """Evaluate queries of a search, or trials, in their order.
 
-        Once a query cannot be predicted, it and all after it are evaluated by `trace`.
-        Images are predicted in batches if neither conditions nor colors vary: then they
-        do not depend on the evaluations before.
+        Images are predicted in batches if neither conditions nor colors vary, since
+        they then do not depend on earlier evaluations.
+
+        Args:
+            queries: the queries.
+            trace: renders. From the first query that cannot be predicted on, it
+                evaluates all.
         """
         # images of the queries of the latest batch, by position
         predicted_images: dict[int, Tensor] = {}
@@ -312,9 +329,10 @@ class SurfaceLight(PredictedSearch):
             yield self.evaluate(query, predicted_images.get(position))
 
     def _must_trace(self, query: Query) -> bool:
-        """Return whether a query is beyond those that are predicted.
+        """Return whether a query has to be rendered.
 
-        So is one whose gradient takes differences of rendered images.
+        It has to if predictions were given up before it, if the search itself is over,
+        or if its gradient takes differences of rendered images.
         """
         takes_differences = self.problem.domain.gradient_cost > 0
         if query.gradient is True and takes_differences:
@@ -331,11 +349,13 @@ class SurfaceLight(PredictedSearch):
         return self._evaluate_over_conditions(query)
 
     def _evaluate_trial(self, query: Query, image: Tensor | None) -> Evaluation:
-        """Evaluate a trial, a test of a configuration outside of the search.
+        """Evaluate a trial, which tests a configuration outside of the search.
 
-        The predicted image is judged as a file would hold it, rounded to 8 bits.
+        The predicted image is rounded to 8 bits, as a file would hold it.
 
-        `image` is that image; None to predict it here.
+        Args:
+            query: the trial.
+            image: (H, W, 3) predicted image; None to predict it here.
         """
         full_u = self.problem.add_conditions(query.u)
         with torch.no_grad():
@@ -361,12 +381,14 @@ class SurfaceLight(PredictedSearch):
         )
 
     def _evaluate_over_conditions(self, query: Query) -> Evaluation:
-        """Evaluate a query of a search by its mean over conditions, whose images are
-        predicted.
+        """Evaluate a query of a search by its mean over conditions.
+
+        An image is predicted under each of the problem's `n_draws` conditions.
         """
         problem = self.problem
-        # A random search ("baseline") uses few sets of conditions in turn, for which
-        # what cameras see is stored, if nothing that is searched moves.
+        # A random search ("baseline") uses `N_CONDITION_SETS` sets of conditions in
+        # turn. If nothing that is searched moves, the cameras see the same surfaces
+        # each time a set is used, and that view is stored.
         reuses_conditions = (
             query.kind == "baseline"
             and problem.conditions is not None
@@ -398,18 +420,20 @@ class SurfaceLight(PredictedSearch):
             return replace(evaluation, picture=round_to_8_bit(images[0]))
 
     def _choose_conditions(self, kind: str, number: int, count: int) -> list[Tensor]:
-        """Return `count` conditions (k,) of an evaluation: new cameras under lights of
-        the bank.
+        """Return the conditions (k,) of an evaluation: new cameras under stored lights.
 
-        Each takes the coordinates that need new light from a random condition of the
-        bank, and all others from a new sample. `kind` and `number` of the evaluation
-        give the seed.
+        The coordinates that need new light come from a random condition of the bank,
+        whose light is stored. All others, such as those of cameras, are sampled anew.
+
+        Args:
+            kind: kind of the search, for the seed.
+            number: index of the evaluation, for the seed.
+            count: number of conditions.
         """
         problem = self.problem
         if problem.conditions is None:
-            return (
-                self._bank_conditions * count
-            )  # the bank has one, without coordinates
+            # the bank has a single condition without coordinates
+            return self._bank_conditions * count
         generator = torch.Generator().manual_seed(
             seeds.stream(problem.seed, f"surface {kind}", number)
         )
@@ -439,10 +463,15 @@ class SurfaceLight(PredictedSearch):
         u: Tensor,
         key: tuple[int, int] | None = None,
     ) -> Tensor:
-        """Return predicted images (n, H, W, 3) of full configurations, with a graph
-        from their searched coordinates u (d,).
+        """Return predicted images (n, H, W, 3), with a graph from u.
 
-        What cameras see is stored under `key`, if there is one, for later calls.
+        Args:
+            full_configurations: n full configurations, whose searched coordinates are
+                u.
+            u: (d,) the searched coordinates, perhaps with a gradient.
+            key: index of a set of conditions, and begin of the batch in it. What the
+                cameras see is stored under this key for later calls. None to store
+                nothing.
         """
         color = self.renderer.get_color(self.problem.searched_space.inputs(u))
         variable_configurations = [
@@ -461,14 +490,16 @@ class SurfaceLight(PredictedSearch):
         )
 
     def replay(self, query: Query) -> None:
-        """Compare predictions with traced images if that is due, and renew the light or
-        give predictions up if they are too far off.
+        """Compare predictions with traced images if a comparison is due.
 
-        A comparison is due every `COMPARISON_INTERVAL` evaluations if base colors are
-        searched, since their light gets old; else the interval doubles as long as
-        predictions are accurate. After the first inaccurate comparison the light is
-        computed again for the present colors, if these are searched. After two in a
+        It is due every `COMPARISON_INTERVAL` evaluations if base colors are searched,
+        since the stored light reflects earlier colors. Otherwise the interval doubles
+        as long as predictions are accurate. After one inaccurate comparison the light
+        is computed again for the present colors, if colors are searched. After two in a
         row, all further images are traced.
+
+        Args:
+            query: the query that is evaluated next.
         """
         is_of_search = query.kind == "search" and query.phase == "search"
         predictions_failed = self.tracing_reason is not None
@@ -496,9 +527,13 @@ class SurfaceLight(PredictedSearch):
     def _compare(self, u: Tensor, index: int) -> Deviation:
         """Compare predicted images with traced ones, and store the deviation.
 
-        The first view is that of u (d,). In the others, searched cameras and
-        environments are random, and conditions are new in all. `index` is that of the
-        evaluation, for the seed.
+        The first view is that of u. In the other views, searched cameras and
+        environments are random, since the search may go anywhere. All views have new
+        conditions.
+
+        Args:
+            u: (d,) the searched coordinates.
+            index: index of the evaluation, for the seed.
         """
         problem = self.problem
         kind = "surface check"
@@ -514,14 +549,15 @@ class SurfaceLight(PredictedSearch):
                 torch.cat([view_u, condition])
                 for view_u, condition in zip(configurations, conditions, strict=True)
             ]
-            # A margin may be off by a fraction of what the search has changed, which
-            # random coordinates have no part in.
+            # The margin may be off by a fraction of the change that the search has
+            # made. Coordinates that are random here do not count as such a change.
             is_random = self._moving
             if not self._searches_colors:
-                # only cameras and environments are searched: the search has no part
+                # only cameras and environments are searched: no change counts
                 is_random = torch.ones_like(self._moving)
 
         def compare_view(number: int) -> ComparedView:
+            """Compare the predicted image of a view with traced ones."""
             return problem.compare_view(
                 self.renderer,
                 full_configurations[number],

@@ -71,8 +71,7 @@ ADVICE = {
 def find_matrix_refusal(
     problem: Problem, steps: int | None, specialise: bool
 ) -> Refusal | None:
-    """Return why the images of a search are rendered, and not predicted by matrices of
-    light transport; None if they are predicted.
+    """Return why matrices of light transport do not predict a search; None if they do.
 
     Args:
         problem: problem of the search.
@@ -97,8 +96,8 @@ def find_matrix_refusal(
     refusal = find_refusal(problem.renderer, condition_names)
     if refusal is not None:
         return refusal
-    # under conditions there are no basis images, and without a number of steps any
-    # number of them pays
+    # The rest is about basis images of lights, which are not used under conditions.
+    # Without a number of steps they pay in any case.
     if problem.conditions is not None or steps is None:
         return None
     # before the first prediction an image is rendered for each light
@@ -214,9 +213,15 @@ class PredictedSearch(ABC):
     def rank_all(
         self, queries: Sequence[Query], trace: Evaluate
     ) -> Iterator[Evaluation]:
-        """Evaluate queries of a ranking, all of one kind, lazily.
+        """Evaluate the queries of a ranking lazily.
 
-        Paths are traced, in the window if there is one. `trace` evaluates whole images.
+        A ranking renders the best configurations of a search again, to choose the best
+        one. So images are traced and not predicted; if there is a window, only the
+        window is traced.
+
+        Args:
+            queries: the queries, all of one kind.
+            trace: renders full images.
         """
         renderer = self.get_window_renderer(queries[0].kind)
         if renderer is None:
@@ -255,19 +260,28 @@ class PredictedSearch(ABC):
     def measure_surroundings(
         self, window: Window, before: FullImage, u: Tensor
     ) -> tuple[FullImage, Deviation]:
-        """Render the whole image of u (d,), and measure how far an earlier one is off.
+        """Render the full image, and measure how it differs outside of the window.
 
-        Only what is outside of the window counts. Returns the image, and by how much.
+        Args:
+            window: the pixels that are predicted, which do not count.
+            before: an earlier full image, whose surroundings are in use.
+            u: (d,) the configuration to render.
+
+        Returns:
+            The full image of u, and the deviation of the earlier one from it.
         """
         current = render_full(self.problem, u)
         self.n_traced += 1
         return current, measure_outside(self.problem, window, before, [current])
 
     def trace_from(self, kind: str, number: int, where: str = "") -> None:
-        """Trace the images of a kind of search from the evaluation with an index on.
+        """Give predictions up for a kind of search, and trace its images from now on.
 
-        `where` completes "evaluation 20" in the reason for the user, such as " of the
-        search"; of several reasons the first one stays.
+        Args:
+            kind: kind of the search.
+            number: index of the first evaluation that is traced.
+            where: text that follows "evaluation 20" in the reason for the user, such as
+                " of the search". If there is a reason already, it stays.
         """
         self.first_traced[kind] = number
         reason = (
@@ -339,12 +353,15 @@ class Transport(PredictedSearch):
         """Choose the window, and compute the matrix of the clean configuration.
 
         The matrix is computed only if no search with the same window has done so.
-        `tick` is called with samples per pixel as they are traced.
+
+        Args:
+            tick: called with samples per pixel as they are traced.
         """
         if not self._is_prepared:
             with self.count_time():
                 windowing = find_window(self.problem)
-            # else it is the reason why there is no window: full images are predicted
+            # Otherwise it is a `Refusal`: there is no window, and full images are
+            # predicted.
             if isinstance(windowing, Windowing):
                 self.window = windowing.window
                 self._full_images["start"] = windowing.start
@@ -412,8 +429,9 @@ class Transport(PredictedSearch):
         self._update_predictor(query)
 
     def evaluate(self, query: Query) -> Evaluation:
-        """Evaluate a query by its predicted image, or by a traced one where predictions
-        are not used.
+        """Evaluate a query by its predicted image, or by a traced one.
+
+        It is traced if predictions were given up, or after the search.
         """
         predictor = self._update_predictor(query)
         if predictor is None:
@@ -429,9 +447,8 @@ class Transport(PredictedSearch):
 
         Queries of the ranking and trials are traced. Every `COMPARISON_INTERVAL`
         queries of a search the predictor is compared with traced images. If it is too
-        far off, it is computed again at the query's configuration; a predictor by basis
-        images of lights, which would be the same again, is given up and the rest of the
-        search is traced.
+        far off, it is computed again at the query's configuration. Basis images of
+        lights would be the same again: then the rest of the search is traced.
         """
         kind = query.kind
         number = query.index
@@ -440,15 +457,16 @@ class Transport(PredictedSearch):
             return None
         predictor = self._current.setdefault(kind, self.start)
         is_due = number > 0 and number % COMPARISON_INTERVAL == 0
-        # a baseline draws configurations by chance: there is nothing to keep up with
+        # A random search ("baseline") does not move away from the start, so that its
+        # predictor does not get old.
         if not is_due or not kind.startswith("search"):
             return predictor
         deviation = self._compare_predictor(predictor, query)
         has_same_surroundings, current = self._compare_surroundings(kind, query.u)
         if deviation.is_accepted and has_same_surroundings:
             return predictor
-        # Basis images of lights (no matrix, hence no entries) do not depend on u:
-        # nothing can be linearised again.
+        # Basis images of lights do not depend on u, so that computing them again would
+        # change nothing. They are no matrix, and so have 0 entries.
         has_basis_images = self.start.n_entries == 0
         if has_basis_images:
             self.trace_from(kind, number, f" of the {kind}")
@@ -461,8 +479,9 @@ class Transport(PredictedSearch):
         return self._current[kind]
 
     def _compare_predictor(self, predictor: Predictor, query: Query) -> Deviation:
-        """Compare a predictor with traced images of a query's configuration, in the
-        window if there is one.
+        """Compare a predictor with traced images of a query's configuration.
+
+        If there is a window, only the window is traced and compared.
         """
         seed = seeds.stream(self.problem.seed, "transport check", query.index)
         renderer = self.problem.renderer
@@ -481,12 +500,15 @@ class Transport(PredictedSearch):
     def _compare_surroundings(
         self, kind: str, u: Tensor
     ) -> tuple[bool, FullImage | None]:
-        """Compare what is outside of the window at u (d,) with what a kind of search
-        has there.
+        """Compare the surroundings of the window at u with those that are in use.
+
+        Args:
+            kind: kind of the search, whose latest full image is in use.
+            u: (d,) where the search is.
 
         Returns:
-            Whether both are the same, up to what is allowed; and the full image at u.
-            True and None without a window, when nothing is outside.
+            Whether both are equal up to the allowed deviation, and the full image at u.
+            Without a window nothing is outside, and the result is (True, None).
         """
         if self.window is None:
             return True, None
@@ -496,18 +518,24 @@ class Transport(PredictedSearch):
         return deviation.is_accepted, current
 
     def is_likely_success(self, u: Tensor) -> bool:
-        """Return whether the predicted image of u (d,) would pass its trials.
+        """Return whether the predicted image of u (d,) would probably pass its trials.
 
-        That is judged by the scores of the trials of the last configuration.
+        It would if its predicted score is over 0 after the bias is subtracted, which
+        the trials of the latest configuration showed.
         """
         return self._predict_score(u) > self._score_bias
 
     def update_score_bias(self, u: Tensor, scores: Sequence[float]) -> None:
-        """Update the bias of predicted scores from those of a configuration's trials.
+        """Update the bias of predicted scores from the trials of a configuration.
 
-        The bias is the predicted score minus the lower end of the trials' scores. From
-        few trials, or where a score is not finite, no end can be estimated: then the
+        The bias is the predicted score minus the lower end of the trials' scores. That
+        end is their mean minus 1.64 standard deviations, above which 95 % of normally
+        distributed scores lie. With few trials, or with a score that is not finite, the
         bias stays.
+
+        Args:
+            u: (d,) the configuration.
+            scores: scores of its trials.
         """
         if len(scores) >= MIN_SCORES and all(map(math.isfinite, scores)):
             mean = statistics.fmean(scores)

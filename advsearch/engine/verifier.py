@@ -118,7 +118,8 @@ class Verifier:
     ) -> Iterator[Evaluation]:
         """Evaluate trials lazily and in order; store their images, and count renders.
 
-        A trial whose image is rendered counts once, however often it is evaluated.
+        A trial counts as one render, even if it is evaluated several times: its results
+        are stored.
 
         Args:
             queries: the trials.
@@ -149,23 +150,24 @@ class Verifier:
     def choose_spp(
         self, candidates: dict[str, Tensor], search_samples: int | None = None
     ) -> None:
-        """Choose the sample count of the verification, and store it in the state.
+        """Choose the samples per pixel of the verification, and store the choice.
 
-        Samples are raised until more would not change the verdict: under the conditions
-        of the scene or, where conditions vary, until they would not change the fraction
+        They are raised until more samples would not change the verdict. If conditions
+        vary by chance, they are raised until more samples would not change the fraction
         of conditions under which the model is wrong.
 
         Args:
-            candidates: configurations (d,) by name.
-            search_samples: samples that the searches took, which bound those of this
-                choice where conditions vary.
+            candidates: configurations (d,) by name, such as the clean one.
+            search_samples: samples per pixel of all renders of the searches. If
+                conditions vary, the verification may not take more. None for no limit.
         """
         has_conditions = self.problem.conditions is not None
         # sample counts to choose from, ascending; a single one is no choice
         ladder = self.ladder
         has_choice = len(ladder) > 1
         n_trials = self.looks[0]
-        # `max_samples`, for the progress: samples of every render at every sample count
+        # `max_samples` is for the progress bar: samples per pixel of all renders, if
+        # every sample count of the ladder is tried.
         if has_conditions:
             choose: Callable[..., SampleCount] = choose_rate_spp
             if has_choice:
@@ -206,10 +208,15 @@ class Verifier:
     def _condition_ladder(
         self, n_candidates: int, search_samples: int | None
     ) -> Sequence[int]:
-        """Return the sample counts to choose from where conditions vary.
+        """Return the sample counts to choose from if conditions vary.
 
-        `search_samples` are the samples that the searches took: counts that would make
-        the verification more expensive than that are left out. None for no such limit.
+        Counts are left out with which the verification would take more samples than the
+        searches did.
+
+        Args:
+            n_candidates: number of configurations to verify.
+            search_samples: samples per pixel of all renders of the searches; None for
+                no limit.
         """
         if search_samples is None:
             return OVER_LADDER
@@ -217,13 +224,13 @@ class Verifier:
         return limit_ladder(OVER_LADDER, n_groups * self.n_trials, search_samples)
 
     def try_clean(self) -> None:
-        """Run the trials of the clean configuration, the control group, if they are
-        missing at this sample count.
+        """Run the trials of the clean configuration, which are the control group.
 
-        They have the same seeds as those of the adversarial configuration. Where the
-        model seems to be wrong about the clean configuration already, they are run
-        before the search, under another kind and at a sample count of their own, and
-        once more after it.
+        They have the same seeds as those of the adversarial configuration. Nothing is
+        done if they were run at this sample count already. If the model seems to be
+        wrong about the clean scene, they are run before the search, at another sample
+        count. After the search they are run once more, and the rows of both are told
+        apart by their kind.
         """
         if self.has_clean_trials:
             return
@@ -262,10 +269,10 @@ class Verifier:
         Args:
             kind: kind of the rows.
             result: result of the search.
-            curtailed: whether trials end as soon as the verdict stands: only this
-                matters, and not the rate.
-            with_new_trials: whether both groups get new trials, numbered after all
-                others.
+            curtailed: whether trials end as soon as the verdict is certain. That saves
+                renders if only the verdict is needed, and not the success rate.
+            with_new_trials: whether both groups get new trials with new seeds, numbered
+                after all others.
         """
         clean_trials = () if with_new_trials else self.state.clean_trials
         verification = verify(
@@ -300,16 +307,17 @@ class Verifier:
         """Try configurations (d,) once each, every one with a seed of its own.
 
         Args:
-            kind: kind of the rows.
+            kind: kind of the rows, such as "average".
             configurations: configurations by their numbers among those of the kind.
-            has_success: whether rows have a success.
-            predictor: as for `evaluate_all`.
+            has_success: whether rows state if the trial is a success.
+            predictor: predicts images in place of renders; None to render all.
         """
         problem = self.problem
         queries = list[Query]()
         for number, u in configurations.items():
             seed = seeds.stream(problem.seed, kind, number)
-            # for the row of the trial; those of a texture would fill the store
+            # The row of the trial states the values of the configuration, unless it has
+            # many: the texels of a texture would fill the store.
             values: dict[str, Any] = {}
             if problem.domain.dim <= MAX_DESCRIBED_COORDINATES:
                 values = problem.describe(u, seed)
@@ -337,8 +345,12 @@ class Verifier:
     ) -> Iterator[Judgement]:
         """Try `count` configurations of a kind, in batches that fit into memory.
 
-        `find_configuration` returns the configuration (d,) of a number from 0 on. Other
-        arguments are those of `try_configurations`.
+        Args:
+            kind: kind of the rows, such as "average".
+            count: number of configurations.
+            find_configuration: returns the configuration (d,) with a number, from 0.
+            has_success: whether rows state if the trial is a success.
+            predictor: predicts images in place of renders; None to render all.
         """
         for numbers in split_into_batches(
             0, count, max_batch_size(self.problem.domain.dim)
@@ -349,13 +361,17 @@ class Verifier:
             )
 
     def try_random(self, n_trials: int) -> None:
-        """Try random configurations: how often is the model wrong on average?"""
+        """Try random configurations, to measure how often the model is wrong.
+
+        Each is sampled at random from the domain of the search.
+        """
         problem = self.problem
         self.begin_stage(
             "trying random configurations", n_trials, name="average", flags="`average`"
         )
 
         def sample_configuration(number: int) -> Tensor:
+            """Return the random configuration (d,) with a number."""
             generator = torch.Generator().manual_seed(
                 seeds.stream(problem.seed, "draw", number)
             )
@@ -444,7 +460,7 @@ class Retrials:
         Args:
             conditions: conditions under which configurations are tried again.
             run: run whose store has the rows.
-            progress: progress that is told of each trial.
+            progress: progress, which counts the trials.
             trials: number of trials of a configuration under a condition.
             seed: root of the trials' seeds.
             executor: evaluates trials on workers, if there are any.
@@ -452,8 +468,8 @@ class Retrials:
         self._progress = progress
         self._n_trials = trials
         self._seed = seed
-        # The others are copies of the first journal, with the same rows and notes,
-        # which are read from the store only once.
+        # All journals are copies of the first one, so that rows and notes are read from
+        # the store only once.
         first_journal = Journal(run, ParallelEvaluator(conditions[0].problem))
         self._journals = {
             condition.name: replace(
@@ -465,12 +481,13 @@ class Retrials:
             for condition in conditions
         }
         self._clean: dict[str, tuple[Judgement, ...]] = {}
-        # Images and radiances that several conditions need, of one kind of rows: by
-        # what sets them (`image_key`, `radiance_key`), seed and spp.
+        # Images and radiances that several conditions need, for trials of the kind
+        # `_shared_kind`. Keys are `image_key` or `radiance_key`, seed, and samples per
+        # pixel.
         self._images: dict[tuple[Hashable, int, int], Tensor] = {}
         self._radiances: dict[tuple[Hashable, int, int], Tensor] = {}
         self._shared_kind = ""
-        # how many conditions have each light
+        # number of conditions by `radiance_key`; a light is shared if it is over 1
         self._n_conditions_of_light = Counter(
             condition.radiance_key
             for condition in conditions
@@ -493,10 +510,16 @@ class Retrials:
     def try_adversarial(
         self, kind: str, u: Tensor, condition: RetrialCondition
     ) -> Verification:
-        """Try a configuration (d,) under one condition, compared with the clean scene.
+        """Try a configuration under one condition, compared with the clean scene.
 
-        Only rates are compared: the search claims nothing under this condition, which
-        trials could confirm. The rows have the kind "KIND under CONDITION".
+        Only success rates are compared: the search was run under other conditions, so
+        that it makes no claim that trials could confirm. The rows have the kind "KIND
+        under CONDITION".
+
+        Args:
+            kind: kind of the trials, such as "verification".
+            u: (d,) the configuration.
+            condition: condition under which it is tried.
         """
         return verify(
             partial(self._evaluate_trials, kind, condition),
@@ -514,7 +537,14 @@ class Retrials:
     def _evaluate_trials(
         self, kind: str, condition: RetrialCondition, queries: Sequence[Query]
     ) -> Iterator[Evaluation]:
-        """Evaluate trials in order, by the journal of their condition."""
+        """Evaluate trials in order, or read them from the store.
+
+        Args:
+            kind: "clean", or the kind of the adversarial configuration; images are
+                shared among conditions for trials of one kind.
+            condition: condition of the trials.
+            queries: the trials.
+        """
         evaluate = partial(self._evaluate_new, kind, condition)
         journal = self._journals[condition.name]
         for evaluation in journal.evaluate_all(queries, evaluate):
@@ -524,11 +554,17 @@ class Retrials:
     def _evaluate_new(
         self, kind: str, condition: RetrialCondition, queries: Sequence[Query]
     ) -> Iterator[Evaluation]:
-        """Evaluate trials: judge images as the condition changes them.
+        """Evaluate trials that are not stored, under one condition.
 
-        Images before that change are cached, since other conditions may need the same
-        ones; the cache is emptied when trials of another kind begin. Missing images are
-        rendered by workers if there are any, and otherwise one by one here.
+        Images before that change are cached, since other conditions, such as another
+        compression, may need the same ones. The cache is emptied when trials of another
+        kind begin. Missing images are rendered by workers if there are any, and one by
+        one in this process otherwise.
+
+        Args:
+            kind: kind of the trials, for which images are cached.
+            condition: condition of the trials.
+            queries: the trials.
         """
         if kind != self._shared_kind:
             self._images.clear()
@@ -544,7 +580,7 @@ class Retrials:
         # in the order of `missing`
         from_workers = self._render_on_workers(condition, missing)
         for query, key in zip(queries, keys, strict=True):
-            machine = None  # that rendered the image, if it was a worker
+            machine = None  # name of the worker's machine, if one rendered the image
             if key not in self._images:
                 rendered = next(from_workers, None)
                 if rendered is None or rendered.picture is None:
@@ -562,10 +598,14 @@ class Retrials:
     def _render_on_workers(
         self, condition: RetrialCondition, queries: Sequence[Query]
     ) -> Iterator[Evaluation]:
-        """Yield the images of queries, rendered by workers; none without workers.
+        """Yield the images of queries, rendered by workers.
 
-        None either for a single query: its image is rendered in this process, where its
-        radiance can be shared.
+        Nothing is yielded without workers, or for a single query: its image is rendered
+        in this process, where conditions can share its radiance.
+
+        Args:
+            condition: condition of the trials.
+            queries: queries for images that are not cached.
         """
         evaluator = self._journals[condition.name].evaluator
         if evaluator.executor is not None and len(queries) > 1:
@@ -573,10 +613,15 @@ class Retrials:
         return iter(())
 
     def _render(self, condition: RetrialCondition, u: Tensor, seed: int) -> Tensor:
-        """Return the image (H, W, 3) of u (d,), as `Problem.picture` does.
+        """Return the image (H, W, 3) of a configuration under a condition.
 
-        Conditions under the same light share the radiance, which is cached; only the
-        formation of the image from it differs.
+        Conditions with the same light share the radiance, which is cached. They differ
+        only in how the image is formed from it.
+
+        Args:
+            condition: the condition.
+            u: (d,) the searched coordinates.
+            seed: seed of the noise and of random conditions.
         """
         problem = condition.problem
         # how many conditions have this light; 0 without a key, which is never shared
@@ -595,6 +640,10 @@ class Retrials:
 
 def read_stored_configuration(directory: Path, problem: Problem) -> torch.Tensor:
     """Return the configuration (d,) that a run directory has stored.
+
+    Args:
+        directory: the run directory.
+        problem: problem of the present scene, to whose domain it must fit.
 
     Raises:
         InputError: the scene has another number of coordinates now.

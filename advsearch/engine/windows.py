@@ -82,10 +82,10 @@ class Windowing:
 def find_window(problem: Problem) -> Windowing | Refusal:
     """Return the smallest window outside of which a search changes little.
 
-    The box around what is searched is grown by each of `MARGINS` in turn. Outside of
-    the window, the images of the smallest and of the largest values of all coordinates
-    must look like that of the start. This takes `N_WINDOW_IMAGES` full images of few
-    samples.
+    The box around what is searched is grown by each of `MARGINS` in turn. A window is
+    accepted if the images of three configurations look alike outside of it: the start,
+    and the smallest and the largest allowed values of all coordinates. These are
+    `N_WINDOW_IMAGES` full images of few samples.
 
     Returns:
         The window with the image of the start, or why there is none.
@@ -101,6 +101,7 @@ def find_window(problem: Problem) -> Windowing | Refusal:
         return Refusal("nothing of what is searched is in the picture")
     if box.grow(MARGINS[0], resolution).area > max_area:
         return Refusal("what is searched fills much of the picture")
+    # the ends of the budget: 0 and 1 in all coordinates, moved into the allowed set
     lower = domain.project(torch.zeros_like(domain.start))
     upper = domain.project(torch.ones_like(domain.start))
     start, *extremes = [render_full(problem, u) for u in (domain.start, lower, upper)]
@@ -138,11 +139,12 @@ def find_crop_refusal(problem: Problem) -> Refusal | None:
 
 
 def find_searched_refusal(problem: Problem) -> Refusal | None:
-    """Return why it is not enough to trace a part of the image, by what is searched.
+    """Return why what is searched may change all of the image; None if it does not.
 
-    None if it is enough: what is searched are surfaces of meshes that stay where they
-    are, so that the image changes there. If nothing changes that is traced, there is no
-    such part either, which is a refusal as well.
+    It does not if surfaces of meshes are searched, such as a texture, and the meshes
+    stay where they are. Then the image changes where the meshes are visible. Lights
+    and moving things change it elsewhere. If nothing is searched that needs rays, as a
+    blur of the finished image, there is no part to trace, which is a refusal as well.
     """
     light_inputs = find_light_inputs(problem.renderer)
     input_names = find_searched_inputs(problem)  # such as "mug.bsdf.reflectance"
@@ -176,11 +178,15 @@ def _find_box(problem: Problem) -> Window | None:
 
 
 def render_full(problem: Problem, u: Tensor) -> FullImage:
-    """Render the full image of u (d,), to compare it with that of another u.
+    """Render the full image of a configuration, to compare it with that of another.
 
-    It is traced twice with independent noise (`halves`); `radiance` is the mean of
-    both, denoised. The two seeds are the same for every u, so that most of the noise
+    It is traced twice with independent noise (`halves`); `radiance` is the denoised
+    mean of both. The two seeds are the same for every u, so that most of the noise
     cancels in the difference of two images.
+
+    Args:
+        problem: problem of the search.
+        u: (d,) the configuration.
     """
     renderer = problem.renderer
     noise_seed = seeds.stream(problem.seed, "crop")
@@ -203,13 +209,13 @@ def _compute_inputs(problem: Problem, u: Tensor) -> dict[str, Tensor]:
 def measure_outside(
     problem: Problem, window: Window, before: FullImage, others: Sequence[FullImage]
 ) -> Deviation:
-    """Measure by how much images differ outside of a window, the mean over several.
+    """Measure by how much images differ outside of a window, on average.
 
     Args:
         problem: problem of the search.
         window: the pixels that are traced.
-        before: the image whose surroundings are pasted.
-        others: the images that are compared with it.
+        before: full image whose surroundings would be pasted around the window.
+        others: full images of other configurations, which are compared with it.
     """
     squared_differences = []
     margin_biases = []
@@ -235,17 +241,27 @@ def measure_outside(
 def _measure_square(
     problem: Problem, window: Window, before: FullImage, after: FullImage
 ) -> float:
-    """Return the mean squared difference of two images outside of a window, in squared
-    levels of 255.
+    """Return the mean squared difference of two images outside of a window.
 
-    Each image has two halves, by two seeds. Images of one seed have nearly the same
-    noise. The product of the differences of two seeds is the square without what noise
-    is left.
+    Each image has two halves, traced with the same two seeds. Most of the noise cancels
+    in the difference of two halves with one seed. The rest is independent for the two
+    seeds, so that the product of both differences has the squared difference as its
+    mean, without noise.
+
+    Args:
+        problem: problem of the search.
+        window: the pixels that do not count.
+        before: a full image.
+        after: another full image.
+
+    Returns:
+        The square in levels of 255, of means over squares of `SQUARE` pixels; it may be
+        below 0 by chance.
     """
     outside = window.is_outside(problem.renderer.formation.resolution).float()
     # levels of the displayed image for a difference of radiance
     slope = _compute_slope(problem, before)
-    # of both halves
+    # for each of the two seeds, the summed differences over squares of pixels
     sums = [
         _sum_squares(255.0 * slope * (new - old)[..., :3] * outside[..., None])
         for old, new in zip(before.halves, after.halves, strict=True)
@@ -256,7 +272,11 @@ def _measure_square(
 
 
 def _sum_squares(image: Tensor) -> Tensor:
-    """Return the sums over squares of `SQUARE` pixels of an image (H, W, c)."""
+    """Return the sums over squares of `SQUARE` pixels of an image (H, W, c).
+
+    The result is (1, c, h, w); squares at the border may be cut off.
+    """
+    # with a divisor of 1 the average is the sum
     sums: Tensor = functional.avg_pool2d(
         image.movedim(-1, 0)[None], SQUARE, ceil_mode=True, divisor_override=1
     )
@@ -264,7 +284,12 @@ def _sum_squares(image: Tensor) -> Tensor:
 
 
 def _compute_slope(problem: Problem, image: FullImage) -> Tensor:
-    """Return the derivative of the displayed image by its radiance, (H, W, 3)."""
+    """Return the derivative of the displayed image by its radiance, (H, W, 3).
+
+    It converts small differences of radiance into differences of displayed values. Each
+    displayed pixel depends on its own radiance, so that the gradient of the sum has the
+    derivative of each pixel.
+    """
     radiance = image.radiance.clone()
     inputs = _compute_inputs(problem, image.u)
     with torch.enable_grad():
@@ -278,8 +303,17 @@ def _compute_slope(problem: Problem, image: FullImage) -> Tensor:
 def _measure_margin(
     problem: Problem, window: Window, before: FullImage, after: FullImage
 ) -> tuple[float, float]:
-    """Return how much larger the margin is with the surroundings of another image, and
-    by how much it has moved from that image.
+    """Return the error of the margin with other surroundings, and how far it moved.
+
+    Args:
+        problem: problem of the search.
+        window: the pixels that are traced.
+        before: full image whose surroundings are pasted around the window.
+        after: full image of the configuration that is searched.
+
+    Returns:
+        The margin with pasted surroundings minus the true margin of `after`; and the
+        absolute difference between the margins of `after` and `before`.
     """
     pasted = window.paste(window.select(after.radiance), before.radiance)
     margin = _compute_margin(problem, after.radiance, after.u)

@@ -87,11 +87,20 @@ class AnswerStore(Protocol):
 
 
 def load(spec: str, purpose: models.Purpose) -> Model:
-    """Create the model behind an address; it is asked for its names if they are
-    unknown.
+    """Create the model behind an address.
+
+    If the task needs scores, and the user gave no names of classes, one request for a
+    gray image finds out the names.
+
+    Args:
+        spec: the address, perhaps with ``#NAME`` behind it, which is the name of a
+            chat's model or of the model in results.
+        purpose: task, names of classes and limits of the model.
 
     Raises:
-        InputError: only a file names it, or as `check_address`.
+        CodeNotAllowedError: the address comes from a file, and the user has not allowed
+            it.
+        InputError: it is no valid address, or a chat is asked for scores.
         ModelError: it cannot do the task, or there is no answer.
     """
     address = models.check_address(spec)
@@ -135,7 +144,17 @@ def load(spec: str, purpose: models.Purpose) -> Model:
 
 
 def _check_chat(spec: str, name: str, *, is_free: bool, is_named: bool) -> None:
-    """Raise InputError unless a chat is asked for free answers, and its model named."""
+    """Check that a chat can be used as the task needs it.
+
+    Args:
+        spec: what the user wrote.
+        name: name of the model, for messages.
+        is_free: whether the task takes answers in free words; a chat has no scores.
+        is_named: whether the address names the chat's model behind a #.
+
+    Raises:
+        InputError: one of the two is not the case.
+    """
     if not is_free:
         raise InputError(
             f"task: a chat such as {name} answers in words; use "
@@ -149,8 +168,9 @@ def _check_chat(spec: str, name: str, *, is_free: bool, is_named: bool) -> None:
 
 
 def _request_names(module: AddressModel) -> tuple[str, ...]:
-    """Return the names to which a model behind an address gives scores, by those for a
-    gray image.
+    """Return the names to which a model behind an address gives scores.
+
+    A gray image is sent, and the names in the answer are taken.
     """
     size = (models.DEFAULT_SIZE, models.DEFAULT_SIZE)
     gray_image = np.full((*size, 3), 128, np.uint8)
@@ -267,8 +287,16 @@ class _TrackingHandler(urllib.request.AbstractHTTPHandler):
     def do_open(
         self, http_class: Any, req: urllib.request.Request, **options: Any
     ) -> Any:
-        """Send a request as the base class does, over a connection that is listed and
-        has the deadline.
+        """Send a request as the base class does, over a tracked connection.
+
+        The base class makes its connection by calling a class. It gets a function
+        instead, which sets the deadline and lists the connection, so that another
+        thread can break it off.
+
+        Args:
+            http_class: class of connection that the base class would use.
+            req: the request.
+            **options: further arguments of the connection.
         """
         is_secure = issubclass(http_class, http.client.HTTPSConnection)
         connection_class = _SecureConnection if is_secure else _Connection
@@ -330,14 +358,18 @@ class AddressModel(models.RemoteNetwork):
     answer_cache: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def __call__(self, pictures: Tensor) -> Any:
-        """Return logits (N, names) for images (N, 3, H, W), or without names the texts
-        about each.
+        """Return what the model answers about images (N, 3, H, W) in [0, 1].
+
+        They are logits (N, names). If the model has no names, they are the texts about
+        each image, ``{"texts": [...]}``.
         """
+        # what an image file holds: integers from 0 to 255, channels last
         levels = (pictures.clamp(0.0, 1.0).nan_to_num() * 255.0).round().to(torch.uint8)
         images = list(levels.permute(0, 2, 3, 1).cpu().contiguous().numpy())
         if not self.names:
             return [{"texts": texts} for texts in self._request_texts(images)]
-        # Scores of 0 have no logarithm: they are `MIN_SCORE`.
+        # A score of 0, or of a name that is missing in the answer, has no logarithm:
+        # `MIN_SCORE` takes its place.
         rows = [
             [max(scores.get(name, 0.0), MIN_SCORE) for name in self.names]
             for scores in self.request_scores(images)
@@ -347,8 +379,10 @@ class AddressModel(models.RemoteNetwork):
     def _request_texts(self, images: Sequence[Image8Bit]) -> list[list[str]]:
         """Return the texts about each image, one for each of `times` requests.
 
-        Of an answer with scores it is the likeliest name.
+        If an answer has scores in place of a text, its text is the name with the
+        highest score.
         """
+        # turn: the number of the request about the same image
         requests = [(image, turn) for image in images for turn in range(self.times)]
         texts = []
         for answer in self._get_answers(requests):
@@ -394,18 +428,20 @@ class AddressModel(models.RemoteNetwork):
     ) -> list[dict[str, Any]]:
         """Return the answer to each image and turn: a stored one, or a new one.
 
-        New answers are stored as they arrive. The same image is asked about once for
-        each turn; trials are all sent, since their noise differs, and so their images.
+        Each new answer is stored as it arrives, so that an interrupted run loses none.
+        An equal image with an equal turn is sent only once. Trials of one configuration
+        are all sent, since their noise differs.
 
         Args:
-            requests: images, each with the number of the request about it, from 0.
+            requests: images, each with its turn: the number of the request about that
+                image, from 0. A model that answers by chance is asked in several turns.
         """
         keys = list[str]()
         answers = dict[str, Any]()
         new_bodies = dict[str, dict[str, Any]]()
         for image, turn in requests:
             body = self._make_body(image)
-            # An answer is stored by all that it depends on.
+            # The key is a hash of all that the answer depends on.
             request = json.dumps([body, turn, self.spec]).encode()
             key = f"answer {hashlib.blake2b(request, digest_size=16).hexdigest()}"
             keys.append(key)
@@ -437,7 +473,8 @@ class AddressModel(models.RemoteNetwork):
     def _make_body(self, image: Image8Bit) -> dict[str, Any]:
         """Return the JSON body of a request about an image.
 
-        It is one of the plain protocol, or of OpenAI's chat if `chat` is not empty.
+        It follows the protocol of OpenAI's chat if `chat` is not empty, and else the
+        plain protocol, {"image": PNG in base64, "prompt": question}.
         """
         encoded = base64.b64encode(models.encode_levels(image)).decode()
         if not self.chat:
@@ -459,7 +496,13 @@ class AddressModel(models.RemoteNetwork):
         }
 
     def _read_plain(self, response: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the answer in a response of the plain protocol, scores or a text."""
+        """Return the answer in a response of the plain protocol.
+
+        It is ``{"scores": {name: fraction}}`` or ``{"text": answer}``.
+
+        Raises:
+            ModelError: the response has neither, or scores outside [0, 1].
+        """
         scores = response.get("scores")
         text = response.get("text")
         if isinstance(scores, dict) and scores:
@@ -478,7 +521,9 @@ class AddressModel(models.RemoteNetwork):
         raise self._make_error('{"scores": {NAME: SHARE}} or {"text": WORDS}', response)
 
     def _read_chat(self, response: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the text in a response of a chat, `REFUSED` if it declines to answer.
+        """Return the answer in a response of a chat, as ``{"text": answer}``.
+
+        The text is `REFUSED` if the model declines to answer.
 
         Raises:
             ModelError: there is no text.
@@ -555,6 +600,7 @@ class AddressModel(models.RemoteNetwork):
             ModelError: a limit is reached, nobody answers, or a response is invalid;
                 the responses up to then are yielded before.
         """
+        # requests that are still to be sent
         pending = [
             _Request(index, MAX_TRIES, FIRST_DELAY) for index in range(len(bodies))
         ]
@@ -569,8 +615,9 @@ class AddressModel(models.RemoteNetwork):
             )
             failures = list[str]()
             retries = list[_Request]()
-            # A refused connection to a server that never answered means that there is
-            # none; the calls of this batch are counted already.
+            # Whether this is the first batch of the run: its own calls are counted
+            # already. If the server refuses the connection now, there is no server, and
+            # another try is pointless.
             is_first = self.spent["calls"] <= len(batch)
             for request, response in zip(batch, responses, strict=True):
                 if isinstance(response, dict):
@@ -581,33 +628,46 @@ class AddressModel(models.RemoteNetwork):
                     failures.append(reason)
                 else:
                     retries.append(retry)
-            # only now, so that no response of the batch is lost
+            # Raised only after the loop, so that no response of the batch is lost.
             if failures:
                 raise errors.ModelError(failures[0])
             pending = self._wait_to_retry(retries) + pending
 
     def _wait_to_retry(self, retries: Sequence[_Request]) -> list[_Request]:
-        """Wait for the longest delay of requests that failed, and return them with
-        twice the delay.
+        """Wait before requests that failed are sent again.
+
+        The longest of their delays is waited for. They are returned with twice the
+        delay, for the case that they fail again.
         """
         if retries:
             time.sleep(min(max(request.delay for request in retries), MAX_DELAY))
         return [replace(request, delay=2 * request.delay) for request in retries]
 
     def _max_concurrent(self) -> int:
-        """Return how many requests may be sent at once."""
+        """Return how many requests may be sent at once.
+
+        It is one if tokens or their price are limited: how many tokens a request takes
+        is known only from its response.
+        """
         by_token = self._priced_by_token and self.limits["money"] < LIMITS["money"]
-        # Only a response shows whether another request is allowed.
         is_sequential = self.limits["tokens"] < LIMITS["tokens"] or by_token
         return 1 if is_sequential else int(self.limits["at_once"])
 
     def _plan_retry(
         self, request: _Request, error: Exception, *, first: bool
     ) -> tuple[str, _Request | None]:
-        """Return why a request failed, and its next try; None if there is none.
+        """Return why a request failed, and the request to send next.
 
-        An error of ours explains itself, and would come again.
+        Args:
+            request: request that failed.
+            error: error that it raised.
+            first: whether no request of the run has succeeded yet.
+
+        Returns:
+            The reason, for a message; and the request with one try less, or None if
+            another try is pointless.
         """
+        # an invalid response, which would come again
         if isinstance(error, errors.ModelError):
             return str(error), None
         failure = self._explain_failure(error, first=first)
@@ -620,11 +680,14 @@ class AddressModel(models.RemoteNetwork):
     def _reserve(self, max_count: int) -> int:
         """Count calls as spent before they are made, as many as the limits allow.
 
+        They are counted first so that a crash cannot lead to calls that nobody counted.
         Tokens are known only after a call, so that their limit stops later calls.
 
+        Args:
+            max_count: number of calls that the caller wants to make.
+
         Returns:
-            The number of calls that may be made now, at least 1 and at most
-            `max_count`.
+            The number of calls that may be made now, from 1 to `max_count`.
 
         Raises:
             ModelError: none is allowed.
@@ -683,13 +746,16 @@ class AddressModel(models.RemoteNetwork):
     ) -> dict[str, Any] | Exception:
         """Return the response to a body, or the error, as a later try may succeed.
 
-        The arguments are those of `_send_body`.
+        Args:
+            body: JSON.
+            deadline: deadline of the connection, as `time.monotonic` counts.
+            connections: list that the connection is added to.
         """
         try:
             return self._send_body(body, deadline, connections)
         except urllib.error.HTTPError as error:
-            # Its body can't be read once the connection is closed: it is copied, and
-            # left empty if it can't be read now.
+            # The message of the error needs its body, which cannot be read once the
+            # connection is closed. So it is copied, or left out if reading it fails.
             with error, suppress(OSError, http.client.HTTPException):
                 text = error.read(MAX_ERROR_BYTES)
                 error = urllib.error.HTTPError(
@@ -705,7 +771,7 @@ class AddressModel(models.RemoteNetwork):
 
         Args:
             error: error that was raised.
-            first: no request has succeeded yet.
+            first: whether no request of the run has succeeded yet.
         """
         if not isinstance(error, urllib.error.HTTPError):
             return self._explain_connection_error(error, first=first)
@@ -717,7 +783,12 @@ class AddressModel(models.RemoteNetwork):
         return _Failure(reason, status in RETRY_STATUSES, seconds)
 
     def _explain_connection_error(self, error: Exception, *, first: bool) -> _Failure:
-        """Explain why there is no response; arguments as of `_explain_failure`."""
+        """Explain why there is no response.
+
+        Args:
+            error: error of the connection.
+            first: whether no request has succeeded yet.
+        """
         cause = getattr(error, "reason", error)  # what urllib's error wraps
         text = type(cause).__name__
         if str(cause):
@@ -728,7 +799,11 @@ class AddressModel(models.RemoteNetwork):
         return _Failure(self._clean(text), may_retry=not (has_no_server or is_final))
 
     def _explain_status(self, error: urllib.error.HTTPError) -> str:
-        """Return what the status of a response means, which is that of an error."""
+        """Return what an HTTP error status means, as a clause for a message.
+
+        Redirects (300 to 399) count as errors: images and key are sent to no other
+        address than the one that the user gave.
+        """
         status = error.code
         if 300 <= status < 400:
             location = self._clean(error.headers.get("Location", "elsewhere"))
@@ -827,10 +902,12 @@ class AddressModel(models.RemoteNetwork):
         )
 
     def _count_tokens(self, response: Mapping[str, Any]) -> None:
-        """Count the tokens that a response states.
+        """Add the tokens that a response states to those that are spent.
+
+        They are in its field `usage`, as in OpenAI's protocol.
 
         Raises:
-            ModelError: it states none, and a limit needs them.
+            ModelError: it states none, and a limit or a price needs them.
         """
         usage = response.get("usage")
         if not isinstance(usage, Mapping):
@@ -840,7 +917,7 @@ class AddressModel(models.RemoteNetwork):
             isinstance(count, int) and not isinstance(count, bool) and count >= 0
             for count in counts
         )
-        # without a limit (there is none by default) and a price, tokens may be unknown
+        # Tokens may be unknown if neither a limit nor a price depends on them.
         needs_tokens = self.limits["tokens"] < LIMITS["tokens"] or self._priced_by_token
         if is_stated:
             tokens_in, tokens_out = counts

@@ -37,12 +37,14 @@ class AllAtOnce(nn.Module):
         self.layout = layout
 
     def forward(self, images: Tensor) -> Tensor:
-        """Return the output (N * K, ...) for pictures (N * K, 3, H, W), those of each
-        configuration together.
+        """Return the output (N * K, ...) for the pictures of N configurations.
 
-        Each row is that of its configuration. A count that is no multiple of K is
-        allowed, as loading a model runs it on one or two images: copies of the last
-        picture fill it up, and have no row.
+        All K pictures of a configuration get the same row of the output. A count that
+        is no multiple of K is allowed, since a model is run on one or two images when
+        it is loaded. Then copies of the last picture fill it up, and get no row.
+
+        Args:
+            images: (N * K, 3, H, W), the K pictures of each configuration together.
         """
         count = len(images)
         n_missing = -count % self.cameras

@@ -74,9 +74,13 @@ class Features:
 
 
 def features_of(model: Model) -> Features:
-    """Find the penultimate features of a model by running it on gray images; see the
-    module.
+    """Find the features of a model: the numbers that its last layer turns into logits.
+
+    The model is run on gray images. Layers are found by hooks on PyTorch modules, or by
+    running an exported graph node by node. If neither finds one, features are the
+    logits minus their mean.
     """
+    # two images, as one alone may hide which axis is the batch
     batch_size = min(2, model.batch_limits[1])
     gray = torch.full((batch_size, *model.input_size, 3), 0.5)
     with torch.no_grad():
@@ -93,6 +97,7 @@ def features_of(model: Model) -> Features:
     )
 
     def center_logits(x: Tensor) -> Tensor:
+        """Return the logits of a batch, less their mean over the classes."""
         logits: Tensor = model.run_network(x)
         return logits - logits.mean(dim=1, keepdim=True)
 
@@ -192,7 +197,11 @@ def _trace_modules(network: Any, x: Tensor, only: nn.Module | None) -> list[_Cal
         kwargs: dict[str, Tensor],
         output: Tensor,
     ) -> None:
-        """Record a call of a layer, after it."""
+        """Record a call of a layer; PyTorch calls this after each of them.
+
+        Calls are left out whose output has another number of rows than the input, as
+        they do not work on the images of the batch.
+        """
         input = args[0] if args else kwargs["input"]
         keeps_batch = len(input) == len(output) and input.dim() > 1
         if keeps_batch:
@@ -210,10 +219,13 @@ def _trace_modules(network: Any, x: Tensor, only: nn.Module | None) -> list[_Cal
 
 
 def _trace_graph(network: Any, x: Tensor, only: fx.Node | None) -> list[_Call]:
-    """Run a graph of operators, such as a `torch.export` program, and return the calls
-    of its layers, those of `OPERATORS`, or of the node `only`.
+    """Run a graph of operators, and return the calls of its layers (`OPERATORS`).
 
-    There are none if the network is no graph.
+    Args:
+        network: any network; only a graph, such as a `torch.export` program, has such
+            calls.
+        x: a batch to run it on.
+        only: the only node of interest; None for all.
     """
     calls: list[_Call] = []
 
@@ -244,11 +256,13 @@ PARTS = ("image_embeds", "pooler_output", "last_hidden_state")
 
 
 def pooled(returned: Any, *, token: bool) -> Tensor | None:
-    """Return the features (N, D) in an output of a network, a tensor or what has one of
-    `PARTS`; None if there are none.
+    """Return the features (N, D) in an output of a network; None if there are none.
 
-    Maps (N, D, H, W) are averaged over their positions. Of several tokens (N, T, D),
-    the first is taken with `token`, otherwise their mean.
+    Args:
+        returned: a tensor, or an object or mapping with one of `PARTS`. Maps (N, D, H,
+            W) are averaged over their positions.
+        token: whether the first of several tokens (N, T, D) is taken, as of networks
+            with a class token; otherwise their mean is.
     """
     for part in PARTS:
         value = (

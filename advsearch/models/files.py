@@ -68,7 +68,9 @@ MAX_BATCH = 64  # maximum batch size of a program whose batch dimension is free
 
 
 def load_file(path: Path) -> Source:
-    """Load the model in a file.
+    """Load the model in a file: a torch.export archive, TorchScript, or ONNX.
+
+    Archives are told apart by their content, ONNX by its suffix.
 
     Raises:
         FileFormatError: missing, empty, truncated, corrupt, a pickle, or of another
@@ -86,7 +88,7 @@ def load_file(path: Path) -> Source:
             f"model file {path}: cannot be read ({error.strerror or error})"
         ) from None
     with opened as file:
-        head = file.read(16)
+        head = file.read(16)  # enough to tell the kind of a file
         if not head:
             raise FileFormatError(
                 f"model file {path}: expected a model, got an empty file"
@@ -103,7 +105,10 @@ def load_file(path: Path) -> Source:
 
 
 def _load_exported(archive: Archive) -> Source:
-    """Load the network in an archive of torch.export."""
+    """Load the network in an archive of torch.export.
+
+    The archive is first rewritten without anything that would have to be unpickled.
+    """
     path = archive.path
     checked = exported_programs.rewrite_program(archive)
     logger = logging.getLogger("torch.export")
@@ -112,7 +117,8 @@ def _load_exported(archive: Archive) -> Source:
         without_unpickling(),
         ExitStack() as stack,
     ):
-        # torch logs a traceback of what is rejected with a message anyway.
+        # torch logs a traceback of an error. The user gets a message instead, so that
+        # its logger is silent in this block.
         stack.callback(logger.setLevel, logger.level)
         logger.setLevel(logging.CRITICAL)
         program = torch.export.load(checked)
@@ -135,12 +141,15 @@ def _make_missing_hint(path: Path) -> str:
 def _load_torchscript(archive: Archive) -> Source:
     """Load the network in a TorchScript archive.
 
+    Some archives run code as they are loaded. That code may never end, so that such an
+    archive is loaded in another process first, which has a deadline.
+
     Raises:
         FileFormatError: it is corrupt, or loading it fails or does not end.
     """
     path = archive.path
     checked, runs_while_loading = rewrite_torchscript(archive)
-    if runs_while_loading:  # code that may never end: it is tried elsewhere first
+    if runs_while_loading:
         problem = try_torchscript(checked)
         if problem:
             raise FileFormatError(f"model file {path}: {problem}")
@@ -157,8 +166,12 @@ def _load_torchscript(archive: Archive) -> Source:
 
 
 def _find_archive_kind(archive: Archive) -> str:
-    """Return ``"exported"`` or ``"torchscript"``; raise FileFormatError for anything
-    else.
+    """Return the kind of an archive, "exported" or "torchscript".
+
+    The names of its members tell the kind.
+
+    Raises:
+        FileFormatError: it is of another kind, such as a pickle that `torch.save` made.
     """
     path = archive.path
     names = archive.members
@@ -182,7 +195,10 @@ def _find_archive_kind(archive: Archive) -> str:
 
 
 def _check_no_code(archive: Archive) -> None:
-    """Raise FileFormatError if an exported program has pickles or compiled code."""
+    """Raise FileFormatError if an exported program has pickles or compiled code.
+
+    Both would run whatever their author wants when they are loaded.
+    """
     pickle_prefixes = ("opaque_obj", "custom_obj")
     members_with_code = [
         name
@@ -199,7 +215,7 @@ def _check_no_code(archive: Archive) -> None:
 
 
 def _describe_file(path: Path, head: bytes) -> str:
-    """Describe what a file may be that is no zip archive, and what to do about it.
+    """Describe what a file that is no zip archive may be, and what to do about it.
 
     Args:
         path: path of the file, whose suffix is looked at.
@@ -232,11 +248,15 @@ def _describe_file(path: Path, head: bytes) -> str:
 
 
 def _apply_signature(source: Source, program: torch.export.ExportedProgram) -> Source:
-    """Return the source with what the program's signature shows: input size, layout,
-    batch limits, dtype.
+    """Return the source with input size, layout, batch limits and dtype of a program.
 
-    A program may take (N, K, 3, H, W) or (N, K, H, W, 3), all images of a rig at once:
-    then it is wrapped as one of single images.
+    The signature of an exported program states the shape and dtype of its inputs. If it
+    takes all K images of a rig at once, (N, K, 3, H, W) or (N, K, H, W, 3), it is
+    wrapped as a network of single images.
+
+    Args:
+        source: source of the network.
+        program: the exported program.
 
     Raises:
         ModelError: it takes something other than images.
@@ -273,8 +293,14 @@ def _apply_signature(source: Source, program: torch.export.ExportedProgram) -> S
 def _apply_image_input(source: Source, images: Any, *, is_rig: bool) -> Source:
     """Return the source with input size, layout and dtype of an input of images.
 
+    Args:
+        source: source of the network.
+        images: example value of the input, (N, 3, H, W) or (N, H, W, 3), or the same
+            with an axis of K cameras after N.
+        is_rig: whether there is that axis.
+
     Raises:
-        ModelError: it is of another dtype.
+        ModelError: its dtype is neither a floating-point one nor uint8.
     """
     is_eight_bit = images.dtype == torch.uint8 and not is_rig
     if not images.is_floating_point() and not is_eight_bit:
@@ -283,6 +309,7 @@ def _apply_image_input(source: Source, images: Any, *, is_rig: bool) -> Source:
             expected = "floating-point images as input, got"
         raise ModelError(f"model {source.name}: expected {expected} {images.dtype}")
     image_shape = images.shape[-3:]
+    # Only a size of 3 in the last place alone means that channels come last.
     is_channels_last = image_shape[2] == 3 and image_shape[0] != 3
     height, width = image_shape[:2] if is_channels_last else image_shape[1:]
     is_fixed_size = isinstance(height, int) and isinstance(width, int)
@@ -299,8 +326,9 @@ def _apply_image_input(source: Source, images: Any, *, is_rig: bool) -> Source:
 def _check_inputs(source: Source, names: list[str], inputs: list[Any]) -> bool:
     """Check the inputs of a program, and return whether it takes rigs.
 
-    It takes a batch of images (N, ...), which may be followed by vectors (N, ...); or
-    rigs (N, K, ...): K images, one of each camera of a rig.
+    A program may take a batch of images with 4 axes, perhaps followed by vectors (N, n)
+    such as image sizes. Or it may take rigs with 5 axes: K images each, one for each
+    camera.
 
     Args:
         source: source of the program, for messages.
@@ -334,7 +362,12 @@ def _check_inputs(source: Source, names: list[str], inputs: list[Any]) -> bool:
 def _find_batch_limits(
     program: torch.export.ExportedProgram, batch: Any
 ) -> tuple[int, int]:
-    """Return the minimum and maximum of a batch dimension, fixed or symbolic."""
+    """Return the minimum and maximum batch size of a program.
+
+    Args:
+        program: the exported program, which may limit a free batch size.
+        batch: size of the batch axis: an int if it is fixed, else a symbol.
+    """
     if isinstance(batch, int):
         return batch, batch
     allowed = program.range_constraints.get(batch.node.expr)
@@ -345,8 +378,9 @@ def _find_batch_limits(
 
 
 def make_eight_bit(source: Source) -> Source:
-    """Return the source of a network that takes uint8 as one that takes floating-point
-    images from 0 to 255.
+    """Return the source of a network that takes uint8, wrapped to take float32.
+
+    The wrapper rounds images from 0 to 255.
     """
     return replace(
         source,
@@ -357,8 +391,13 @@ def make_eight_bit(source: Source) -> Source:
 
 
 def _advise_on_second_input(names: list[str]) -> str:
-    """Return advice on the second input of a network that cannot be used, by the names
-    of its inputs; "" if there are not two.
+    """Return advice about a network whose second input is not known.
+
+    Args:
+        names: names of all inputs of the network.
+
+    Returns:
+        The advice, to follow a message; "" if there are not exactly two inputs.
     """
     if len(names) != 2:
         return ""
@@ -370,7 +409,12 @@ def _advise_on_second_input(names: list[str]) -> str:
 
 
 def _report_corrupt(path: Path, kind: str) -> AbstractContextManager[None]:
-    """Turn whatever torch raises while it reads a file into a FileFormatError."""
+    """Return a context that turns errors of torch into a FileFormatError.
+
+    Args:
+        path: path of the file that torch reads.
+        kind: kind of the file, such as "TorchScript", for the message.
+    """
     problem = (
         f"model file {path}: cannot be read as {kind} with torch {torch.__version__}"
     )
@@ -407,8 +451,12 @@ class OnnxNetwork(nn.Module):
         self.options = new_options()
 
     def forward(self, *tensors: Tensor) -> Tensor | tuple[Tensor, ...]:
-        """Return the only output, or all outputs in order, for the inputs in order."""
-        # Options by which a run was ended would end the next one as well.
+        """Return the output of the network, or a tuple of its outputs.
+
+        Args:
+            *tensors: its inputs, in the order of the file.
+        """
+        # New options each time: those by which `stop` ended a run would end the next.
         self.options = self.new_options()
         names = [tensor.name for tensor in self.session.get_inputs()]
         named = {
@@ -427,9 +475,10 @@ class OnnxNetwork(nn.Module):
 
 
 def load_onnx(path: Path) -> Source:
-    """Load the network in an ONNX file, which is known to be a regular file.
+    """Load the network in an ONNX file.
 
-    onnxruntime restricts its other files to its directory.
+    The caller has checked that it is a regular file. If it names further files with
+    weights, onnxruntime reads them only from the same directory.
 
     Raises:
         FileFormatError: it is corrupt, or refers to files elsewhere.
@@ -464,7 +513,15 @@ def load_onnx(path: Path) -> Source:
 
 
 def _open_session(path: Path) -> tuple[Any, Any]:
-    """Return a session of onnxruntime with the network in a file, and onnxruntime."""
+    """Open a network with onnxruntime.
+
+    Returns:
+        The session that runs the network, and the module `onnxruntime`.
+
+    Raises:
+        ModelError: onnxruntime is missing or too old.
+        FileFormatError: the file is corrupt.
+    """
     runtime = import_library("onnxruntime", str(path), "onnx")
     release = re.match(r"(\d+)\.(\d+)", runtime.__version__)
     if release is None or (int(release[1]), int(release[2])) < MIN_VERSION:
@@ -481,8 +538,9 @@ def _open_session(path: Path) -> tuple[Any, Any]:
         f"{runtime.__version__}"
     )
     with translate_errors(problem, kind=FileFormatError):
-        # Constants are computed in each call, which has a deadline: nothing could end
-        # the creation of a session.
+        # Without this optimizer, no part of the network runs as the session is created,
+        # which nothing could end. Constants are computed in each call, which has a
+        # deadline.
         session = runtime.InferenceSession(
             str(path),
             options,
@@ -494,8 +552,14 @@ def _open_session(path: Path) -> tuple[Any, Any]:
 
 
 def _check_onnx_inputs(path: Path, inputs: list[Any]) -> None:
-    """Raise ModelError unless the inputs of a network are images (N, ...), maybe with
-    their sizes (N, 2).
+    """Check that a network takes images with 4 axes, perhaps with their sizes (N, 2).
+
+    Args:
+        path: path of the file, for the message.
+        inputs: inputs as onnxruntime describes them, with name, type and shape.
+
+    Raises:
+        ModelError: it takes something else.
     """
     image_shape = inputs[0].shape if inputs else []
     fixed_sizes = [size for size in image_shape if isinstance(size, int)]
@@ -523,8 +587,10 @@ def _check_onnx_inputs(path: Path, inputs: list[Any]) -> None:
 
 
 def _parse_image_size(text: str) -> list[int]:
-    """Parse (height, width) as YOLO's exporters write it, such as "[640, 640]"; empty
-    if it is no such text.
+    """Parse (height, width) in pixels from a text such as "[640, 640]".
+
+    YOLO's exporters write it so. The result is empty if the text has another form, or
+    if a size is 0.
     """
     match = re.fullmatch(r"\[(\d{1,5}), ?(\d{1,5})\]", text)
     size = [int(number) for number in match.groups()] if match else []

@@ -83,8 +83,9 @@ class EightBitInput(nn.Module):
 
 
 def list_required_inputs(network: nn.Module) -> list[str]:
-    """Return the names of the required inputs of a network; empty if Python does not
-    know them.
+    """Return the names of the inputs without a default of a network's `forward`.
+
+    The list is empty if the network is not written in Python.
     """
     if isinstance(network, torch.jit.ScriptModule):
         arguments = network.forward.schema.arguments[1:]  # type: ignore[attr-defined]
@@ -132,8 +133,11 @@ class WithState(nn.Module):
         self.training = False
 
     def forward(self, images: Tensor) -> Any:
-        """Return the policy's output for images (N, ...); each entry of the state is
-        (N, numbers).
+        """Return the policy's output for images.
+
+        Args:
+            images: (N, ...). Each entry of the state is repeated for every image, to
+                (N, numbers).
         """
         state = {
             name: images.new_tensor(numbers).expand(len(images), -1)

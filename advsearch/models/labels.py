@@ -105,9 +105,14 @@ def find_label_set(
 def find_similar_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str]]:
     """Find the classes whose names resemble a word, best first, then its synonyms.
 
-    Resemblance is that of `find_similar_names`; synonyms ("cup" for "mug") come from a
-    table of everyday things. A synonym is a better suggestion than a name that is only
-    spelled alike: with synonyms, names count only if one of them contains the word.
+    Names resemble a word if they are spelled alike (`find_similar_names`). Synonyms
+    ("cup" for "mug") come from a table of everyday things. A synonym is a better
+    suggestion than a name that is only spelled alike: if there are synonyms, names
+    count only if one of them contains the word.
+
+    Args:
+        word: what the user wrote.
+        labels: the model's label names in index order.
 
     Returns:
         Index and name of each class; the name is the part of the label that matched:
@@ -139,11 +144,11 @@ def find_similar_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str
 def _find_class(
     term: str, table: dict[str, list[int]], labels: Sequence[str], named: bool
 ) -> int:
-    """Return the index of the class of a term.
+    """Return the index of the class that a term names.
 
     Args:
         term: a name, or an index such as "#504".
-        table: indices by name.
+        table: indices of classes by name, from `_make_name_table`.
         labels: labels of the model.
         named: whether the labels are names; else they are placeholders ("class 0").
 
@@ -205,8 +210,9 @@ def _normalize_name(name: str) -> str:  # what is compared
 
 
 def _make_name_table(labels: Sequence[str]) -> dict[str, list[int]]:
-    """Return, for every full name and every synonym, the class indices that carry it,
-    ascending.
+    """Return the indices of the classes that have a name, for each name.
+
+    "tench, Tinca tinca" has three names: the full label and both parts of it.
     """
     table: dict[str, list[int]] = {}
     for index, label in enumerate(labels):
@@ -249,11 +255,17 @@ def read_labels(source: str | os.PathLike[str] | Sequence[str]) -> tuple[str, ..
 
 
 def parse_names(names: Any) -> tuple[str, ...] | None:
-    """Return the names of classes that a network states, in order, as YOLO's do in
-    `names` and in the metadata of their files.
+    """Return the names of classes that a network states, in index order.
 
-    They are untrusted: a mapping from 0, 1, ... to names, a list of names, or the text
-    of one; None for anything else.
+    YOLO networks state them in `names` and in the metadata of their files. Files are
+    not trusted, so that a text is parsed only if it is a flat mapping or list.
+
+    Args:
+        names: a mapping from 0, 1, ... to names, a list of names, or the text of one as
+            Python writes it.
+
+    Returns:
+        The names; None if they have another form.
     """
     if isinstance(names, str):
         if len(names) > MAX_METADATA_CHARACTERS or not _FLAT.fullmatch(names):
@@ -358,7 +370,13 @@ def _load_label_sets() -> dict[str, tuple[str, ...]]:
 def fit_labels(
     classes: int, labels: tuple[str, ...] | None, origin: LabelsOrigin, model: str
 ) -> tuple[str, ...]:
-    """Return the labels, or placeholders for None.
+    """Return the labels if there is one for each class, or placeholders for None.
+
+    Args:
+        classes: number of classes of the model.
+        labels: names in index order; None for placeholders ("class 0").
+        origin: where the labels come from, for the message.
+        model: name of the model, for the message.
 
     Raises:
         InputError: their number is not that of the model's classes; FileFormatError if
@@ -380,7 +398,12 @@ def fit_labels(
 def _order_by_index(name_by_index: dict[str, Any], where: str) -> list[Any]:
     """Return the values of a JSON object whose keys are the indices 0, 1, ...
 
-    `where` is the beginning of an error. Raises FileFormatError for other keys.
+    Args:
+        name_by_index: the object; its keys may be in any order.
+        where: what is read, with which the message begins.
+
+    Raises:
+        FileFormatError: the keys are others.
     """
     indices = list(map(str, range(len(name_by_index))))
     last_index = len(name_by_index) - 1
@@ -393,7 +416,11 @@ def _order_by_index(name_by_index: dict[str, Any], where: str) -> list[Any]:
 
 
 def _read_file(path: Path) -> tuple[str, ...]:
-    """Read label names from a JSON or text file; see `read_labels`."""
+    """Read label names from a JSON file, or from a text file with a name per line.
+
+    Raises:
+        FileFormatError: it cannot be read, or holds something else than names.
+    """
     where = f"label file {path}"
     try:
         text = read_text(path, "a label file", MAX_FILE_BYTES)
@@ -418,7 +445,12 @@ def _read_file(path: Path) -> tuple[str, ...]:
 def _parse_json_names(text: str, where: str) -> list[Any]:
     """Return the names in a JSON list, or in a JSON object from index to name.
 
-    `where` is the beginning of an error. Raises FileFormatError for anything else.
+    Args:
+        text: content of a label file.
+        where: what is read, with which the message begins.
+
+    Raises:
+        FileFormatError: it is anything else.
     """
     try:
         names = parse_json(text)
@@ -440,8 +472,12 @@ def _parse_json_names(text: str, where: str) -> list[Any]:
 def _check_names(
     names: Sequence[Any], kind: type[InputError], where: str
 ) -> tuple[str, ...]:
-    """Return label names without surrounding spaces; raise an error of a kind if one is
-    invalid.
+    """Return label names without surrounding spaces.
+
+    Args:
+        names: names in index order.
+        kind: class of the error that is raised if one is invalid.
+        where: where they come from, for the message.
     """
     if problem := _find_problem(names):
         raise kind(f"{where}: {problem}")
@@ -449,7 +485,7 @@ def _check_names(
 
 
 def _find_problem(names: Sequence[Any]) -> str:
-    """Return what is wrong with label names, "" if nothing is."""
+    """Return what is wrong with label names as a clause; "" if nothing is."""
     if not names:
         return "expected label names, got an empty list"
     for index, name in enumerate(names):

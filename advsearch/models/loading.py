@@ -106,7 +106,8 @@ def load_model(
         input_size: (height, width) in pixels, or one number; default 224.
         mean: one number, three, or ``"imagenet"``, ``"half"``, ``"clip"``, in units of
             `value_range`; default 0.
-        std: likewise; default 1. A preset given for one of `mean` and `std` sets both.
+        std: standard deviation in the same forms; default 1. The name of a preset for
+            `mean` or `std` sets both.
         value_range: (low, high), the values of black and white; default (0, 1).
         layout: ``"NCHW"`` (default) or ``"NHWC"``.
         channels: ``"RGB"`` (default) or ``"BGR"``.
@@ -115,7 +116,8 @@ def load_model(
             unless there is `read`.
         read: finds the output in what the network returns for a number of images, if
             it is not logits: a tensor (N, ...) or a list of N elements.
-        ask: ceilings and prices of a model behind an address (docs/addresses.md).
+        ask: limits and prices of a model behind an address (docs/addresses.md), such as
+            {"calls": 500}.
 
     Raises:
         UnknownNameError: `spec` is a name that means nothing; near matches are given.
@@ -138,7 +140,9 @@ def load_model(
         channels=channels,
         max_batch=max_batch,
     )
-    read = read or (task and task.reader)  # None for logits
+    # A function that the caller gives takes precedence over that of the task. None
+    # means that the output is logits.
+    read = read or (task and task.reader)
     names = None if labels is None else read_labels(labels)
     origin = find_labels_origin(labels)
     if names is not None and task and task.names_source:
@@ -163,7 +167,8 @@ def load_model(
             source = _add_training_arguments(source)
         _check_max_batch(max_batch)
         model = _probe_source(source, options, read, name, names, origin)
-    # Only then the text alone stands for the model, in a file of a run for example.
+    # A text stands for the model, in a file of a run for example, only if nothing but
+    # the text was given.
     is_named_alone = not options and labels is None and name is None
     if isinstance(spec, (str, os.PathLike)) and is_named_alone:
         return replace(model, spec=os.fspath(spec))
@@ -176,15 +181,20 @@ def _state_purpose(
     prompts: tuple[str, ...] | None,
     ask: Mapping[str, float] | None,
 ) -> Purpose:
-    """Return what a model is loaded for; arguments as for `load_model`, after reading.
+    """Return what a model is loaded for, which the loaders of some sources need.
 
-    Without a task it is classification.
+    Args:
+        task: task that reads the model; None for classification.
+        names: names of classes; None if the user gave none.
+        prompts: texts with ``{}`` that each name is put into; None for the default.
+        ask: limits and prices of a model behind an address, such as {"calls": 500}.
     """
     return Purpose(
         task=task.name if task else "classification",
         names=names,
         prompts=prompts,
-        # only tasks that read texts have these
+        # Only tasks that read answers in words have these two: the maximum length of an
+        # answer in tokens, and how many answers are asked for about each image.
         tokens=getattr(task, "tokens", 16),
         times=getattr(task, "times", 1),
         ask=ask or {},
@@ -197,8 +207,10 @@ def _drop_unset(**options: Any) -> dict[str, Any]:
 
 
 def _add_training_arguments(source: Source) -> Source:
-    """Return a source with the names and the image size that YOLO networks store, where
-    it states none.
+    """Return a source completed by what YOLO networks store of their training.
+
+    They have the names of classes in `names` and the image size in `args["imgsz"]`.
+    What the source itself states stays.
     """
     arguments = getattr(source.module, "args", None)
     size = arguments.get("imgsz") if isinstance(arguments, Mapping) else None
@@ -222,10 +234,15 @@ def _check_max_batch(max_batch: object) -> None:
 
 
 def _check_reads_text(source: Source | Model, spec: object) -> None:
-    """Raise InputError if a network reads no text, so that a prompt means nothing.
+    """Raise InputError if a prompt means nothing to a model.
 
-    Nor does it for a `Model` that the user gave, which is ready: then `source` is
-    `spec` itself.
+    It means nothing to a network that reads no text, nor to a `Model` that the user
+    passed, which is complete.
+
+    Args:
+        source: what was found for `spec`.
+        spec: what the user passed to `load_model`; it is `source` itself if that is a
+            `Model`.
     """
     if isinstance(source, Source):
         reads_text = source.reads_text
@@ -255,18 +272,20 @@ def _adapt_model(
     names: tuple[str, ...] | None,
     origin: LabelsOrigin,
 ) -> Model:
-    """Return a ready model with another name, other names of classes, or to be read.
+    """Return a complete model with another name, other names of classes, or reader.
 
     Args:
         model: the model, whose preprocessing stays.
-        options: options of `load_model` that are set, of which there may be none.
-        read: reads the network's output; None for what the model has.
+        options: options of the preprocessing that the user set. Any of them is an
+            error, as the model has its preprocessing.
+        read: finds the output in what the network returns; None for the model's own
+            reader.
         name: name of the model; None for its own.
         names: names of classes; None for its own.
-        origin: origin of the names, for messages.
+        origin: where the names come from, for messages.
 
     Raises:
-        InputError: there are options, or another number of names than of classes.
+        InputError: there are options, or the number of names is not that of classes.
     """
     if options:
         raise InputError(
@@ -300,10 +319,10 @@ def _probe_source(
     Args:
         source: source of the network.
         options: options that are set.
-        read: reads the network's output; None for logits.
+        read: finds the output in what the network returns; None for logits.
         name: name of the model; None for that of the source.
         names: names of classes; None for those of the source.
-        origin: origin of the names, for messages.
+        origin: where the names come from, for messages.
     """
     min_batch, max_batch = source.batch_limits
     requested_max_batch = options.get("max_batch")
@@ -328,16 +347,27 @@ def _probe_source(
 def _adapt_to_images_alone(
     source: Source, preprocessing: Preprocessing
 ) -> Callable[[Tensor], Any]:
-    """Return the network of a source as one that is called with images alone."""
+    """Return the network of a source as one that is called with images alone.
+
+    Some networks also take the size of the images, which is then passed along. A
+    network with a state, such as a speed, is called with that already (`WithState`).
+
+    Args:
+        source: source of the network.
+        preprocessing: states the layout of the images.
+    """
     if source.size_type is None or isinstance(source.module, WithState):
         return source.module
     return WithImageSize(source.module, source.size_type, preprocessing.layout)
 
 
 def parse_code_reference(spec: str) -> str | None:
-    """Return the "package.module:attribute" that a model's name imports, None if it
-    imports nothing.
+    """Return the "package.module:attribute" that a model's name imports.
+
+    None if it imports nothing: a source such as "timm:resnet18", a path, or
+    "reference". A file of weights behind an @ is left out.
     """
+    # two names of Python with dots and a colon between them, perhaps with weights
     text = spec.strip()
     if text.partition(":")[0].lower() in SOURCES or not re.fullmatch(
         r"[^\W\d][\w.]*:[^\W\d][\w.]*(@.+)?", text
@@ -347,7 +377,16 @@ def parse_code_reference(spec: str) -> str | None:
 
 
 def _find_source(spec: object, purpose: Purpose) -> Source | Model:
-    """Find the source of a model, or the model itself; see `load_model`."""
+    """Find the source of a model, or the model itself.
+
+    Args:
+        spec: what the user passed to `load_model`: a name, a path, a network, or a
+            `Model`.
+        purpose: what the model is loaded for.
+
+    Raises:
+        InputError: `spec` is something else, or a name that means nothing.
+    """
     if isinstance(spec, Model):
         return spec
     if isinstance(spec, nn.Module):
@@ -367,7 +406,19 @@ def _find_source(spec: object, purpose: Purpose) -> Source | Model:
 
 
 def _find_named_source(text: str, purpose: Purpose) -> Source | Model:
-    """Find the source of a model that a text names, or the model itself."""
+    """Find the source of a model that a text names, or the model itself.
+
+    The forms are tried in this order: the bundled "reference", "SOURCE:NAME",
+    "package.module:callable", a path.
+
+    Args:
+        text: the name, perhaps with "@weights.safetensors" behind it.
+        purpose: what the model is loaded for, such as the task.
+
+    Raises:
+        UnknownNameError: the text has none of these forms.
+        InputError: it names a Python file instead of a module ("nets.py:build").
+    """
     network, weights = split_weights(text)
     if network == "reference":
         return reference.load(weights=weights)
@@ -380,6 +431,7 @@ def _find_named_source(text: str, purpose: Purpose) -> Source | Model:
             f"model {text!r}: write {text.replace('.py:', ':')!r}, without the '.py'"
         )
     if parse_code_reference(text) is not None:
+        # the sources are only for a message, about a misspelt source in the text
         return load_callable(text, SOURCES)
     is_path = (
         Path(text).suffix.lower() in files.SUFFIXES
@@ -393,7 +445,11 @@ def _find_named_source(text: str, purpose: Purpose) -> Source | Model:
 
 
 def _make_unknown_error(text: str) -> UnknownNameError:
-    """Return the error for a model's name that means nothing, with similar names."""
+    """Return the error for a model's name that means nothing, with similar names.
+
+    A name without a colon, such as "resnet18", may be that of a library's network. Then
+    the message states how it is written with its library.
+    """
     # what stands after the colon; NAME for other sources
     forms = {
         "hf": "hf:REPOSITORY",
@@ -413,8 +469,14 @@ def _make_unknown_error(text: str) -> UnknownNameError:
 
 
 def _find_library_source(network: nn.Module, purpose: Purpose) -> Source | None:
-    """Return the source of a network of transformers or timm; None for any other
-    network.
+    """Return the source of a network that a known library has built, else None.
+
+    Libraries such as transformers and timm describe their networks: preprocessing and
+    names of classes follow from that description.
+
+    Args:
+        network: network that the user passed.
+        purpose: what the model is loaded for, such as the task.
     """
     for library, recognizer in list_built_ins("recognizer").items():
         if library in sys.modules:  # else no network of it can exist
@@ -428,7 +490,14 @@ def _find_library_source(network: nn.Module, purpose: Purpose) -> Source | None:
 
 
 def _check_processor(source: Source, options: Mapping[str, Any]) -> None:
-    """Raise InputError for options that repeat what a source's processor does."""
+    """Raise InputError for options that repeat what a source's processor does.
+
+    A processor is the preprocessing that a library supplies with a network.
+
+    Args:
+        source: source of the network.
+        options: options of `load_model` that the user set.
+    """
     if not source.processor:
         return
     for key in ("mean", "std", "value_range", "channels"):
@@ -451,7 +520,10 @@ def _parse_choice(key: str, value: object, choices: tuple[str, ...]) -> str:
 
 
 def _make_preprocessing(source: Source, options: Mapping[str, Any]) -> Preprocessing:
-    """Create the preprocessing from options, else from what the source states.
+    """Create the preprocessing of a network.
+
+    An option of the user takes precedence over what the source states, and that over
+    the defaults.
 
     Args:
         source: source of the network.
@@ -505,8 +577,14 @@ def _parse_input_size(value: Any) -> tuple[int, int]:
 def _parse_normalization(options: Mapping[str, Any]) -> dict[str, Any]:
     """Parse the options `mean` and `std`, three numbers each.
 
-    The name of a preset ("imagenet") for one of them sets both, unless the user gave
-    the other one too.
+    The name of a preset, such as "imagenet", for one of them sets both, unless the user
+    stated the other one too.
+
+    Args:
+        options: options of `load_model` that the user set.
+
+    Returns:
+        Fields of `Preprocessing`, as far as the options determine them.
     """
     fields: dict[str, Any] = {}
     for key in ("mean", "std"):
@@ -537,8 +615,12 @@ def _parse_value_range(value: Any) -> tuple[float, float]:
 def _check_eight_bit(
     name: str, fields: Mapping[str, Any], options: Mapping[str, object]
 ) -> None:
-    """Raise InputError if options contradict a network that takes integers from 0 to
-    255.
+    """Raise InputError if options contradict a network that takes uint8 images.
+
+    Args:
+        name: name of the model, for the message.
+        fields: fields of the preprocessing, `value_range` among them.
+        options: options that the user set.
     """
     wrong = [key for key in ("mean", "std") if key in options]
     if fields["value_range"] != (0.0, 255.0):
@@ -558,8 +640,8 @@ def _parse_numbers(
     Args:
         key: name of the option, for messages.
         value: to parse.
-        counts: how many there may be.
-        expected: what is expected, for messages.
+        counts: allowed counts of numbers, such as (1, 3).
+        expected: description of what is expected, for messages.
 
     Raises:
         InputError: they are no numbers, or their count is none of `counts`.

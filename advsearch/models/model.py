@@ -65,11 +65,13 @@ class _Recomputed(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[None, None, Tensor]:
         """Return the gradient by the images, for the gradients of all returned tensors.
 
-        The function is computed again, this time with a graph. Its other arguments have
-        no gradient (None).
+        The function is computed again, this time with a graph. As autograd requires,
+        there is a value for each argument of `forward`: None for `function` and
+        `structures`, which are no tensors, and the gradient for `images`.
         """
         (images,) = ctx.saved_tensors
-        # Gradients are on if this gradient is to be differentiated once more.
+        # Autograd switches gradients on in here only if the caller wants a gradient of
+        # this gradient (`create_graph=True`).
         create_graph = torch.is_grad_enabled()
         with torch.enable_grad():
             images = images if create_graph else images.detach().requires_grad_()
@@ -97,11 +99,13 @@ class _Recomputed(torch.autograd.Function):
 def compute_checkpointed(function: Callable[[Tensor], Any], images: Tensor) -> Any:
     """Return `function(images)` without storing activations.
 
-    It returns a tensor, or lists and mappings of tensors.
+    The gradient computes the function a second time. So the activations of one batch
+    are in memory at a time, and not those of all (Chen et al. 2016, *Training Deep Nets
+    with Sublinear Memory Cost*, section 3).
 
-    The gradient computes the function a second time, and takes the memory of one batch
-    instead of that of all (Chen et al. 2016, *Training Deep Nets with Sublinear Memory
-    Cost*, section 3).
+    Args:
+        function: function that returns a tensor, or lists and mappings of tensors.
+        images: (N, H, W, 3).
     """
     # `apply` returns tensors only, and appends the structure that they belong to
     structures: list[Any] = []
@@ -206,8 +210,13 @@ class Preprocessing:
     resizes: bool = True
 
     def __call__(self, images: Tensor) -> Tensor:
-        """Preprocess images (N, H, W, 3), display-referred sRGB in [0, 1], any floating
-        dtype; differentiable.
+        """Preprocess images for the network; differentiable.
+
+        Args:
+            images: (N, H, W, 3) display-referred sRGB in [0, 1], of any floating dtype.
+
+        Returns:
+            (N, 3, H, W), or (N, H, W, 3) for the layout NHWC, at `input_size`.
         """
         x = images.permute(0, 3, 1, 2)
         if self.resizes and (x.shape[2], x.shape[3]) != self.input_size:
@@ -219,7 +228,8 @@ class Preprocessing:
                 antialias=True,
             )
         if self.processor:
-            x = self.processor(x.clone())  # which may write into it
+            # a copy, as the processor may write into its argument
+            x = self.processor(x.clone())
         else:
             x = self._normalize(x)
         if self.layout == "NCHW":
@@ -227,7 +237,11 @@ class Preprocessing:
         return x.permute(0, 2, 3, 1).contiguous()
 
     def _normalize(self, x: Tensor) -> Tensor:
-        """Apply steps 2 to 4 to images (N, 3, H, W), as one gain and one offset."""
+        """Apply steps 2 to 4 of the preprocessing to images (N, 3, H, W).
+
+        Range and normalization are linear, so that one gain and one offset for each
+        channel do both.
+        """
         # (low + (high - low) x - mean) / std = gain x + offset
         low, high = self.value_range
         gain = [(high - low) / std for std in self.std]
@@ -335,7 +349,10 @@ class Model:
         recomputes = self._must_recompute(images)
 
         def return_to_device(output: Tensor) -> Tensor:
-            # A copy, because a network may write into the same memory again.
+            """Return an output on the device of the images.
+
+            It is a copy, because a network may write into the same memory again.
+            """
             returned = output.to(images.device)
             is_same_memory = returned is output and not output.requires_grad
             return returned.clone() if is_same_memory else returned
@@ -351,7 +368,7 @@ class Model:
         output = outputs[0] if len(outputs) == 1 else join_outputs(outputs)
         if self.cameras == 1:
             return output
-        # of each rig, a tuple of the outputs for its images
+        # one tuple for each rig, with the output for each of its cameras
         image_outputs = [output[index : index + 1] for index in range(len(output))]
         return [
             tuple(image_outputs[start : start + self.cameras])
@@ -359,8 +376,11 @@ class Model:
         ]
 
     def _must_recompute(self, images: Tensor) -> bool:
-        """Return whether the activations of images (N, H, W, 3) of rigs would take too
-        much memory, so that the gradient computes them again.
+        """Return whether the gradient must compute activations again to save memory.
+
+        It must if the images (N, H, W, 3) come from rigs, there are more than
+        `MAX_STORED_IMAGES`, and a gradient is wanted. A network that takes all images
+        of a rig at once cannot be split so.
         """
         return (
             self.cameras > 1
@@ -373,10 +393,14 @@ class Model:
     def _find_max_batch(self, *, recomputes: bool) -> int:
         """Return the maximum number of images in a batch.
 
-        The images of a rig stay in one batch, if they fit into it.
+        The images of a rig stay in one batch, if they fit into it. With `recomputes`,
+        batches are at most `MAX_STORED_IMAGES`, as the activations of one batch are in
+        memory at a time.
         """
         max_batch = self.batch_limits[1]
         if self.cameras > 1:
+            # The largest multiple of the number of cameras; 0 if one rig is too large.
+            # Then the batch has as many images as are allowed.
             full_rigs = max_batch - max_batch % self.cameras
             max_batch = max(full_rigs, min(max_batch, self.cameras))
         return min(max_batch, MAX_STORED_IMAGES) if recomputes else max_batch
@@ -385,7 +409,7 @@ class Model:
         """Return a copy of the network, to train it further.
 
         Raises:
-            ModelError: there is none, as of an exported program.
+            ModelError: there is none, since an exported program cannot be trained.
         """
         if self.make_trainable is not None:
             return self.make_trainable()
@@ -415,12 +439,19 @@ class Model:
         return find_label_set(text, self.labels, named=self.named)
 
     def prepare(self, images: Tensor) -> Tensor:
-        """Preprocess images (N, H, W, 3), at most a batch of them, for the network.
+        """Preprocess a batch of images for the network.
 
-        They get the network's dtype and device. Too small a batch is padded with copies
-        of the last image. The result is a copy of the images: the network may write
-        into it.
+        They get the network's dtype and device. Copies of the last image fill a batch
+        that is smaller than the network needs.
+
+        Args:
+            images: (N, H, W, 3), where N is at most the maximum batch size.
+
+        Returns:
+            What the network takes, with at least the minimum batch size. It shares no
+            memory with the images, as the network may write into it.
         """
+        # how many images the batch is too small by
         missing = self.batch_limits[0] - len(images)
         batch = images
         if missing > 0:
@@ -432,6 +463,10 @@ class Model:
 
     def run_network(self, x: Tensor, *, raw: bool = False) -> Any:
         """Run the network on a batch that `prepare` returned.
+
+        Args:
+            x: the batch.
+            raw: whether to return what the network itself returns.
 
         Returns:
             The output; with `raw`, what the network itself returns.
@@ -461,6 +496,7 @@ def copy_sharing_weights(module: nn.Module) -> nn.Module:
     """
 
     def make_differentiable(weights: torch.Tensor) -> torch.Tensor:
+        """Return weights through which autograd can differentiate."""
         return weights.clone() if weights.is_inference() else weights
 
     # `deepcopy` takes the objects in here, by id, in place of copies of them.
@@ -496,7 +532,16 @@ class DetachMode(TorchFunctionMode):
     def __torch_function__(
         self, function: Any, types: Any, args: Any = (), kwargs: Any = None
     ) -> Any:
-        """Call torch's function, or return what was to be detached as it is."""
+        """Call a function of torch, or leave out a `detach` that is to be ignored.
+
+        torch calls this in place of each of its functions while the mode is on.
+
+        Args:
+            function: function of torch that the network calls.
+            types: types of its arguments, which are not needed.
+            args: its positional arguments; the first of `detach` is the tensor.
+            kwargs: its keyword arguments.
+        """
         if function in DETACHING:
             self.has_detached = self.has_detached or args[0].requires_grad
             if self.ignored:
@@ -505,7 +550,15 @@ class DetachMode(TorchFunctionMode):
 
 
 def check_images(images: Tensor) -> Tensor:
-    """Return images as (N, H, W, 3); InputError for what is not an image in [0, 1]."""
+    """Return images as a batch (N, H, W, 3).
+
+    Args:
+        images: (H, W, 3) or (N, H, W, 3), floating.
+
+    Raises:
+        InputError: another type, shape or dtype, or values that are not in [0, 1] up to
+            `RANGE_TOLERANCE`.
+    """
     expected = (
         "images: expected a floating-point tensor (H, W, 3) or (N, H, W, 3) in [0, 1]"
     )
@@ -546,7 +599,7 @@ def read_output(read: Read, returned: Any, count: int, name: str) -> Any:
     try:
         output = read(returned, count)
     except ValueError as error:
-        # `read` is usually the method of a task.
+        # `read` is usually a method of a task, whose name is then known for advice.
         task = getattr(getattr(read, "__self__", None), "name", None)
         raise ModelError(
             f"model {name}: {error}, got {describe_output(returned)}; "
@@ -562,7 +615,12 @@ def read_output(read: Read, returned: Any, count: int, name: str) -> Any:
 
 
 def _advise_on_output(returned: Any, task: str | None) -> str:
-    """Return what to do about an output that a task, by its name, cannot read."""
+    """Return what to do about an output that a task cannot read.
+
+    Args:
+        returned: what the network returned.
+        task: name of the task; None if it is not known.
+    """
     advice = _advise_on_missing_scores(returned)
     if advice:
         return advice
@@ -588,10 +646,14 @@ def join_outputs(outputs: Sequence[Any]) -> Any:
 
 
 def map_tensors(output: Any, function: Callable[[Tensor], Tensor]) -> Any:
-    """Apply a function to every tensor in an output, in plain dicts and lists.
+    """Apply a function to every tensor in an output.
 
-    torch's trees do not know subclasses of these that are not registered, such as a
-    library's outputs.
+    The result has plain dicts and lists. `torch.utils._pytree` would not do: it takes a
+    subclass of dict that is not registered, such as a library's output, for a leaf.
+
+    Args:
+        output: a tensor, or mappings and sequences of tensors and other values.
+        function: function of a tensor; other values stay as they are.
     """
     if isinstance(output, Tensor):
         return function(output)
@@ -629,7 +691,7 @@ def read_logits(output: Any, count: int, classes: int | None, name: str) -> Tens
     Raises:
         ModelError: there is no such tensor, or its shape or type is not that of logits.
     """
-    # The usual case, first because it is quick.
+    # The usual case is a tensor of the right shape. It comes first to be quick.
     if (
         isinstance(output, Tensor)
         and output.is_floating_point()
@@ -701,7 +763,12 @@ def mend_batch_norms(output: Any) -> None:
     def with_strides(
         strides: tuple[int, ...], gradients: tuple[Tensor | None, ...]
     ) -> tuple[Tensor | None, ...]:
-        """Return gradients of which the first has these strides, copied if need be."""
+        """Return the gradients of a batch norm, the first with these strides.
+
+        Args:
+            strides: strides of the input of the batch norm.
+            gradients: gradients by its outputs; the first is that of the image.
+        """
         gradient, *rest = gradients
         if gradient is None or gradient.stride() == strides:
             return gradients
@@ -710,7 +777,7 @@ def mend_batch_norms(output: Any) -> None:
         )
         return strided.copy_(gradient), *rest
 
-    # walk through the graph of the output, and hook every batch norm in it
+    # Walk back through the graph of the output, and hook every batch norm in it.
     pending: list[Any] = [tensor.grad_fn for tensor in list_tensors(output)]
     visited = {None}
     while pending:
@@ -720,6 +787,7 @@ def mend_batch_norms(output: Any) -> None:
         visited.add(node)
         pending.extend(next_node for next_node, _ in node.next_functions)
         if node.name().startswith("NativeBatchNorm"):
+            # `empty_like` keeps the order of axes; "meta" tensors take no memory.
             strides = torch.empty_like(node._saved_input, device="meta").stride()
             node.register_prehook(partial(with_strides, strides))
 
@@ -745,8 +813,12 @@ def _find_scores(returned: Any) -> Any:
 
 
 def _advise_on_missing_scores(returned: Any) -> str:
-    """Return what to do about an output that has losses or class indices instead of
-    scores; "" for any other output.
+    """Return what to do about an output without scores; "" for any other output.
+
+    Such an output has losses, as in training, or the indices of chosen classes.
+
+    Args:
+        returned: what the network returned.
     """
     values = list(returned.values()) if isinstance(returned, Mapping) else [returned]
     are_losses = all(isinstance(value, Tensor) and value.ndim == 0 for value in values)
@@ -769,7 +841,14 @@ def _advise_on_missing_scores(returned: Any) -> str:
 
 
 def _guess_task(returned: Any) -> str | None:
-    """Return the task whose networks return such an output; None if there is none."""
+    """Guess the task of a network from its output, for advice in a message.
+
+    Args:
+        returned: what the network returned.
+
+    Returns:
+        Name of a task in `OUTPUTS_BY_TASK`; None if nothing suggests one.
+    """
     if _looks_like_boxes(returned):
         return "detection"
     if isinstance(returned, Mapping) and any(
@@ -786,6 +865,7 @@ def _guess_task(returned: Any) -> str | None:
     scores = _find_scores(returned)
     if not isinstance(scores, Tensor):
         return None
+    # scores are (N, classes), or for each pixel (N, classes, H, W)
     task_of_dimensions = {2: "classification", 4: "segmentation"}
     return task_of_dimensions.get(scores.dim())
 
@@ -793,9 +873,9 @@ def _guess_task(returned: Any) -> str | None:
 def _looks_like_boxes(returned: Any) -> bool:
     """Return whether an output of a network looks like boxes of a detector.
 
-    Detectors return one of these: a tuple that begins with boxes (N, K, 4) and goes on
-    with scores; or a mapping or an object with a field "boxes" or "pred_boxes", by
-    itself or for each image, as the elements of a list.
+    Detectors return one of these: a tuple that begins with boxes (N, K, 4), followed by
+    scores; a mapping or an object with a field "boxes" or "pred_boxes"; or a list of
+    such mappings, one for each image.
     """
     is_sequence = isinstance(returned, (tuple, list))
     first = returned[0] if is_sequence and returned else returned
@@ -814,7 +894,7 @@ def _advise_other_task(name: str) -> str:
 
 
 def _advise_on_shape(shape: tuple[int, ...]) -> str:
-    """Return what to do about an output whose shape is not that of logits."""
+    """Return what to do about an output whose shape is not (N, classes)."""
     if len(shape) == 4:
         return (
             f"{_advise_other_task('segmentation')}. If these are a classifier's "

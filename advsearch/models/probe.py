@@ -83,17 +83,17 @@ MAX_PIXELS = 1 << 26
 def probe(
     model: Model, labels: tuple[str, ...] | None, labels_origin: LabelsOrigin
 ) -> Model:
-    """Run a model on test images, and set what its outputs show.
+    """Run a model on test images, and return it with what its outputs show.
 
-    That is `labels`, `probabilities`, `differentiable` and `batch_limits`. The images
-    are a gray one and one of uniform noise. The idea of looking for probabilities,
-    randomness and missing gradients before an attack is AutoAttack's (Croce and Hein
-    2020, the flags of its reference implementation).
+    The fields `labels`, `probabilities`, `differentiable` and `batch_limits` are set.
+    The images are a gray one and one of uniform noise. The idea of looking for
+    probabilities, randomness and missing gradients before an attack is AutoAttack's
+    (Croce and Hein 2020, the flags of its reference implementation).
 
     Args:
-        model: without labels.
-        labels: one for each class; None for placeholders ("class 0").
-        labels_origin: where they come from, for messages.
+        model: the model, without labels.
+        labels: one name for each class; None for placeholders ("class 0").
+        labels_origin: where the labels come from, for messages.
 
     Raises:
         ModelError: it takes more than `MAX_PIXELS`, cannot be run on such an image,
@@ -120,7 +120,7 @@ def probe(
         names = labels or ()
         probabilities = False
         _warn_of_pixel_probabilities(model, noise)
-    # The first row is that of the gray image, too.
+    # Both are the output for the gray image: a network with dropout differs.
     repeatable = _are_equal(model, rows[:1], repeated_rows)
     if repeatable and returns_logits and not probabilities:
         _warn_of_odd_scores(model, rows)
@@ -157,7 +157,12 @@ def _check_batch_size(model: Model) -> None:
 
 
 def _check_finite(model: Model, rows: Tensor) -> None:
-    """Raise ModelError if the outputs for a gray image and noise are not finite."""
+    """Raise ModelError if outputs are not finite.
+
+    Args:
+        model: model that is probed.
+        rows: output for a gray image, then that for noise.
+    """
     if bool(torch.isfinite(rows).all()):
         return
     image = "grey" if not bool(torch.isfinite(rows[0]).all()) else "noise"
@@ -211,17 +216,19 @@ def _warn_of_odd_scores(model: Model, rows: Tensor) -> None:
 
 
 def _run(model: Model, images: Tensor) -> Tensor:
-    """Run a network on images (N, H, W, 3), and return rows of its raw output.
+    """Run a network on images (N, H, W, 3), and return numbers for each to compare.
 
-    They are logits (N, classes), float32 on the CPU. An output of another kind is
-    summarized by three numbers of each image, (N, 3): how many numbers it has, their
-    sum, and the sum of their absolute values.
+    For a classifier these are its raw scores (N, classes), float32 on the CPU. Any
+    other output, such as boxes, may differ in size from image to image. So it is
+    summarized by three numbers, (N, 3): how many numbers it has, their sum, and the sum
+    of their absolute values.
     """
     if model.read is None:
         returned, count = _run_network(model, images)
         return read_logits(returned, count, None, model.name)[: len(images)].cpu()
     rows = []
     for output in _run_and_read(model, images):
+        # an empty tensor first, as `cat` needs one and an output may have none
         tensors = [torch.zeros(0, device="cpu")]
         tensors += [tensor.float().flatten().cpu() for tensor in list_tensors(output)]
         values = torch.cat(tensors)
@@ -231,8 +238,16 @@ def _run(model: Model, images: Tensor) -> Tensor:
 
 
 def _run_and_read(model: Model, images: Tensor) -> Any:
-    """Run a network that does not return logits on images (N, H, W, 3), and return the
-    output for each as the task reads it.
+    """Run a network, and return its output as the task reads it.
+
+    The network is one that does not return logits.
+
+    Args:
+        model: model that is probed.
+        images: (N, H, W, 3).
+
+    Returns:
+        The output for each of the N images, a tensor (N, ...) or a list.
     """
     assert model.read is not None
     returned, batch_size = _run_network(model, images)
@@ -241,8 +256,9 @@ def _run_and_read(model: Model, images: Tensor) -> Any:
 
 
 def _run_network(model: Model, images: Tensor) -> tuple[Any, int]:
-    """Return what the network returns for images (N, H, W, 3), and the size of its
-    batch, which may be larger.
+    """Return what a network returns for images (N, H, W, 3), and its batch size.
+
+    The batch is larger than N if the network needs a larger one.
     """
     x = model.prepare(images)
     with torch.set_grad_enabled(torch.is_grad_enabled()):
@@ -250,14 +266,18 @@ def _run_network(model: Model, images: Tensor) -> tuple[Any, int]:
 
 
 def _call_guarded(model: Model, call: Callable[[], Any]) -> Any:
-    """Call a foreign network; whatever it raises becomes a ModelError with advice.
+    """Call a user's network, and turn whatever it raises into a ModelError with advice.
 
-    A program has a deadline, for nothing else ends it; the user's own code is ended by
-    Ctrl-C.
+    A program from a file has a deadline, since it may never end and Ctrl-C does not
+    stop it. The user's own Python code has none, as Ctrl-C ends it.
+
+    Args:
+        model: the model, for messages.
+        call: runs the network.
     """
     network = _unwrap(model.module)
     try:
-        stop = getattr(network, "stop", None)  # a program that can be stopped has it
+        stop = getattr(network, "stop", None)  # ends a program, such as `OnnxNetwork`
         if stop or isinstance(network, PROGRAMS):
             return run_within_limits(call, stop)
         return call()
@@ -320,8 +340,14 @@ LABEL_ARGUMENTS = {
 
 
 def _describe_other_inputs(network: object, error: str) -> str:
-    """Describe what a network that raised an error needs other than images; "" if that
-    is not known.
+    """Describe what a network that raised an error needs other than images.
+
+    Args:
+        network: the user's network.
+        error: text of the error, which may name a missing argument.
+
+    Returns:
+        A clause to follow the model's name; "" if nothing is known.
     """
     if not isinstance(network, nn.Module):
         return ""
@@ -343,8 +369,13 @@ def _describe_other_inputs(network: object, error: str) -> str:
 def _list_missing_inputs(network: nn.Module, error: str) -> list[str]:
     """Return the names of the inputs that a network lacks if it is called with images.
 
-    They are required; or labels of training that its error names: they have a default,
-    and yet a network may need them.
+    These are arguments without a default. Arguments for training, such as `targets`,
+    often have the default None although the network then fails: they count if the text
+    of the error names them.
+
+    Args:
+        network: the user's network.
+        error: text of the error that it raised.
     """
     try:
         # the first one is the images
@@ -375,9 +406,17 @@ def _are_probabilities(rows: Tensor, tolerance: float = PROBABILITY_TOLERANCE) -
 def _describe_odd_scores(model: Model, rows: Tensor) -> str:
     """Describe rows of scores (N, classes) that are neither logits nor probabilities.
 
-    "" for others. Scores in [0, 1] may also be means of the image, or small logits as
-    of an untrained network. So they are computed for two more kinds of images: means
-    are 0 for a black one, and logits leave [0, 1] for colors far outside of it.
+    Scores in [0, 1] that do not sum to 1 may come from a sigmoid. They may also be
+    means of the image, or the small logits of an untrained network. Two more kinds of
+    images tell these apart: means are 0 for a black image, and logits leave [0, 1] for
+    colors far outside of it.
+
+    Args:
+        model: model that is probed.
+        rows: (N, classes) scores for the images so far.
+
+    Returns:
+        A description such as "costs"; "" if the rows look like logits.
     """
     is_non_negative = float(rows.min()) >= 0.0
     if is_non_negative and float(rows.max()) <= 1.0:
@@ -396,7 +435,7 @@ def _describe_odd_scores(model: Model, rows: Tensor) -> str:
         return (
             "scores in [0, 1] that do not sum to 1, as after a sigmoid for each class"
         )
-    # of minus log-probabilities, exp(-x) sums to 1
+    # If x are minus the logarithms of probabilities, exp(-x) sums to 1.
     sum_error = (torch.exp(-rows).sum(dim=1) - 1.0).abs()
     if is_non_negative and bool((sum_error < PROBABILITY_TOLERANCE).all()):
         return (
@@ -408,9 +447,14 @@ def _describe_odd_scores(model: Model, rows: Tensor) -> str:
 def _check_range(model: Model, images: Tensor) -> None:
     """Warn if a network seems to be made for colors from 0 to 255.
 
-    That is, if its outputs hardly follow images (3, H, W, 3) that are black, white and
-    noise, but do so, at the same size, with these colors. A network in Python that
-    returns no logits is not checked: if it is untrained, it looks the same.
+    With colors from 0 to 1 all images look black to such a network. So its outputs
+    hardly differ between unlike images, but they do with colors from 0 to 255, and are
+    of the same magnitude. A network in Python that returns no logits is not checked,
+    since an untrained one looks the same.
+
+    Args:
+        model: model that is probed.
+        images: (3, H, W, 3) a black, a white and a random image.
     """
     network = _unwrap(model.module)
     is_program = isinstance(network, PROGRAMS) or hasattr(network, "stop")
@@ -443,8 +487,9 @@ def _check_range(model: Model, images: Tensor) -> None:
 
 
 def _is_range_declared(model: Model) -> bool:
-    """Return whether the user or a library has set what depends on the range of colors:
-    then the range is known, too.
+    """Return whether the user or a library has stated how colors are normalized.
+
+    Then the range of colors is known, and need not be guessed.
     """
     preprocessing = model.preprocessing
     return (
@@ -464,9 +509,9 @@ def _follows_images(outputs: Tensor) -> bool:
 def _collect_numbers(model: Model, images: Tensor) -> Tensor | None:
     """Return the numbers (K, n) that a network returns for K images, one by one.
 
-    Scores in [0, 1] become logits, which do not saturate. None if the network refuses
-    an image, there are no numbers, they are not finite, or images have different counts
-    of them.
+    Scores in [0, 1] become logits, since scores near 0 or 1 hardly change. The result
+    is None if the network rejects an image, returns no numbers or not finite ones, or
+    returns different counts of numbers for different images.
     """
     rows = []
     for image in images:
@@ -491,10 +536,13 @@ def _collect_numbers(model: Model, images: Tensor) -> Tensor | None:
 
 
 def _compute_relative_change(outputs: Tensor) -> float:
-    """Return the median, over the n numbers of outputs (K, n), of their relative
-    change.
+    """Return how much outputs change between K images, relative to their size.
 
-    That is the range over the K outputs, divided by the largest absolute value.
+    For each of n numbers this is its range over the images, divided by its largest
+    absolute value. The result is the median over the numbers.
+
+    Args:
+        outputs: (K, n).
     """
     change = outputs.amax(dim=0) - outputs.amin(dim=0)
     size = outputs.abs().amax(dim=0).clamp_min(torch.finfo(torch.float32).tiny)
@@ -511,7 +559,10 @@ def _are_equal(model: Model, rows: Tensor, repeated_rows: Tensor) -> bool:
 def _find_batch_limits(
     model: Model, pair: Tensor, rows: Tensor | None
 ) -> tuple[int, int]:
-    """Return the minimum and maximum batch size, from a batch of two images.
+    """Return the minimum and maximum batch size, after running a batch of two images.
+
+    A network that fails on two images takes one at a time. Warns if an image has
+    another output in a batch than by itself.
 
     Args:
         model: model that is probed.
@@ -542,9 +593,15 @@ def _find_batch_limits(
 def _probe_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
     """Return a model with `differentiable` and `attached` set.
 
-    If the network detaches tensors, and its outputs are repeatable, the gradient is
-    tried that ignores it (`_try_attached`). A detector that finds nothing in noise
-    counts as differentiable.
+    If the network detaches tensors, and its outputs are repeatable, the gradient that
+    ignores this is tried as well (`_try_attached`). A detector that finds nothing in
+    noise counts as differentiable.
+
+    Args:
+        model: model that is probed.
+        images: (N, H, W, 3) noise.
+        repeatable: whether the network returns the same for the same image; only then
+            can changes of outputs be compared with a gradient.
 
     Warns:
         ModelWarning: no gradient reaches the image, or outputs do not follow it.
@@ -600,10 +657,13 @@ class _FirstGradient(NamedTuple):
 def _compute_first_gradient(
     model: Model, images: Tensor, repeatable: bool
 ) -> _FirstGradient:
-    """Compute the gradient of a network by images (N, H, W, 3).
+    """Compute the gradient of a network's outputs by images (N, H, W, 3).
 
-    It is zero where the network detaches all that has one, and its outputs are
-    repeatable, so that this can be mended; otherwise a RuntimeError is raised.
+    If the network detaches everything, autograd finds no graph. Then the gradient is
+    zero if outputs are repeatable, as ignoring `detach` may help.
+
+    Raises:
+        RuntimeError: there is no gradient for another reason.
     """
     with DetachMode() as detaching:
         try:
@@ -621,10 +681,20 @@ def _compute_first_gradient(
 def _try_attached(
     model: Model, images: Tensor, gradient: Tensor
 ) -> tuple[Model, Tensor]:
-    """Return the model that ignores `detach`, with its gradient, if that predicts
-    changes of outputs better than the network's own gradient; else the model as it is.
+    """Return the model that ignores `detach`, if its gradient is the better one.
 
-    A network that rounds behind a `detach` keeps its own: the other one is zero.
+    Both gradients predict how outputs change over a small step, and the measured change
+    decides. The step follows the sign of their difference, where they disagree most. A
+    network that rounds behind a `detach`, with a straight-through gradient, keeps its
+    own gradient, as ignoring `detach` makes it zero.
+
+    Args:
+        model: model that is probed.
+        images: (N, H, W, 3) noise.
+        gradient: (N, H, W, 3) the network's own gradient.
+
+    Returns:
+        The model to use, and its gradient (N, H, W, 3).
     """
     attached = dataclasses.replace(model, attached=True)
     # A network may detach what must have no gradient, such as for numpy, and then
@@ -645,10 +715,14 @@ def _try_attached(
 
 
 def _compute_gradient(model: Model, images: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the rows of `_run` for images, and the gradient of one number of them.
+    """Return the output for images, and the gradient of one number computed from it.
 
-    That number is `_compute_checked_value`. The gradient is zero if nothing is
-    detected.
+    That number is a weighted sum of the output (`_compute_checked_value`). The gradient
+    (N, H, W, 3) is zero if nothing is detected.
+
+    Args:
+        model: model that is probed.
+        images: (N, H, W, 3).
     """
     leaf = images.clone().requires_grad_()
     with torch.enable_grad():
@@ -695,13 +769,17 @@ class _Change(NamedTuple):
 def _measure_change(
     model: Model, images: Tensor, step: Tensor, *gradients: Tensor
 ) -> _Change:
-    """Measure how the number of `_compute_checked_value` changes around images.
+    """Measure how outputs change around images, and what gradients predict of it.
+
+    Outputs are summed up in one number (`_compute_checked_value`), and its change is
+    the central difference f(x + step) - f(x - step).
 
     Args:
         model: model that is run.
         images: (N, H, W, 3).
-        step: (N, H, W, 3), taken to both sides; the images are clipped to [0, 1] there.
-        *gradients: (N, H, W, 3) that predict the change.
+        step: (N, H, W, 3) change of the images; x + step and x - step are clipped to
+            [0, 1].
+        *gradients: gradients (N, H, W, 3) of that number by the images.
     """
     ends = [(images + step).clamp(0.0, 1.0), (images - step).clamp(0.0, 1.0)]
     outputs = [_run(model, end) for end in ends]
@@ -717,9 +795,9 @@ def _check_gradient(
 ) -> None:
     """Warn if a network's outputs do not change as its gradient predicts.
 
-    Its gradient may be masked, cut off, or not that of this network. The change over a
-    small step along the sign of the gradient is compared with what the gradient
-    predicts; it is right if it holds for one of the steps.
+    A defence may mask the gradient, or a rounding may cut it off. The change of outputs
+    over a small step along the sign of the gradient is compared with what the gradient
+    predicts. The gradient counts as right if it holds for one of the step sizes.
 
     Args:
         model: model that is probed.
@@ -771,9 +849,13 @@ def _choose_step_sizes(model: Model) -> tuple[float, ...]:
 def _collect_discrete_values(model: Model, images: Tensor) -> str:
     """Return the part of an output that no gradient changes, as a string to compare.
 
-    That is its shapes, its columns of integers, and its texts; "" of a single tensor. A
-    detector with suppression finds other boxes after a small step, and a text continues
-    differently after another word.
+    That part is its shapes, its columns of integers (such as classes), and its texts.
+    It jumps if a detector with suppression keeps other boxes after a small step, or if
+    a text continues differently. It is "" if the output is a single tensor.
+
+    Args:
+        model: model that is probed.
+        images: (N, H, W, 3).
     """
     outputs = _run_and_read(model, images)
     if isinstance(outputs, Tensor):

@@ -50,6 +50,7 @@ class ReferenceNet(nn.Module):
             dropout: probability that a pooled feature is dropped in training.
         """
         super().__init__()
+        # The stem halves the image, and the first block of each stage halves it again.
         layers: list[nn.Module] = [_Convolution(3, STEM, 5, stride=2), nn.SiLU()]
         width = STEM
         for stage_width, depth in zip(WIDTHS, DEPTHS, strict=True):
@@ -65,6 +66,7 @@ class ReferenceNet(nn.Module):
                 nn.init.kaiming_normal_(
                     module.weight, mode="fan_out", nonlinearity="relu"
                 )
+        # small weights, so that all classes are nearly equally probable at first
         nn.init.normal_(self.head.weight, std=0.01)
         nn.init.zeros_(self.head.bias)
 
@@ -86,6 +88,7 @@ class _Convolution(nn.Module):
     def __init__(
         self, inputs: int, outputs: int, size: int, *, stride: int = 1
     ) -> None:
+        """Build the layers; `size` is the side of the kernel in pixels."""
         super().__init__()
         self.convolve = nn.Conv2d(inputs, outputs, size, stride, size // 2, bias=False)
         self.normalise = nn.BatchNorm2d(outputs)
@@ -134,8 +137,10 @@ def build(classes: int, *, dropout: float = 0.1) -> ReferenceNet:
 
 
 def fold_batch_norms(net: ReferenceNet) -> ReferenceNet:
-    """Return a copy for inference: evaluation mode, normalisation merged into the
-    convolutions, parameters frozen.
+    """Return a copy for inference, in evaluation mode and with frozen parameters.
+
+    In evaluation mode a batch norm is linear, so that it is merged into the convolution
+    before it. That is faster, and gives the same logits.
     """
     copied = copy.deepcopy(net).eval().requires_grad_(False)
     for module in list(copied.modules()):

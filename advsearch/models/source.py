@@ -95,11 +95,18 @@ class Purpose:
             )
 
     def parse_question(self, model: str, what: str) -> tuple[bool, str | None]:
-        """Return whether a network that returns texts answers freely, and the user's
-        question, None for the default.
+        """Return how a network that returns texts is to be asked.
+
+        Args:
+            model: name of the model, for messages.
+            what: what the network does, such as "is behind an address".
+
+        Returns:
+            Whether it answers in free words, as for the task `answer`, and does not
+            choose a class; and the user's question, or None for the default one.
 
         Raises:
-            ModelError: as `check`.
+            ModelError: the network cannot do the task.
             InputError: there are several questions, or names for a free answer.
         """
         self.check(model, what, "classification", "answer")
@@ -117,10 +124,15 @@ class Purpose:
         return free, prompts[0] if prompts else None
 
     def require_names(self, model: str, what: str, task: str) -> tuple[str, ...]:
-        """Return the names for a network without classes of its own.
+        """Return the user's names of classes for a network that has none itself.
+
+        Args:
+            model: name of the model, for messages.
+            what: what the network does, such as "compares a picture with texts".
+            task: the task that it can do.
 
         Raises:
-            ModelError: as `check`.
+            ModelError: the network cannot do the task.
             InputError: there are no names.
         """
         self.check(model, what, task)
@@ -161,9 +173,13 @@ class Source:
 
 
 def _check_not_lazy(module: nn.Module, name: str) -> None:
-    """Raise ModelError if a layer of a network gets its weights with the first image.
+    """Raise ModelError if a layer of a network has no weights yet.
 
-    `name` is the name of the model, for the message.
+    Layers such as `nn.LazyLinear` get their weights when the first image passes.
+
+    Args:
+        module: the network.
+        name: name of the model, for the message.
     """
     lazy_keys = [
         key
@@ -196,7 +212,7 @@ def make_source(module: nn.Module, name: str, **fields: Any) -> Source:
     _check_not_lazy(module, name)
     tensors = (*module.parameters(), *module.buffers())
     first = next((tensor for tensor in tensors if tensor.is_floating_point()), None)
-    # What the caller gives wins over what is found here.
+    # `fields` stand last, so that what the caller states takes precedence.
     if first is not None:
         fields = {"dtype": first.dtype, "device": first.device, **fields}
     if takes_image_size(module):
@@ -207,10 +223,14 @@ def make_source(module: nn.Module, name: str, **fields: Any) -> Source:
 def freeze_network(module: nn.Module, name: str) -> nn.Module:
     """Return the module in evaluation mode, with parameters that collect no gradient.
 
-    An ordinary module is copied, except for its weights, which the copy shares: the
-    caller may go on training the original, and the copy sees the new weights as long as
-    they are changed in place (as optimisers do). Exported and scripted programs, and
-    modules that cannot be copied (with a warning), are frozen themselves.
+    An ordinary module is copied, except for its weights, which the copy shares. So the
+    caller may go on training the original, and the copy sees the new weights if they
+    are changed in place, as optimizers do. Exported and scripted programs are frozen
+    themselves. So are modules that cannot be copied, with a warning.
+
+    Args:
+        module: the network.
+        name: name of the model, for the warning.
     """
     if not isinstance(module, PROGRAMS):
         try:
@@ -260,8 +280,12 @@ def load_weights(module: nn.Module, path: Path, name: str) -> None:
 def _read_weights(path: Path, name: str) -> dict[str, Tensor]:
     """Return the tensors in a safetensors file, by key.
 
-    `name` is the name of the model, for messages. Raises FileFormatError if the file is
-    missing or is not safetensors.
+    Args:
+        path: path of the file.
+        name: name of the model, for messages.
+
+    Raises:
+        FileFormatError: the file is missing or is not safetensors.
     """
     try:
         # a check: this opens regular files only, of limited size
@@ -281,6 +305,9 @@ def _describe_misfit(
     expected: Mapping[str, Tensor], state: Mapping[str, Tensor]
 ) -> list[str]:
     """Describe why the tensors of a file do not fit a network; empty if they do.
+
+    Counters of batch norms (`num_batches_tracked`) may be missing, since they do not
+    matter outside of training.
 
     Args:
         expected: tensors of the network, by key.
@@ -355,10 +382,15 @@ def load_callable(spec: str, libraries: Iterable[str] = ()) -> Source | Model:
 
 
 def _get_attribute(module: ModuleType, attribute: str, module_name: str) -> Any:
-    """Return an attribute of a module, or of a class in it: "Class.method".
+    """Return an attribute of a module, or of a class in it.
+
+    Args:
+        module: the module.
+        attribute: name such as "build", or "Class.method".
+        module_name: name of the module, for the message.
 
     Raises:
-        UnknownNameError: there is none; the message has near names.
+        UnknownNameError: there is no such attribute; the message has similar names.
     """
     value: Any = module
     for name in attribute.split("."):
@@ -380,8 +412,12 @@ def _get_attribute(module: ModuleType, attribute: str, module_name: str) -> Any:
 def _call_factory(factory: Any, spec: str) -> Any:
     """Return what the user's function or class returns, called without arguments.
 
-    `spec` is what the user wrote, for messages. Raises ModelError if it cannot be
-    called, or fails.
+    Args:
+        factory: what the user named.
+        spec: what the user wrote, for messages.
+
+    Raises:
+        ModelError: it cannot be called, or fails.
     """
     if not callable(factory):
         raise ModelError(
@@ -402,7 +438,8 @@ def _import_module(name: str, spec: str, libraries: Iterable[str]) -> ModuleType
     Args:
         name: name of the module.
         spec: what the user wrote, for messages.
-        libraries: names that the module's may have been meant to be.
+        libraries: names of model sources, such as "timm", of which the name may be a
+            misspelling.
 
     Raises:
         ModelError: it cannot be imported.
@@ -412,7 +449,8 @@ def _import_module(name: str, spec: str, libraries: Iterable[str]) -> ModuleType
             return importlib.import_module(name)
         except ModuleNotFoundError as error:
             missing = error.name
-            # the module itself or a package that it is in, and not one that it imports
+            # whether the module itself, or a package that holds it, is missing, and not
+            # another module that it imports
             is_module_itself = missing is not None and f"{name}.".startswith(
                 f"{missing}."
             )
@@ -430,8 +468,15 @@ def _import_module(name: str, spec: str, libraries: Iterable[str]) -> ModuleType
 
 
 def _suggest_library(name: str, spec: str, libraries: Iterable[str]) -> str:
-    """Return the question whether a library is meant by the name of a module, "" if
-    none is similar.
+    """Return a suggestion such as "; did you mean 'timm:resnet18'?".
+
+    Args:
+        name: name of a module that does not exist.
+        spec: what the user wrote, "NAME:REST".
+        libraries: names that may have been meant.
+
+    Returns:
+        The suggestion; "" if no library has a similar name.
     """
     similar = find_similar_names(name, libraries)
     if not similar:
@@ -440,6 +485,7 @@ def _suggest_library(name: str, spec: str, libraries: Iterable[str]) -> str:
 
 
 def _where(error: BaseException) -> str:
+    """Return the first line of an error, and the file and line that raised it."""
     frames = traceback.extract_tb(error.__traceback__)
     return get_first_line(error) + (
         f" at {frames[-1].filename}:{frames[-1].lineno}" if frames else ""

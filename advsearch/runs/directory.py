@@ -106,11 +106,11 @@ class RunDirectory:
         overwrite: bool = False,
         default: str = "attack",
     ) -> RunDirectory:
-        """Make the directory of a new run, lock it, and write `run.yaml`, from which
-        `advsearch run` repeats the run.
+        """Make the directory of a new run, lock it, and write `run.yaml`.
 
-        With `overwrite`, only a directory that advsearch wrote is touched, and in it
-        only what advsearch writes.
+        `advsearch run` repeats a run from that file. With `overwrite`, only a directory
+        that advsearch wrote is changed, and only files that advsearch writes are
+        removed from it.
 
         Args:
             run: a name (kept in ``runs/``) or a path; None takes ``runs/<default>-NNN``
@@ -123,15 +123,16 @@ class RunDirectory:
             RunExistsError: there is something already.
         """
         path = _make_numbered_directory(default) if run is None else locate_run(run)
-        # before the directory is made: else that of a study that was moved away would
-        # be made again
+        # Checked before the directory is made. If the folder of a study was moved away
+        # while it runs, `mkdir` would make it again.
         check_not_moved(path)
         check_free(path, overwrite=overwrite)
         with storage_errors(path):
             path.mkdir(parents=True, exist_ok=True)
         try:
             return cls._create_in(path, config, overwrite=overwrite)
-        except InputError:  # the directory belongs to another run, and stays
+        except InputError:
+            # the directory belongs to another run, and stays
             raise
         except BaseException:
             _remove_if_bare(path)
@@ -142,6 +143,12 @@ class RunDirectory:
         cls, path: Path, config: Config | None, *, overwrite: bool
     ) -> RunDirectory:
         """Begin a run in a directory that exists; after an error nothing of it is left.
+
+        Args:
+            path: path of the directory.
+            config: configuration of the run, which is written as `run.yaml`; None for
+                a run that cannot be repeated.
+            overwrite: whether an older run in the directory is removed.
 
         Raises:
             RunExistsError: another process has begun a run there.
@@ -170,8 +177,11 @@ class RunDirectory:
 
     @classmethod
     def open(cls, config: Config, resumed: str | Path | None = None) -> RunDirectory:
-        """Open the directory of the run that `config` describes: a new one, or the one
-        to go on with, as for `find_run`.
+        """Open the directory of a run, and its tracker if the run has one.
+
+        Args:
+            config: configuration of the run.
+            resumed: name or path of a run to go on with; None for a new run.
         """
         log: str | None = getattr(config, "log", None)
         check_tracker(log)
@@ -182,8 +192,13 @@ class RunDirectory:
 
     @classmethod
     def create_for(cls, config: Config) -> RunDirectory:
-        """Make the directory that `config` asks for, with its `run.yaml`; errors as for
-        `create`.
+        """Make the directory of a new run as its configuration states.
+
+        Without a name in the configuration, the name consists of the object and the
+        controls, such as "mug-texture-001".
+
+        Raises:
+            RunExistsError: there is something already.
         """
         location, overwrite = config.run_location
         first, *others = config.title_words
@@ -200,7 +215,8 @@ class RunDirectory:
 
         Args:
             run: its name or path.
-            config: what it goes on with; None where nothing goes on.
+            config: the configuration, which must be the one that the run began with;
+                None if nothing is to be evaluated.
 
         Raises:
             InputError: another process works on it, or `config` would give other
@@ -229,8 +245,10 @@ class RunDirectory:
         return f"start again with advsearch run {self.path / CONFIG}"
 
     def _note_start(self, config: Config) -> None:
-        """Store what decides the numbers of a new run: parts from Python, versions and
-        settings.
+        """Store what decides the numbers of a new run.
+
+        That is its settings, the versions of packages, digests of files, and which
+        parts were passed as Python objects.
         """
         if config.python_only_parts:
             self.store.write_note(
@@ -248,7 +266,8 @@ class RunDirectory:
         Raises:
             InputError: some are not, so that it would give other numbers.
         """
-        # without settings, the run was killed before it noted anything: it begins now
+        # A run without stored settings was killed before `_note_start` ended. It has no
+        # rows, and begins now.
         has_settings = self.store.read_note(SETTINGS_NOTE) is not None
         if not has_settings:
             if self.store.count_rows():
@@ -258,7 +277,8 @@ class RunDirectory:
                 )
             self._note_start(config)
             return
-        # a file that only the beginning of a run reads may have changed since
+        # Only files that are read again count. One that the run has copied into its
+        # store, such as a recipe, may have changed since.
         read_again = {
             name: value
             for name, value in _known_settings(config).items()
@@ -272,13 +292,13 @@ class RunDirectory:
     def check_unchanged(self, note: str, facts: Mapping[str, Any]) -> None:
         """Check that what decides the numbers of a run is as it was when the run began.
 
-        Facts are settings, or versions and digests of files. They are stored by the
-        first call, and later ones are compared with them. One that is new is stored as
-        well.
+        Facts are settings, versions of packages, or digests of files. The first call
+        stores them. Later calls compare with the stored ones, and store those that are
+        new.
 
         Args:
-            note: the name under which they are stored.
-            facts: facts by name.
+            note: name of the note under which they are stored.
+            facts: values by name, such as {"torch": "2.13.0"}.
 
         Raises:
             InputError: a fact is not what it was when it was stored first; the run
@@ -305,8 +325,15 @@ class RunDirectory:
             self.store.write_note(note, json.dumps({**facts, **before}))
 
     def check_files_unchanged(self, used_settings: Iterable[Mapping[str, Any]]) -> None:
-        """Store the versions, files and weights that settings name; errors as for
-        `check_unchanged`.
+        """Store the versions of packages and the digests of files that settings name.
+
+        For a resumed run they are compared with the stored ones.
+
+        Args:
+            used_settings: settings by name, of each part of the run.
+
+        Raises:
+            InputError: a version or a file has changed since the run began.
         """
         facts = dict[str, str]()
         for values in used_settings:
@@ -316,12 +343,14 @@ class RunDirectory:
     def append_rows(
         self, *rows: store.Row, cached: store.CachedEvaluation | None = None
     ) -> None:
-        """Add evaluated configurations to the results; they survive a kill when this
-        returns (see `store`).
+        """Add rows to the results, and send them to the tracker if there is one.
+
+        When this returns, the rows survive a kill of the process.
 
         Args:
-            rows: what was evaluated.
-            cached: what the last row told its search, beside the row.
+            *rows: one row for each evaluated configuration.
+            cached: what a search needs to be resumed and the last row lacks, such as
+                the gradient; None if there is nothing.
         """
         self.store.append(rows, cached)
         if self._tracker is not None:
@@ -329,8 +358,14 @@ class RunDirectory:
 
     @staticmethod
     def find_file_changed_since(run: Path, config: Config) -> str | None:
-        """Return the name of a file that settings name and that is another one than
-        when a run was made, or None.
+        """Return the name of a file that has changed since a run was made.
+
+        Args:
+            run: directory of the run.
+            config: configuration whose settings name the files.
+
+        Returns:
+            One such name; None if no file has changed.
         """
         return summary.find_changed_file(
             RunDirectory.read_versions(run), config.to_json()
@@ -338,8 +373,9 @@ class RunDirectory:
 
     @staticmethod
     def read_versions(run: Path) -> dict[str, object]:
-        """Return the versions and the digests of files and weights that a run was made
-        with, as it noted them.
+        """Return the versions of packages and digests of files that a run has noted.
+
+        They are those with which the run was made.
         """
         with store.Store.open_to_read(run) as results:
             noted = results.read_json_note(summary.VERSIONS_NOTE)
@@ -398,8 +434,10 @@ class RunDirectory:
 
     @property
     def is_empty(self) -> bool:
-        """Whether nothing would be lost with it: it has no result, no part, no row and
-        no answer of a model that was paid for.
+        """Whether nothing would be lost if the directory were removed.
+
+        It then has no result, no part, no row, and no answer of a remote model, which
+        may have cost money.
         """
         has_files = any((self.path / name).exists() for name in (summary.NAME, PARTS))
         return (
@@ -431,6 +469,7 @@ class RunDirectory:
 
         Without an error it is checked first that nobody moved it meanwhile.
         """
+        # A new directory is removed only if the block raised before it stored anything.
         if error is None:
             try:
                 check_not_moved(self.path)
@@ -445,23 +484,26 @@ class RunDirectory:
 
 @contextmanager
 def create_before_work(config: Config) -> Iterator[Path | None]:
-    """Make the directory of a new run before its work begins, so that the run can be
-    resumed however the block ends.
+    """Make the directory of a new run before its work begins.
 
-    If the block raises before anything was evaluated, the directory is removed again,
-    with the folders that were made for it.
+    So the run can be resumed however the block ends. If the block raises before
+    anything was evaluated, the directory is removed again, with the folders that were
+    made for it.
+
+    Args:
+        config: configuration of the run.
 
     Yields:
-        The path of the directory. It is closed, and the block resumes it. None with
-        `overwrite` over an existing run, for which nothing is made: the old run stays
-        until the new one has something to store.
+        The path of the directory, which is not locked: the block resumes the run. None
+        if the run overwrites another one. Then nothing is made here, and the old run
+        stays until the new one has something to store.
     """
     location, overwrite = config.run_location
     if overwrite and location is not None and is_run(locate_run(location)):
         yield None
         return
     home = HOME if location is None else locate_run(location).parent
-    # from the innermost out
+    # parent folders that do not exist yet, the innermost first
     new_folders = [
         parent for parent in (home, *home.parents) if not os.path.exists(parent)
     ]
@@ -481,10 +523,13 @@ def create_before_work(config: Config) -> Iterator[Path | None]:
 
 
 def make_default_name(object_name: str, controls: Iterable[str]) -> str:
-    """Return the name of a run by default: ``mug-texture`` for the object ``mug`` or
-    ``data/mug.obj`` and the control ``texture``.
+    """Return the default name of a run, such as ``mug-texture``.
 
-    It has only small letters, digits and hyphens, 80 at most.
+    It has only small letters, digits and hyphens, at most 80 of them.
+
+    Args:
+        object_name: name or file of the object, such as ``data/mug.obj``.
+        controls: names of the controls, such as ``texture``.
     """
     words = [Path(object_name).stem, *controls]
     return (
@@ -493,9 +538,13 @@ def make_default_name(object_name: str, controls: Iterable[str]) -> str:
 
 
 def check_links(run: Path) -> None:
-    """Check that what a run's folder has is its own, as `check_no_links`. Small
-    pictures, of which there may be a million, are checked as each is read
-    (`viewer.thumbnails`). Raises FileFormatError.
+    """Check that nothing in a run's folder is a link to a file elsewhere.
+
+    Small pictures, of which there may be a million, are checked when each is read
+    (`viewer.thumbnails`).
+
+    Raises:
+        FileFormatError: something is a link.
     """
     check_no_links(run, CONTENTS, SMALL_PICTURES)
 
@@ -508,8 +557,9 @@ def locate_run(run: str | Path) -> Path:
 
 
 def format_run_name(path: str | Path) -> str:
-    """Return what a user types to name the run in a folder: its name in `HOME`, or its
-    path.
+    """Return what a user types to name the run in a folder.
+
+    It is the name of the folder if that is in ``runs/``, else its path.
     """
     path = Path(path)
     return path.name if path.parent == HOME else str(path)
@@ -540,9 +590,11 @@ def find_run(run: str | Path, *, checked: bool = True) -> Path:
 
 
 def read_python_only(path: Path) -> list[PythonOnly]:
-    """Return the parts of a run that existed in the Python session that made it only.
+    """Return the parts of a run that were passed as Python objects.
 
-    They are noted as a list of pairs; what has another form is left out.
+    No file and no command can name them, so that the run cannot be repeated from its
+    `run.yaml`. They are noted as pairs of role and name. A pair of another form is left
+    out, as the file may come from somebody else.
     """
     if not (path / store.NAME).is_file():
         return []
@@ -573,7 +625,11 @@ def is_run(path: Path) -> bool:
 
 
 def check_free(run: str | Path, *, overwrite: bool = False) -> None:
-    """Check that a new run may be put at `run`; call it before any long work.
+    """Check that a new run may be put somewhere; call it before any long work.
+
+    Args:
+        run: name or path of the new run.
+        overwrite: whether it may replace another run.
 
     Raises:
         InputError: it is no possible path.
@@ -636,6 +692,7 @@ def _make_numbered_directory(default: str) -> Path:
 
 
 def _clear(path: Path) -> None:
+    """Remove all that a run writes from a directory, and nothing else."""
     for entry in list(path.iterdir()):
         if entry.name in CONTENTS or entry.name.startswith(PART):
             if entry.is_dir() and not entry.is_symlink():
@@ -651,8 +708,12 @@ def _known_settings(config: Config) -> dict[str, Any]:
 
 
 def _format_change(name: str, value: object) -> str:
-    """Return the name of a changed fact, with the value that it had where that is known
-    and short.
+    """Return the name of a changed fact, such as "seed (was 0)".
+
+    Args:
+        name: name of the fact.
+        value: the value that it had. It is left out if it is None or long, as digests
+            are.
     """
     text = format_value(value)
     return (
@@ -663,13 +724,15 @@ def _format_change(name: str, value: object) -> str:
 
 
 def _is_leftover(path: Path) -> bool:
-    """Whether it is what a kill leaves before there is a run: the lock, or a part of a
-    file.
+    """Return whether a file is a leftover of a run that was killed as it began.
+
+    It is the lock, or a file that was not written completely.
     """
     return path.name == LOCK or path.name.startswith(PART)
 
 
 def _remove_if_bare(path: Path) -> None:
+    """Remove a directory if it has nothing but leftovers of a killed run."""
     with suppress(OSError):
         if all(_is_leftover(entry) for entry in path.iterdir()):
             for entry in list(path.iterdir()):

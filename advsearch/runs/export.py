@@ -59,10 +59,11 @@ def write_rows(
     """Write the rows of a run as a table, and return how many there were.
 
     Args:
-        store: has the rows.
-        format: a name in `FORMATS`.
-        out: the file, which is written whole or not at all; None for `stream`.
-        stream: is written to where there is no file.
+        store: store of the run, which has the rows.
+        format: "csv", "json" or "parquet".
+        out: the file, which is written completely or not at all; None to write to
+            `stream`.
+        stream: open binary stream, such as standard output.
         kind: kind of the rows to write; None for all.
 
     Raises:
@@ -89,11 +90,12 @@ def write_rows(
 
 
 def list_columns(rows: Iterable[Row]) -> list[str]:
-    """Return the columns of a table of rows.
+    """Return the names of the columns of a table of rows.
 
     Metrics and values stand between the fixed columns, in the order in which they first
     occur.
     """
+    # the keys of these dictionaries are sets that keep their order
     metrics = dict[str, None]()
     values = dict[str, None]()
     for row in rows:
@@ -103,6 +105,7 @@ def list_columns(rows: Iterable[Row]) -> list[str]:
 
 
 def make_record(row: Row) -> JsonObject:
+    """Return a row as values by column, with a column for each metric and value."""
     columns = {
         field.name: getattr(row, field.name)
         for field in fields(row)
@@ -114,10 +117,13 @@ def make_record(row: Row) -> JsonObject:
 def iterate_values(
     values: Mapping[str, Value | JsonValue],
 ) -> Iterator[tuple[str, JsonValue, str]]:
-    """Yield (column, value, unit) of each value of a row.
+    """Yield column, value and unit of each value of a row.
 
-    A value of several numbers has a column for each, such as ``camera.target[0]``. An
-    entry is a mapping with value and unit, or the value alone.
+    A value of several numbers has a column for each, such as ``camera.target[0]``.
+
+    Args:
+        values: by parameter, a mapping such as {"value": 130.0, "unit": "degrees"}, or
+            the value alone, which has no unit.
     """
     for name, entry in values.items():
         value: Any = entry
@@ -135,6 +141,7 @@ def iterate_values(
 
 
 def _flatten_values(values: Mapping[str, Value | JsonValue]) -> JsonObject:
+    """Return values by column, whose name has the unit: "pose.yaw [degrees]"."""
     return {
         f"{name} [{unit}]" if unit else name: value
         for name, value, unit in iterate_values(values)
@@ -144,7 +151,13 @@ def _flatten_values(values: Mapping[str, Value | JsonValue]) -> JsonObject:
 def _write_csv(
     records: Iterable[JsonObject], names: list[str], stream: IO[bytes]
 ) -> None:
-    """Write records as CSV; a missing value is empty, and a bool is 0 or 1."""
+    """Write records as CSV; a missing value is empty, and a bool is 0 or 1.
+
+    Args:
+        records: a record for each row.
+        names: names of the columns.
+        stream: open binary stream, which stays open.
+    """
     text = io.TextIOWrapper(stream, encoding="utf-8", newline="", write_through=True)
     writer = csv.DictWriter(text, names, restval="", lineterminator="\n")
     writer.writeheader()
@@ -154,7 +167,7 @@ def _write_csv(
             for name, value in _encode_payload(record).items()
         }
         writer.writerow(cells)
-    # the stream stays open when the wrapper is deleted
+    # A text wrapper closes its stream when it is deleted, unless it is detached.
     text.detach()
 
 
@@ -170,7 +183,13 @@ def _encode_payload(record: JsonObject) -> JsonObject:
 def _write_json(
     records: Iterable[JsonObject], names: list[str], stream: IO[bytes]
 ) -> None:
-    """Write records as one JSON array, a record on each line."""
+    """Write records as one JSON array, a record on each line.
+
+    Args:
+        records: a record for each row.
+        names: names of the columns; a record without one has null.
+        stream: open binary stream.
+    """
     stream.write(b"[")
     for number, record in enumerate(records):
         line = json.dumps(
@@ -185,8 +204,10 @@ def _write_json(
 def _write_parquet(
     records: Iterable[JsonObject], names: list[str], stream: IO[bytes]
 ) -> None:
-    """Write records as Parquet, in groups of `ROWS_PER_GROUP`, so that no more are in
-    memory.
+    """Write records as Parquet.
+
+    They are written in groups of `ROWS_PER_GROUP`, so that no more are in memory. The
+    types of columns follow from the first group.
     """
     try:
         # comes with the extra `parquet`
@@ -209,10 +230,14 @@ def _write_parquet(
 
 
 def _make_schema(names: list[str], first_records: Sequence[JsonObject]) -> Any:
-    """Return the Arrow schema of columns.
+    """Return the Arrow schema of a table.
 
-    Fixed columns have the type that `Row` declares. A column of a metric or a value is
-    text where one of the first records has text in it, else float64.
+    Fixed columns have the type that `Row` declares. The column of a metric or a value
+    is text if one of the first records has text in it, else float64.
+
+    Args:
+        names: names of the columns.
+        first_records: the first records of the table.
     """
     # an optional package
     import pyarrow
@@ -235,7 +260,11 @@ def _make_schema(names: list[str], first_records: Sequence[JsonObject]) -> Any:
 
 
 def _convert_column(values: list[Any], arrow_type: Any) -> list[Any]:
-    """Return values as text or float where the column has that type, None as it is."""
+    """Return the values of a column in the type of the column.
+
+    Values of text and float columns are converted, and None stays. Other columns have
+    values of their type already.
+    """
     # an optional package
     import pyarrow
 
@@ -257,8 +286,13 @@ MAX_CLASSES_BYTES = 16 << 20  # most bytes of a `class_maps.json`
 
 
 def read_threedb(folder: Path) -> Iterator[tuple[Row, Path | None]]:
-    """Yield the lines of a folder of 3DB as rows of a sweep, each with the file of its
-    picture, if there is one.
+    """Yield the lines of a 3DB log as rows of a sweep.
+
+    Args:
+        folder: folder that 3DB has written, with `details.log`.
+
+    Yields:
+        A row, and the file of its picture, or None if there is none.
 
     Raises:
         FileFormatError: the classes or a line are not as 3DB writes them; it names the
@@ -286,10 +320,12 @@ def read_threedb(folder: Path) -> Iterator[tuple[Row, Path | None]]:
 
 
 def _read_classes(path: Path) -> list[str]:
-    """Return the names of classes in a file of 3DB; empty if there is no such file.
+    """Return the names of classes by index, from a file of 3DB.
+
+    The list is empty if there is no such file.
 
     Raises:
-        FileFormatError: it has something else.
+        FileFormatError: the file has something else than a list.
     """
     try:
         classes = parse_json(read_text(path, "the classes of 3DB", MAX_CLASSES_BYTES))
@@ -309,8 +345,14 @@ def _parse_line(
 ) -> tuple[Row, Path | None]:
     """Return a line of 3DB's log as a row, and the file of its picture, if any.
 
+    Args:
+        folder: folder that 3DB has written.
+        number: number of the line from 0, which becomes the step of the row.
+        line: the line, a JSON object.
+        classes: names of classes by index.
+
     Raises:
-        FileFormatError: the line, the `number`-th from 0, is not as 3DB writes it.
+        FileFormatError: the line is not as 3DB writes it.
     """
     try:
         record = parse_json(line.decode())
@@ -326,8 +368,8 @@ def _parse_line(
         number,
         # 3DB writes a bool or the text of one
         correct=str(record.get("is_correct")) == "True",
-        # A loss is large where the model is wrong, a margin where it is right. The
-        # difference has no -0.0.
+        # A loss is large if the model is wrong, a margin if it is right, so the sign
+        # changes. It is 0.0 - loss and not -loss, which would be -0.0 for 0.
         margin=0.0 - loss if isinstance(loss, (int, float)) else None,
         label=label,
         label_index=label_index,
@@ -337,8 +379,14 @@ def _parse_line(
 
 
 def _import_values(record: JsonObject, render_args: JsonObject) -> dict[str, Value]:
-    """Return the parameters of a line of 3DB's log by name; each number of a list has
-    its index behind the name.
+    """Return the parameters of a line of 3DB's log by name.
+
+    Each number of a list has its own entry, with its index behind the name, such as
+    "NAME[0]".
+
+    Args:
+        record: the line, which names object and environment.
+        render_args: further parameters in it.
     """
     # 3DB calls the object "model", and the model "network"
     values: dict[str, Value] = {
@@ -357,7 +405,7 @@ def _import_values(record: JsonObject, render_args: JsonObject) -> dict[str, Val
 def _parse_prediction(
     prediction: JsonValue, classes: Sequence[str]
 ) -> tuple[str, int | None]:
-    """Return label and index of the class that 3DB's log says was predicted.
+    """Return label and index of the class that was predicted, as 3DB's log states it.
 
     Args:
         prediction: an index, or a list with the best one first.

@@ -99,13 +99,16 @@ def is_results_database(path: Path) -> bool:
 
 
 def connect_to_write(path: Path) -> sqlite3.Connection:
-    """Open a database for writing; a new one appears with all of its tables in one
-    step.
+    """Open a database for writing, and create it if it is missing.
+
+    A new one is created under another name and then renamed, so that no process ever
+    sees it without its tables.
     """
     check_before_writing(path)
     if not path.exists():
         with replace_file(path) as part, closing(sqlite3.connect(part)) as db:
-            # there is nothing in it to lose yet, so the disk isn't waited for
+            # Nothing in the new file can be lost, so that waiting for the disk is
+            # not needed.
             db.execute("PRAGMA synchronous = OFF")
             # before WAL mode, so that it is written into the file itself
             db.execute(f"PRAGMA application_id = {APPLICATION_ID}")
@@ -120,9 +123,13 @@ def connect_to_write(path: Path) -> sqlite3.Connection:
 def check_version(db: sqlite3.Connection, path: Path) -> None:
     """Check that a database has the version that this advsearch reads.
 
+    Args:
+        db: the open database.
+        path: its path, for the message.
+
     Raises:
-        FileFormatError: it has not, and is closed; the message says which advsearch
-            reads it.
+        FileFormatError: it has another version. The database is then closed, and the
+            message states which advsearch can read it.
     """
     version = read_version(db)
     day = ""
@@ -184,8 +191,14 @@ def to_8bit(image: Any) -> Bytes:
 def amplify_difference(
     before: Any, after: Any, gain: float = DIFFERENCE_GAIN
 ) -> Floats:
-    """Return ``0.5 + gain (after - before)`` clipped to [0, 1]: mid grey where nothing
-    changed.
+    """Return an image of the difference between two images, mid gray for no change.
+
+    It is ``0.5 + gain (after - before)``, clipped to [0, 1].
+
+    Args:
+        before: (H, W, 3) or (H, W), in [0, 1].
+        after: the changed image, of the same shape.
+        gain: factor by which differences are amplified.
     """
     moved: Floats = np.float32(0.5) + np.float32(gain) * (
         _to_float32(after) - _to_float32(before)
@@ -241,13 +254,14 @@ def write_exr(path: Path, image: Any) -> Path:
 def write_layers(
     path: Path, layers: Mapping[str, Any], notes: Mapping[str, str]
 ) -> Path:
-    """Write channels into one EXR file, whole or not at all, and return its path.
+    """Write channels atomically into one EXR file, and return its path.
 
     Args:
         path: path of the file.
-        layers: channels (H, W) by name, such as ``normal.X``; numbers become float32,
-            whole numbers 32 bits without sign.
-        notes: what they mean, attributes of the file by name.
+        layers: channels (H, W) by name, such as ``normal.X``. Integers are stored as
+            uint32, other numbers as float32.
+        notes: texts by name that describe the channels; they become attributes of the
+            file.
     """
     channels = {}
     for name, layer in layers.items():
@@ -262,9 +276,15 @@ def write_layers(
 def _write_exr(
     path: Path, channels: Mapping[str, Any], notes: Mapping[str, str]
 ) -> Path:
-    """Write channels into an OpenEXR file atomically.
+    """Write channels atomically into an OpenEXR file, and return its path.
 
-    OpenEXR raises RuntimeError for a full disk; it becomes an OSError.
+    Args:
+        path: path of the file.
+        channels: arrays by name, (H, W) or, as "RGB", (H, W, 3).
+        notes: further attributes of the file.
+
+    Raises:
+        OSError: it cannot be written. OpenEXR itself raises RuntimeError.
     """
     # late: OpenEXR takes long to import
     import OpenEXR
@@ -286,11 +306,13 @@ def _write_exr(
 
 
 def encode_animation(frames: Sequence[Any]) -> bytes:
-    """Return display-referred pictures as a GIF that repeats and shows its last frame
-    longer.
+    """Return pictures as a GIF that repeats and shows its last frame longer.
 
-    It is made again, first with fewer frames and then with smaller ones, until it has
-    `ANIMATION_BYTES` at most, or cannot get smaller.
+    If the GIF is larger than `ANIMATION_BYTES`, it is made again with fewer frames,
+    down to `MIN_ANIMATION_FRAMES`, and then with smaller ones.
+
+    Args:
+        frames: (H, W, 3) or (H, W) display-referred pictures in [0, 1], of one size.
     """
     count = min(len(frames), ANIMATION_FRAMES)
     shrink = 1  # factor by which sides are smaller than ANIMATION_SIDE
@@ -307,16 +329,21 @@ def encode_animation(frames: Sequence[Any]) -> bytes:
         if len(data) <= ANIMATION_BYTES or is_minimal:
             return data
         if count > MIN_ANIMATION_FRAMES:
-            # a tenth less, or less in proportion to what is too much
+            # a tenth less, or as many as would fit if all frames were equally large
             count = min(count * 9 // 10, count * ANIMATION_BYTES // len(data))
         else:
             shrink *= 2
 
 
 def _shrink_images(images: Sequence[Image.Image], shrink: int) -> list[Image.Image]:
-    """Return images (one size) whose longest side is at most ANIMATION_SIDE / `shrink`.
+    """Return images whose longest side is at most ANIMATION_SIDE / `shrink` pixels.
 
-    Blocks of pixels become one pixel; what is left of a block at an edge is cut off.
+    Each block of pixels is averaged to one pixel. Rows and columns that fill no block
+    are cut off.
+
+    Args:
+        images: images of one size.
+        shrink: factor by which they are smaller than `ANIMATION_SIDE`.
     """
     longest_side = max(images[0].size)
     # -(-a // b) is a / b, rounded up
@@ -328,10 +355,13 @@ def _shrink_images(images: Sequence[Image.Image], shrink: int) -> list[Image.Ima
 
 
 def _encode_gif(pictures: Sequence[Image.Image]) -> bytes:
-    """Encode images (one size) as a GIF that repeats; the last one stays longer."""
-    # one palette for all frames, by Pillow itself: 20 times as fast as through imageio
+    """Encode images of one size as a GIF that repeats, with a longer last frame.
+
+    One palette of 256 colors serves all frames.
+    """
     pixels = np.concatenate([np.asarray(picture) for picture in pictures])
-    # the palette is made from some of the rows, _PALETTE_PIXELS at most
+    # To be fast, the palette is made from every `stride`-th row of pixels, about
+    # `_PALETTE_PIXELS` in all.
     stride = 1 + pixels.shape[0] * pixels.shape[1] // _PALETTE_PIXELS
     palette = Image.fromarray(np.ascontiguousarray(pixels[::stride])).quantize(256)
     frames = [

@@ -42,8 +42,9 @@ class ListedRun:
 
 
 def list_runs(folder: Path) -> list[ListedRun]:
-    """Return the runs in a folder, by name; what cannot be read is shown as far as it
-    can.
+    """Return the runs in a folder, sorted by name.
+
+    A run that cannot be read completely is listed with what can be read.
     """
     if not folder.is_dir():
         return []
@@ -55,8 +56,9 @@ def list_runs(folder: Path) -> list[ListedRun]:
 
 
 def is_finished(path: Path) -> bool:
-    """Whether a run has come to its end; one that was interrupted, or killed while its
-    report was written, has not.
+    """Return whether a run has come to its end.
+
+    A run has not if it was interrupted, or killed while its report was written.
     """
     if not (path / summary.NAME).is_file() or summary.read_result(path).is_unfinished:
         return False
@@ -72,21 +74,21 @@ _LISTED: dict[tuple[str, bool], tuple[object, ListedRun]] = {}
 
 
 def read_listed_run(path: Path, *, counts: bool = True) -> ListedRun:
-    """Return what the list of runs says of the run in a folder.
+    """Return the entry of a run in the list of runs.
 
-    What cannot be read is left out, and `fault` says why. The result is kept until the
-    files of the run change; a run that a process works on is read again where rows are
-    counted.
+    What cannot be read is left out, and `fault` states why. The entry is cached until
+    the files of the run change. If a process works on the run and rows are counted, it
+    is read again each time.
 
     Args:
         path: path of the run.
-        counts: also count its rows, which takes a second for a million.
+        counts: whether to count its rows, which takes a second for a million.
     """
     running = is_held(path)
     read_paths = [
         path / name for name in (CONFIG, summary.NAME, store.NAME, f"{store.NAME}-wal")
     ]
-    # `_LISTED` has, by key, the state of the files when they were read, and the result.
+    # The cache has, by key, the state of the files when they were read, and the entry.
     key = (os.path.abspath(path), counts)
     state = (str(path), running, *map(_state, read_paths))
     is_known = key in _LISTED and _LISTED[key][0] == state
@@ -109,7 +111,7 @@ def read_listed_run(path: Path, *, counts: bool = True) -> ListedRun:
 
 
 def _make_damaged_run(path: Path) -> ListedRun:
-    """Return what the list says of a run of which nothing can be read."""
+    """Return the entry of a run of which nothing can be read."""
     return ListedRun(
         path.name,
         str(path),
@@ -126,6 +128,7 @@ def _make_damaged_run(path: Path) -> ListedRun:
 
 
 def _state(path: Path) -> object:
+    """Return what changes when a file is written; None if it is missing or empty."""
     with suppress(OSError):
         file = os.lstat(path)
         if file.st_size:  # who reads leaves an empty log
@@ -136,20 +139,20 @@ def _state(path: Path) -> object:
 def _make_listed_run(
     path: Path, counts: bool, running: bool, faults: list[str]
 ) -> ListedRun:
-    """Read what the list of runs says of one run.
+    """Read the entry of one run in the list of runs.
 
-    What cannot be read is added to `faults` and left out; nothing is raised.
+    A file that cannot be read is left out, and `faults` gets a sentence about it.
 
     Args:
         path: path of the run.
-        counts: also count its rows, which opens the database.
-        running: a process holds the lock of the run.
-        faults: sentences, to which those of this run are added.
+        counts: whether to count its rows, which opens the database.
+        running: whether a process works on the run.
+        faults: list of sentences, to which those about this run are added.
     """
     config: dict[str, object] = {}
     result: Result | None = None
     kinds: dict[str, int] = {}
-    # what fails in such a block is added to the faults
+    # an error in one of these blocks is added to the faults, and not raised
     with _collect_faults(faults, path / CONFIG):
         config = read_yaml(path / CONFIG)
     with _collect_faults(faults, path / summary.NAME):

@@ -45,8 +45,11 @@ class Measurements:
         self.n_new = 0
 
     def get(self, key: str, measure: Callable[[], Any]) -> Any:
-        """Return the JSON value that is stored under a key; measure and store it if
-        there is none.
+        """Return the JSON value that is stored under a key, or measure and store it.
+
+        Args:
+            key: key of the measurement in the store of the run.
+            measure: measures it; what it returns must have a JSON form.
 
         Raises:
             OutOfTime: it would have to be measured, the time is up, and something was
@@ -65,8 +68,15 @@ class Measurements:
     def get_row(
         self, key: str, row_type: type[AnyFields], measure: Callable[[], AnyFields]
     ) -> AnyFields:
-        """Return the fields that `measure` returns, or those that are stored; otherwise
-        as `get`.
+        """Return the fields that are stored under a key, or measure and store them.
+
+        Args:
+            key: key of the measurement in the store of the run.
+            row_type: class of the fields.
+            measure: measures them.
+
+        Raises:
+            OutOfTime: they would have to be measured, and the time is up.
         """
         return row_type.of(self.get(key, lambda: measure().to_dict()))
 
@@ -76,8 +86,15 @@ class Measurements:
         row_type: type[AnyFields],
         measure: Callable[[], Sequence[AnyFields]],
     ) -> list[AnyFields]:
-        """Return rows that are stored under a key; measure and store them if there are
-        none, as `get`.
+        """Return the rows that are stored under a key, or measure and store them.
+
+        Args:
+            key: key of the measurement in the store of the run.
+            row_type: class of the rows.
+            measure: measures the rows.
+
+        Raises:
+            OutOfTime: they would have to be measured, and the time is up.
         """
         return [
             row_type.of(row)
@@ -93,20 +110,22 @@ class Measurements:
     def collect(
         self, rows: Iterable[Row], make_result: Callable[[list[Row]], AnyResult]
     ) -> AnyResult:
-        """Take rows until they end, the time is up or there is an interrupt, and return
-        the result of the rows taken.
+        """Collect rows until they end, and return their result.
 
-        The summary is written after each new row, so that a kill leaves it. It never
-        has fewer rows than before the run was resumed: stored rows are taken first, and
-        if an interrupt comes before they were all read, the earlier result is returned.
+        It ends earlier if the time is up or the user presses Ctrl-C. The summary is
+        written after each new row, so that a kill of the process leaves it. A resumed
+        run never has fewer rows than before: if an interrupt comes before all stored
+        rows were read, the earlier result is returned.
 
         Args:
-            rows: measures each row when it is taken.
+            rows: iterator that measures each row when it is taken; stored rows come
+                first.
             make_result: makes the result from the rows so far.
         """
         context = self._context
         collected_rows: list[Row] = []
-        context.ending = INTERRUPTED  # unless the rows end, or the time is up
+        # replaced below if the rows end, or the time is up
+        context.ending = INTERRUPTED
         try:
             with interruptible():
                 for row in rows:

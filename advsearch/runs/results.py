@@ -121,8 +121,10 @@ class Result(Fields):
         return {"schema": SCHEMA, "command": self.command, **super().to_dict()}
 
     def facts(self) -> dict[str, str]:
-        """Return the fields that are declared with `as_fact`, as texts by their names;
-        None and NaN are left out.
+        """Return the fields that are declared with `as_fact`, as texts by their names.
+
+        Terminal, report and notebook show them. Fields that are None or NaN are left
+        out.
         """
         facts = {}
         for name, field in self.described().items():
@@ -801,11 +803,16 @@ class SharedWork(Fields):
 
 
 def kind_of(values: JsonObject) -> type[Result] | None:
-    """Return the class of the result in a `summary.json`; None where there is no such
-    experiment.
+    """Return the class of the result in a `summary.json`.
 
-    An experiment may have several kinds of results; each of the others has a field that
-    tells it from the main one.
+    An experiment may have several kinds of results besides the main one. Each of these
+    has a field that no other kind has.
+
+    Args:
+        values: content of the file; its "command" names the experiment.
+
+    Returns:
+        The class; None if there is no such experiment.
     """
     command = str(values.get("command"))
     if command not in registry.EXPERIMENTS:

@@ -82,10 +82,10 @@ class Row:
 
 @dataclass(frozen=True)
 class CachedEvaluation:
-    """What a search was told of an evaluation that its row does not have.
+    """What a search needs of an evaluation to be resumed, and the row does not have.
 
-    A policy's state follows from the evaluations that it was told of, so a search that
-    is resumed is told of all of them again.
+    The state of a policy follows from the evaluations that it has received. So a search
+    is resumed by sending it all of them again.
     """
 
     number: int  # index of the evaluation in the search
@@ -125,11 +125,14 @@ class Store:
     NOT_A_NUMBER: ClassVar[str] = NOT_A_NUMBER
 
     def __init__(self, path: Path, *, read_only: bool = False) -> None:
-        """Open a database, and check its version and its tables; without `read_only`,
-        make it if it is missing.
+        """Open a database, and check its version and its tables.
+
+        Args:
+            path: path of the file.
+            read_only: whether it is only read. Otherwise it is made if it is missing.
 
         Raises:
-            FileFormatError: it is none of advsearch, or of another version.
+            FileFormatError: it was not written by advsearch, or by another version.
         """
         self.path = path
         # the first rows are synced at once
@@ -155,11 +158,11 @@ class Store:
     def append(
         self, rows: Sequence[Row], cached: CachedEvaluation | None = None
     ) -> None:
-        """Add rows in one transaction; where the disk is full, none of them is kept.
+        """Add rows in one transaction: if the disk is full, none of them is stored.
 
-        When this returns they survive a kill of the process. The disk is waited for
-        only now and then, so that a power cut may lose the last rows. A row whose kind
-        and step are there already changes nothing.
+        When this returns, they survive a kill of the process. Only now and then the
+        function waits until the disk has them, so that a power cut may lose the last
+        rows. A row whose kind and step are stored already changes nothing.
 
         Args:
             rows: rows of evaluations.
@@ -184,15 +187,20 @@ class Store:
         if must_sync:
             end_time = time.monotonic()
             sync_seconds = end_time - start_time
-            # the next one only after so long that all take at most `SYNC_SHARE` of the
-            # time
+            # On a slow disk the wait is longer, so that syncing takes at most
+            # `SYNC_SHARE` of the time.
             wait_seconds = max(SYNC_INTERVAL, sync_seconds / SYNC_SHARE)
             self._next_sync = end_time + wait_seconds
 
     def _select(self, query: str, *parameters: Any) -> Iterator[Any]:
-        """Yield the rows of a query; an error of SQLite becomes one of ours.
+        """Yield the rows of a SELECT query.
 
-        The caller's own errors between two rows pass through unchanged.
+        Errors of SQLite become FileFormatError. The context that does this is left
+        before each row is yielded, so that errors of the caller pass unchanged.
+
+        Args:
+            query: the query after "SELECT".
+            *parameters: values for its question marks.
         """
         with translate_database_errors(self.path):
             cursor = self._db.execute(f"SELECT {query}", parameters)
@@ -203,10 +211,11 @@ class Store:
                 row = cursor.fetchone()
 
     def rows(self, kind: str | None = None, after: int = 0) -> Iterator[Row]:
-        """Yield the rows, or those of one kind, in the order in which they were
-        written.
+        """Yield rows in the order of their ids.
 
-        Only rows with an id larger than `after` are read.
+        Args:
+            kind: kind of the rows; None for all kinds.
+            after: only rows with a larger id.
         """
         condition = "id > ?"
         parameters: list[int | str] = [after]
@@ -231,9 +240,15 @@ class Store:
         )
 
     def read_cached(self, kind: str, step: int) -> tuple[Row, CachedEvaluation] | None:
-        """Return a row of a search with what the search was told of it that no row has.
+        """Return a row of a search, with what the search needs of it to be resumed.
 
-        None if there is no such row, or the run is done, when the rest is deleted.
+        Args:
+            kind: kind of the search.
+            step: index of the evaluation.
+
+        Returns:
+            The row, and gradient, cost and more, which the row lacks. None if there is
+            no such row, or if the run is done: then only rows are left.
         """
         row = self.read_row(kind, step)
         if row is None:
@@ -247,10 +262,14 @@ class Store:
     def iterate_images(
         self, kind: str, after: int, until: int
     ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        """Yield number and picture (H, W, 3) of rows of a kind, as long as the run goes
-        on and keeps them.
+        """Yield the number and the image (H, W, 3) of rows of a kind.
 
-        The ids of the rows are larger than `after`, and `until` at most.
+        Images are stored only until the run is done.
+
+        Args:
+            kind: kind of the rows.
+            after: only rows with a larger id.
+            until: only rows with at most this id.
         """
         query = (
             # NULL instead of the gradient, which nobody needs here
@@ -269,8 +288,10 @@ class Store:
         return bool(next(self._select("EXISTS (SELECT * FROM told)"))[0])
 
     def delete_cached(self) -> None:
-        """Delete what rows told their searches: the run is done. The file gets smaller
-        by it.
+        """Delete what searches would need to be resumed, as the run is done.
+
+        That is gradients and images, which take most of the file. So the file is then
+        compacted.
         """
         check_not_moved(self.path)
         with storage_errors(self.path):
@@ -286,6 +307,7 @@ class Store:
         return int(step)
 
     def count_rows(self, kind: str | None = None) -> int:
+        """Return the number of rows of a kind; None for all kinds."""
         condition, parameters = (
             ("", []) if kind is None else (" WHERE kind = ?", [kind])
         )
@@ -294,8 +316,11 @@ class Store:
         )
 
     def find_missing_steps(self, kind: str, count: int) -> Iterator[range]:
-        """Yield the steps from 0 to below `count` that have no row of a kind,
-        neighbours as one range.
+        """Yield the steps that have no row of a kind, neighbors as one range.
+
+        Args:
+            kind: kind of the rows.
+            count: steps from 0 to below this are expected.
         """
         expected = 0  # the step after the row before
         steps = self._select("step FROM evaluations WHERE kind = ? ORDER BY step", kind)
@@ -363,9 +388,10 @@ _JSON = json.JSONEncoder(allow_nan=False)
 
 
 def _encode_cached(cached: CachedEvaluation) -> tuple[Any, ...]:
-    """Return what an evaluation told its search as the values of its columns.
+    """Return a cached evaluation as the values of its columns, for SQLite.
 
-    Arrays become their bytes; the height of the picture tells their shape.
+    Arrays become bytes. The height of the picture is stored as well, from which its
+    width follows.
     """
     arrays = [
         None if array is None else array.tobytes()
@@ -385,8 +411,8 @@ def _encode_cached(cached: CachedEvaluation) -> tuple[Any, ...]:
 def _encode(row: Row, stamp: float) -> tuple[Any, ...]:
     """Return a row as the values of its columns, for SQLite.
 
-    Numbers of numpy and torch become Python's, mappings become JSON, and empty metrics
-    become NULL.
+    Numbers of NumPy and torch become numbers of Python, mappings become JSON, and empty
+    metrics become NULL. Time and id stand last in the columns.
 
     Args:
         row: row of an evaluation.
@@ -436,8 +462,14 @@ MAX_STEP = (1 << 32) - 1
 
 
 def _decode(values: tuple[Any, ...], path: Path) -> Row:
-    """Return a row from the values of its columns, each of which is checked: the file
-    may come from somebody else.
+    """Return a row from the values of its columns.
+
+    Each value is checked, since the file may come from somebody else, and SQLite allows
+    any type in any column.
+
+    Args:
+        values: values in the order of the fields of `Row`.
+        path: path of the file, for the message.
 
     Raises:
         FileFormatError: a column has another type, or a number that no row has.
@@ -464,10 +496,13 @@ def _find_wrong_column(by_name: Mapping[str, Any]) -> str | None:
 
 
 def _decode_json_columns(by_name: dict[str, Any]) -> str | None:
-    """Replace JSON texts by what they stand for.
+    """Replace the JSON texts in a row by the values that they encode.
+
+    Args:
+        by_name: values by column, which are changed in place.
 
     Returns:
-        The first column whose JSON is not that of a row; None if all fit.
+        The first column whose JSON does not fit a row; None if all fit.
     """
     by_name["values"] = _parse_named(by_name["values"], _is_value)
     if by_name["values"] is None:
@@ -487,7 +522,11 @@ def _decode_json_columns(by_name: dict[str, Any]) -> str | None:
 
 
 def _decode_cached(values: tuple[Any, ...], path: Path) -> CachedEvaluation:
-    """Return what an evaluation told its search, from the values of its columns.
+    """Return a cached evaluation from the values of its columns.
+
+    Args:
+        values: values in the order of `_CACHED_COLUMNS`.
+        path: path of the file, for the message.
 
     Raises:
         FileFormatError: a column has another type, or the picture another size.
@@ -511,8 +550,14 @@ def _decode_cached(values: tuple[Any, ...], path: Path) -> CachedEvaluation:
 
 
 def _parse_named(text: str, fits: Callable[[Any], bool]) -> dict[str, Any] | None:
-    """Return the JSON object in a text; None where it is no object, or `fits` is false
-    for one of its values.
+    """Return the JSON object in a text.
+
+    Args:
+        text: the JSON.
+        fits: whether a value of the object is allowed.
+
+    Returns:
+        The object; None if it is none, or if a value is not allowed.
     """
     try:
         named = json.loads(text)

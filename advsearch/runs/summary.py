@@ -67,8 +67,9 @@ def read_result(folder: Path) -> Result:
 
 
 def read_stored_result(folder: Path) -> Result:
-    """Return the result of the run in `folder` as it was written, whether or not a
-    process works on the run.
+    """Return the result of the run in a folder as its `summary.json` states it.
+
+    Its ending is then not `RUNNING`, even if a process works on the run.
 
     Raises:
         FileFormatError: there is none, or it is not what this version writes.
@@ -91,7 +92,7 @@ def read_stored_result(folder: Path) -> Result:
     try:
         return kind.of(values)
     except ValidationError as error:
-        # one is enough, and the values are not quoted
+        # The message states the first error only, and no values, which may be long.
         first = error.errors(include_url=False, include_input=False)[0]
         what = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"[:120]
         got = (
@@ -120,8 +121,11 @@ named, and parses the header as Python, which ends in errors of any kind.
 
 
 def write_configuration(run: Path, u: NDArray[np.float32]) -> Path:
-    """Keep a configuration (d,) of the unit box, whole or not at all, and return
-    where.
+    """Write the adversarial configuration of a run atomically, and return its path.
+
+    Args:
+        run: directory of the run.
+        u: (d,) the configuration, in [0, 1].
     """
     buffer = io.BytesIO()
     np.save(buffer, np.ascontiguousarray(u, dtype=np.float32), allow_pickle=False)
@@ -155,8 +159,10 @@ def read_configuration(run: Path) -> NDArray[np.float32]:
 
 
 def _parse_array(data: bytes) -> NDArray[np.float32] | None:
-    """Return the numbers (d,) in a file of numpy; None unless it is `HEADER` with
-    their count d, and four bytes for each.
+    """Return the numbers (d,) in the content of a .npy file.
+
+    None unless the content is a `HEADER` with the count d, followed by four bytes for
+    each number.
     """
     header = HEADER.match(data)
     if header is None:
@@ -186,8 +192,10 @@ file.
 
 
 def collect_versions(settings: Mapping[str, object]) -> dict[str, str]:
-    """Return what decides the numbers of a run beside its settings: versions by
-    package, and the SHA-256 of each file and bundled thing that the settings name.
+    """Return what decides the numbers of a run apart from its settings.
+
+    These are the versions of Python and of packages by name, and the SHA-256 of each
+    file and each bundled object, environment or model that the settings name.
     """
     facts = {"python": platform.python_version()}
     for name in PACKAGES:
@@ -217,10 +225,17 @@ NAMES_BUNDLED = (
 
 
 def compute_bundled_digests(settings: Mapping[str, object]) -> dict[str, str]:
-    """Return the SHA-256 of each bundled object, environment and model that settings
-    name.
+    """Return the SHA-256 of each bundled thing that settings name.
 
-    The digest of a folder is that of a list of its files with their digests.
+    Bundled things are objects, environments and the reference model. They may change
+    with a new version of advsearch. The digest of a folder is that of a list of its
+    files with their digests.
+
+    Args:
+        settings: settings by name.
+
+    Returns:
+        Digests by name, such as "bundled object mug".
     """
     package = Path(__file__).parent.parent
     names = _list_bundled_names(settings)
@@ -237,7 +252,7 @@ def compute_bundled_digests(settings: Mapping[str, object]) -> dict[str, str]:
 
 
 def _list_bundled_names(settings: Mapping[str, object]) -> set[str]:
-    """Return what may be names of bundled objects and environments in settings."""
+    """Return the words in settings that may name bundled objects and environments."""
     names = {
         name
         for setting in NAMES_BUNDLED
@@ -278,9 +293,13 @@ def find_changed_facts(
 ) -> list[str]:
     """Return the names of facts that have another value now than before.
 
-    A fact that was not known before has not changed. A file is known by the last part
-    of its path, since it may have been moved; where several had that name, one with the
-    same value is enough.
+    A fact that is only known now counts as unchanged. Files are compared by the last
+    part of their path, since they may have been moved. If several files had the same
+    name, it is enough that one of them has the same digest.
+
+    Args:
+        before: values by name when the run began. A name may be the path of a file.
+        now: values by name now.
     """
     values_before: dict[str, list[object]] = {}
     for path, value in before.items():
@@ -296,12 +315,11 @@ def find_changed_facts(
 def find_changed_file(
     before: Mapping[str, object], settings: Mapping[str, object]
 ) -> str | None:
-    """Return the name of one file that settings name and that has changed; None if none
-    has.
+    """Return the name of a file that has changed since a run began; None if none has.
 
     Args:
-        before: digests by path.
-        settings: name the files now.
+        before: digests by path when the run began.
+        settings: settings by name, which name the files.
     """
     settings_read_again = {
         name: value for name, value in settings.items() if name not in NOT_READ_AGAIN
@@ -313,37 +331,41 @@ def find_changed_file(
 
 
 def compute_file_digests(settings: Mapping[str, object]) -> dict[str, str]:
-    """Return the SHA-256 of each file that settings name, in hexadecimal, by its name
-    there.
+    """Return the SHA-256 of each file that settings name, in hexadecimal, by its path.
 
-    Files that were read for it (materials, pictures and buffers that a mesh or a scene
-    names) have their own, and a folder has one for all its files. What is bundled or
-    gone has none.
+    Files that were read for such a file have digests of their own, as the materials and
+    pictures that a mesh names. A folder has one digest for all its files. Bundled
+    things and missing files have none.
+
+    Args:
+        settings: settings by name.
     """
     digests: dict[str, str] = {}
     for name, value in settings.items():
         for path in _find_paths(value):
             with suppress(OSError, ValueError):
-                # one by one, so that those before an error are kept
+                # One by one: if a file cannot be read, the digests before it stay.
                 for file_name, digest in _iterate_digests(name, path):
                     digests[file_name] = digest
     return digests
 
 
 def _iterate_digests(setting: str, path: str) -> Iterator[tuple[str, str]]:
-    """Yield name and digest of the folder or the file that a setting names, and of the
-    files that were read for it.
+    """Yield path and digest of each file that a value of a setting stands for.
+
+    It may be a folder, a file, and the files that were read for that file.
 
     Args:
-        setting: its name, which says whether it may name a file or a folder.
-        path: a part of its value.
+        setting: name of the setting, by which it is known whether it may name a file
+            or a folder.
+        path: the path, a part of the setting's value.
 
     Raises:
         OSError: a file cannot be read.
         ValueError: it is no possible path.
     """
     absolute_path = os.path.abspath(path)
-    # the file itself and others, if this process has read it
+    # If this process has read the file: the file itself, and those read for it.
     opened_files = list_opened_files(absolute_path)
     folder = ""
     if os.path.isabs(path):
@@ -363,8 +385,12 @@ def _iterate_digests(setting: str, path: str) -> Iterator[tuple[str, str]]:
 
 
 def _digest_folder(folder: Path, pattern: str) -> str:
-    """Return one SHA-256 of the names and contents of the files that match a
-    pattern.
+    """Return one SHA-256 of the names and contents of files in a folder.
+
+    Args:
+        folder: the folder.
+        pattern: pattern of the paths of its files that count, such as "*/*". At most
+            `MAX_FILES` do.
     """
     paths = sorted(islice(folder.glob(pattern), MAX_FILES))
     lines = [
@@ -378,10 +404,10 @@ def _digest_folder(folder: Path, pattern: str) -> str:
 def _find_paths(value: object) -> Iterator[str]:
     """Yield what may be the path of a file in a setting.
 
-    Names are separated by commas. Of ``reference@weights.safetensors``,
-    ``scene.glb#NODE`` and ``camera.csv+object.csv`` the parts are yielded that may be
-    paths, and the full text too, since a path may have these signs in it. Lists and
-    mappings are searched for texts.
+    Names are separated by commas. Some name a file in a part of the text:
+    ``reference@weights.safetensors``, ``scene.glb#NODE`` and
+    ``camera.csv+object.csv``. Then the parts are yielded, and the full text too, since
+    a path may have these signs in it. Lists and mappings are searched for texts.
     """
     if isinstance(value, (Mapping, list, tuple)):
         for inner in value.values() if isinstance(value, Mapping) else value:
@@ -398,6 +424,7 @@ def _find_paths(value: object) -> Iterator[str]:
 
 
 def _digest_file(path: Path) -> str:
+    """Return the SHA-256 of a file, which is read in pieces of 1 MiB."""
     digest = hashlib.sha256()
     with path.open("rb") as file:
         while part := file.read(1 << 20):

@@ -54,7 +54,8 @@ class Units:
     frames: Annotated[int, Field(strict=True, ge=0)] | None = None
     samples: Count = 1  # draws at each point of the grid
     models: Count = 1  # models that are shown the same pictures
-    # pictures after which the draws come again; 0 for never
+    # number of pictures after which the same draws come again, with the adversarial
+    # scene; 0 for never
     again: Annotated[int, Field(strict=True, ge=0, le=MAX_ROWS)] = 0
     noise: Count = 1  # pictures of each draw that differ in noise alone
     # Photographs of a folder, in which the scenes are in turn; 1 where there is no
@@ -64,6 +65,11 @@ class Units:
 
     @property
     def size(self) -> int:
+        """Number of rows that follow one another and belong to one unit.
+
+        Each image has a row for each model. With `again`, all images come twice:
+        without and with the adversarial scene.
+        """
         if self.photographs > 1:
             return self.models * (2 if self.again else 1) * self.scene
         frames = 1 if self.frames is None else self.sizes[self.frames]
@@ -83,13 +89,16 @@ class Units:
         return self.find_cluster(step // self.models)
 
     def find_cluster(self, image_index: Number) -> Number:
-        """Return the number of the unit of a picture: that of its photograph, or of its
-        draw where there is no folder of photographs.
+        """Return the number of the unit of a picture.
+
+        It is the number of its photograph or, without a folder of photographs, of its
+        draw.
 
         Args:
             image_index: number of the picture in the whole sweep, or an array of them.
         """
-        # the scenes, of `scene` pictures each, are in the photographs in turn
+        # Each scene has `scene` pictures and is in one photograph; the photographs are
+        # used in turn.
         if self.photographs > 1:
             return image_index // self.scene % self.photographs
         return self.find_draw(image_index)
@@ -109,27 +118,32 @@ class Units:
         image_index = image_index // self.noise
         if self.frames is None:
             return image_index
-        # the picture is a sample of a point of the grid; the frame is one digit of the
-        # point in mixed radix, and is taken out
+        # A point of the grid is a number whose digits, in mixed radix, are the indices
+        # along the axes. The digit of the frame is left out of it, so that all frames
+        # of a drive get the same number.
         point = image_index // self.samples
         sample = image_index % self.samples
-        # points along the axes that are faster than the frames
+        # number of points along the axes after that of the frames
         after = prod(self.sizes[self.frames + 1 :])
-        # scenes are like one more axis, the slowest
+        # Index along the axes before that of the frames. Scenes act as one more axis,
+        # which is the first.
         before = point // (self.sizes[self.frames] * after)
         return (before * after + point % after) * self.samples + sample
 
 
 def read_units(store: Store, *, is_sampled: bool = True) -> Units | None:
-    """Return what a run notes of its units; None where it notes nothing.
+    """Return which rows of a run are not independent, as the run has noted it.
 
     Args:
         store: store of the run.
-        is_sampled: something was drawn by chance. Older notes do not say it: where
-            nothing was drawn, their samples differ in noise alone.
+        is_sampled: whether something was sampled by chance. If not, the samples of an
+            older note differ only in noise, and count as such.
+
+    Returns:
+        The units; None if the run has not noted any.
 
     Raises:
-        FileFormatError: the note says something impossible.
+        FileFormatError: the note has impossible values.
     """
     noted = store.read_json_note(UNITS_NOTE)
     if noted is None:
@@ -174,10 +188,10 @@ RESERVED_NAMES = {*(field.name for field in fields(Row)), "unit", "outcome"}
 
 
 def to_pandas(rows: Iterable[Row]) -> pd.DataFrame:
-    """Return rows as a frame with the columns of an export.
+    """Return rows as a pandas frame with the columns of an export.
 
-    Names are without units: a value is called ``pose.yaw``, and
-    ``attrs["units"]["pose.yaw"]`` says "degrees".
+    Columns are named without units: a value is called ``pose.yaw``, and
+    ``attrs["units"]["pose.yaw"]`` is "degrees".
     """
     row_list = list(rows)
     names = {column: column.partition(" [")[0] for column in list_columns(row_list)}
@@ -187,7 +201,7 @@ def to_pandas(rows: Iterable[Row]) -> pd.DataFrame:
     ]
     frame = pd.DataFrame(records, columns=list(names.values()))
     frame.attrs["units"] = {
-        # what is in the brackets of "NAME [UNIT]"
+        # the unit of "NAME [UNIT]": from behind " [" to before "]"
         plain: name[len(plain) + 2 : -1]
         for name, plain in names.items()
         if plain != name
@@ -203,19 +217,19 @@ def read_sweep(
     *,
     is_sampled: bool = True,
 ) -> pd.DataFrame:
-    """Return the rows of the sweep in `run` as `make_sweep_frame` does, with their
-    units.
+    """Return the rows of a sweep as a pandas frame.
 
-    Column `unit` says which rows are not independent (`Units`), ``attrs["unit name"]``
-    what such a unit is, and ``attrs["edges"]`` where the ranges of drawn parameters are
-    cut.
+    The columns are those of `make_sweep_frame`. Rows with the same number in the column
+    `unit` are not independent (`Units`). ``attrs["unit name"]`` states what a unit is,
+    such as "drive", and ``attrs["edges"]`` where the range of each sampled parameter is
+    divided.
 
     Args:
-        run: its folder.
+        run: folder of the run.
         after: only rows with a larger id.
-        max_rows: how many at most; None for all.
-        extra_columns: more columns, from a row.
-        is_sampled: something was drawn by chance (`read_units`).
+        max_rows: maximum number of rows; None for all.
+        extra_columns: function that returns more columns of a row.
+        is_sampled: whether something was sampled by chance, see `read_units`.
 
     Raises:
         FileFormatError: the results cannot be read.
@@ -234,8 +248,11 @@ def read_sweep(
 
 
 def _parse_edges(noted: Any) -> dict[str, list[float]]:
-    """Return where the range of each parameter is cut, as a run has noted it; what has
-    another form is left out.
+    """Return where the range of each parameter is divided, as a run has noted it.
+
+    Args:
+        noted: the note, such as {"camera.azimuth": [0, 120, 240, 360]}. What has
+            another form is left out, as the file may come from somebody else.
     """
     edges_by_name = {}
     for name, edges in noted.items() if isinstance(noted, dict) else ():
@@ -249,14 +266,19 @@ def make_sweep_frame(
     rows: Iterable[Row],
     extra_columns: Callable[[Row], Mapping[str, float]] | None = None,
 ) -> pd.DataFrame:
-    """Return rows of a sweep as a frame: `FIXED_COLUMNS`, a column for each parameter,
-    the `extra_columns` of each row, and `unit`, which here is the step.
+    """Return rows of a sweep as a pandas frame.
 
-    Numbers are float64, NaN where a row has none; `correct` is 1 or 0, NaN where it was
-    not judged. `label`, `outcome` (of `options.Outcome`, "" where a row has none) and
-    parameters with a text anywhere are categories in the order in which they come,
-    "none" where a row has nothing. A parameter of several numbers has a column for
-    each, such as ``camera.target[0]``; ``attrs["units"]`` has the units.
+    Its columns are `FIXED_COLUMNS`, one for each parameter, those of `extra_columns`,
+    and `unit`, which here is the step. Numbers are float64, and NaN if a row has none.
+    `correct` is 1 or 0, and NaN if the row was not judged. Columns with texts are
+    categories, in the order in which these occur: `label`, `outcome` (of
+    `options.Outcome`, or ""), and parameters of which any value is a text. A row
+    without a value has the category "none". A parameter of several numbers has a
+    column for each, such as ``camera.target[0]``. ``attrs["units"]`` has the units.
+
+    Args:
+        rows: rows of the sweep.
+        extra_columns: function that returns more columns of a row.
     """
     units = dict[str, str]()
     cells = (
@@ -293,12 +315,14 @@ def _make_chunk_frame(cells: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
 
 
 def _make_cells(row: Row, number: int, units: dict[str, str]) -> dict[str, Any]:
-    """Return what is known of a row by column, and add the units of its parameters to
-    `units`.
+    """Return the values of a row by column.
 
-    `number` is the row's place from 1, which is its id where it has none.
+    Args:
+        row: the row.
+        number: number of the row from 1, which is its id if it has none.
+        units: units by column, to which those of the row's parameters are added.
     """
-    # a row that was judged without a label is one whose output is not a number
+    # A row that was judged but has no label is that of an output that was NaN.
     label = row.label or ("" if row.correct is None else NOT_A_NUMBER)
     outcome = get_outcome(row.payload)
     # in the order of `FIXED_COLUMNS`
@@ -323,8 +347,10 @@ def _make_cells(row: Row, number: int, units: dict[str, str]) -> dict[str, Any]:
 
 
 def _to_categories(column: pd.Series) -> pd.Categorical:
-    """Return a column that has names as categories, in the order in which they come;
-    numbers among them follow.
+    """Return a column with texts as a column of categories.
+
+    Categories are the texts in the order in which they occur, followed by the numbers
+    among them, as texts.
     """
     texts = list(map(_as_category, column))
     names = [value for value in column if isinstance(value, str)]

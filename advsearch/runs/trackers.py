@@ -32,6 +32,7 @@ _LOG = logging.getLogger("advsearch")
 
 
 def check_tracker(name: str | None) -> None:
+    """Check that a tracker exists and is installed; None stands for no tracker."""
     if name is None:
         return
     if name not in PACKAGES:
@@ -40,6 +41,7 @@ def check_tracker(name: str | None) -> None:
 
 
 def _import_package(name: str) -> Any:
+    """Import the package of a tracker; raise InputError if it is not installed."""
     try:
         return importlib.import_module(PACKAGES[name])
     except ImportError:
@@ -105,8 +107,14 @@ class Tracker:
         self._n_judged[kind] += len(is_correct)
 
     def _compute_metrics(self, kind: str, rows: Sequence[Row]) -> MetricValues:
-        """Return the means over some rows of a kind, and the accuracy over all rows of
-        the kind so far; names begin with the kind.
+        """Return metrics of rows by name, such as "search/margin".
+
+        They are means over these rows. The accuracy is that of all rows of the kind so
+        far, since a mean over few rows would jump.
+
+        Args:
+            kind: kind of the rows, with which the names begin.
+            rows: rows that were stored together.
         """
         metrics = {}
         for name in METRICS:
@@ -120,13 +128,19 @@ class Tracker:
         return metrics
 
     def _put(self, message: tuple[MetricValues, int] | None) -> None:
+        """Queue metrics and their step for the thread; None ends the thread."""
         try:
             self._queue.put_nowait(message)
         except Full:
             return  # a tracker that is that slow is told less; the run has all of it
 
     def _work(self, folder: Path, settings: Mapping[str, str]) -> None:
-        """Send messages until None comes; the body of the thread."""
+        """Send messages until None comes; this is what the thread runs.
+
+        Args:
+            folder: folder of the run.
+            settings: settings of the run as texts, by name.
+        """
         try:
             log_metrics, close = _open_tracker(self._name, folder, settings)
             message = self._queue.get()
@@ -148,13 +162,13 @@ def _open_tracker(
     """Open a run of a tracker.
 
     Args:
-        name: name of the tracker.
-        folder: folder of our run.
-        settings: texts by name.
+        name: "mlflow", "tensorboard" or "wandb".
+        folder: folder of our run, whose name the tracker's run gets.
+        settings: settings of the run as texts, by name.
 
     Returns:
-        A function that sends numbers by name with their step, and one that ends the
-        run.
+        A function that sends metrics by name with their step, and a function that ends
+        the tracker's run.
     """
     package = _import_package(name)
     if name == "mlflow":
@@ -182,8 +196,8 @@ def _open_tracker(
     )
 
     def log(numbers: MetricValues, step: int) -> None:
-        # wandb's own counter only ever goes up, but the steps of each kind begin at 0:
-        # they are sent as a number
+        # The step of wandb itself may never decrease, but the steps of each kind of
+        # rows begin at 0. So the step is sent as a metric of its own.
         kind = next(iter(numbers), "rows/").partition("/")[0]
         run.log({**numbers, f"{kind}/step": step})
 

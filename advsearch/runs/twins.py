@@ -52,18 +52,25 @@ def find_twin_evidence(
     environment: str,
     in_photograph: bool = False,
 ) -> TwinEvidence | None:
-    """Return what a run of twins measured for the nearest conditions.
+    """Return how well renders agreed with photographs, for conditions like those given.
+
+    A run of `advsearch twins` compares a model's predictions on photographs with those
+    on renders of the same scenes. The row of its table is chosen that is nearest to the
+    conditions of another run.
 
     Args:
-        run: run of twins, its name or folder; None for none.
-        model: name of the model of the other run, to which all these belong.
-        task: task that judged it.
-        object_name: a bundled name, or a file.
-        environment: name of the environment around the object.
-        in_photograph: the scene is rendered into a photograph.
+        run: name or folder of the run of twins; None if there is none.
+        model: name of the model of the other run.
+        task: name of the task of the other run.
+        object_name: object of the other run, a bundled name or a file.
+        environment: name of the environment of the other run.
+        in_photograph: whether the other run renders into a photograph.
+
+    Returns:
+        The row, or why no row fits; None without a run of twins.
 
     Raises:
-        InputError: as `read_twins`.
+        InputError: there is no such run, or it is a run of another command.
     """
     if run is None:
         return None
@@ -80,11 +87,12 @@ def find_twin_evidence(
         return _make_empty(run, TwinMatch.OTHER_TASK)
     surroundings = IN_PHOTOGRAPH if in_photograph else environment
     stem = PurePath(object_name).stem
-    # The nearest row: of this object, or else of all objects together; among these in
-    # these surroundings, or else in any but photographs.
+    # The nearest row is that of the same object, or else that of all objects together,
+    # which has no object. Among several, it is that of the same surroundings, or else
+    # one that is not in a photograph.
     row = max(
         (row for row in rows if not row.condition),
-        # by the first of these in which rows differ; a row without object is over all
+        # tuples are compared by the first entry in which they differ
         key=lambda row: (
             row.object == stem,
             not row.object,
