@@ -83,7 +83,7 @@ def _describe_predictions(
 ) -> list[str]:
     """Describe for how many groups the most frequent prediction is mostly right.
 
-    Those for which it is not are described each.
+    Each group for which it is mostly wrong has a sentence of its own.
 
     Args:
         groups: for each group the predictions, the most frequent first, each with its
@@ -193,8 +193,9 @@ def make_cues_figure(rows: Rows, options: CuesOptions) -> FigureContent:
 
     Its sentences also say which of both cues predicts the predictions better.
     """
-    # All three are by texture: which predictions about it name the texture, and how
-    # many name the object and the texture.
+    # The three mappings are by the name of the texture. `names_texture` has a flag for
+    # each row: whether its prediction names the texture. The others count the rows
+    # whose prediction names the object, and those whose prediction names the texture.
     names_texture = dict[str, Any]()
     by_shape = dict[str, ClusteredFraction]()
     by_texture = dict[str, ClusteredFraction]()
@@ -257,9 +258,10 @@ def _describe_named(
 
 
 def _names_class(predictions: Any, classes: Sequence[str]) -> Any:
-    """Return which predictions (n,) name one of the classes.
+    """Return a flag for each prediction (n,): whether it names one of the classes.
 
-    A label may be a list of synonyms, as in "cup, mug": it matches in full, or by one.
+    A label may be a list of synonyms, such as "cup, mug". It matches if the full label
+    is a class, or if one of the synonyms is.
     """
     names = predictions.map(
         lambda label: {label.strip(), *map(str.strip, label.split(","))}
@@ -305,11 +307,11 @@ def _draw_cues(
 def count_predicted(rows: Rows, options: CuesOptions) -> list[tuple[int, int, int]]:
     """Count how many predictions the shape and the texture predict, by pair of both.
 
-    To predict what a model says about a pair, a cue takes its most frequent prediction
-    about the same object with other textures, or about the same texture on other
-    objects. Both sets are sampled to the size of the smaller, and neither has the
-    pair's own predictions, so that a model that goes by neither cue is predicted
-    equally well by both.
+    The shape predicts, for a pair of object and texture, the model's most frequent
+    label for the same object with other textures. The texture predicts the most
+    frequent label for the same texture on other objects. Both sets of labels are
+    sampled to the size of the smaller one, and neither has the pair's own labels: so a
+    model that uses neither cue is predicted equally well by both.
 
     Args:
         rows: predictions with object and texture.
@@ -375,9 +377,12 @@ def _most_frequent_of_sample(
 def _compare_cues(pairs: Sequence[tuple[int, int, int]]) -> str:
     """Describe by how many percentage points the shape predicts better.
 
-    Predictions about one pair of object and texture are dependent: the interval is a
-    percentile bootstrap over pairs. `pairs` are counts as `count_predicted` returns
-    them.
+    The predictions about one pair of object and texture are not independent. Therefore
+    the interval is a percentile bootstrap over pairs.
+
+    Args:
+        pairs: for each pair the number of predictions, those that the shape predicts,
+            and those that the texture predicts.
     """
     if len(pairs) < MIN_PAIRS:
         return (
@@ -553,7 +558,16 @@ def _read_mixtures(rows: Rows, options: TernaryOptions) -> Float64Array:
 def _margins_by_ingredient(
     rows: Rows, names: Sequence[str], main_ingredient: npt.NDArray[np.intp]
 ) -> dict[str, Float64Array]:
-    """Return the known margins of the mixtures in which each ingredient is largest."""
+    """Return the known margins of the mixtures in which each ingredient is largest.
+
+    Args:
+        rows: rows of one mixture each.
+        names: names of the ingredients.
+        main_ingredient: (n,) index of the largest ingredient in each row.
+
+    Returns:
+        The margins by the name of the ingredient.
+    """
     margin = rows["margin"].astype(float).to_numpy()
     is_known = ~np.isnan(margin)
     return {
@@ -700,8 +714,9 @@ def find_triangle(mixture: Sequence[float], side: int) -> Triangle:
         side: number of triangles along a side of the diagram.
     """
     a, b, c = (int(fraction * side) for fraction in mixture)
-    # The sum is `side` at a corner, which several triangles share. It counts for one of
-    # those that have no larger value of its largest fraction.
+    # Inside a triangle the sum of the rounded numbers is `side - 1` or `side - 2`. At a
+    # corner, which several triangles share, nothing is rounded and it is `side`: 1 is
+    # taken from the largest number, so that the corner belongs to one triangle.
     while a + b + c >= side:
         if a >= max(b, c):
             a -= 1
@@ -709,8 +724,8 @@ def find_triangle(mixture: Sequence[float], side: int) -> Triangle:
             b -= 1
         else:
             c -= 1
-    # The three numbers add up to `side` before they are rounded down, which takes 1 from
-    # the sum in a triangle that points up, and 2 in one that points down.
+    # Before rounding down, the three numbers add up to `side`. Rounding takes 1 in total
+    # from the sum in a triangle that points up, and 2 in one that points down.
     points_down = a + b + c < side - 1
     return a, b, points_down
 
@@ -802,9 +817,9 @@ def _choose_color_range(
 ) -> tuple[float, float]:
     """Return the values of the first and the last color of a ternary diagram.
 
-    Fractions have colors from 0 to 1, or if normalised to the largest of them. Margins
-    have colors up to the largest: from 0, or from the smallest if it is below 0 or if
-    they are normalised.
+    The colors of fractions go from 0 to 1; if normalised, from 0 to the largest value.
+    The colors of margins go to the largest value. They begin at 0, or at the smallest
+    value if it is below 0 or if they are normalised.
 
     Args:
         values: values of the triangles.
@@ -829,8 +844,15 @@ def _draw_panel(
 ) -> Any:
     """Draw a ternary diagram, and return its colored triangles for a color bar.
 
-    The first ingredient is at the left corner, the third at the top. Triangles without
-    a value are hatched.
+    The first ingredient is at the left corner, the second at the right one, the third
+    at the top. Triangles without a value are hatched.
+
+    Args:
+        axes: axes of matplotlib.
+        label: the prediction, which becomes the title.
+        values: value of each triangle; None where no mixture lies.
+        corners: the mixtures at the corners of each triangle.
+        names: names of the three ingredients.
     """
     from matplotlib.collections import PolyCollection  # matplotlib takes half a second
 
