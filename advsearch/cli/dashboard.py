@@ -66,6 +66,15 @@ PRIVACY_NOTE = (
     ),
 )
 def dashboard(args: argparse.Namespace) -> int:
+    """Serve the pages of runs until Ctrl-C, and return the exit status.
+
+    The address is printed on standard output, and all other messages on standard error.
+    If others in the network can reach the server, its address has a token, and a note
+    on privacy and a QR code are printed.
+
+    Raises:
+        InputError: the port is out of range, or a run does not exist.
+    """
     if not 0 <= args.port <= 65535:
         raise InputError(f"--port: expected a number from 0 to 65535, got {args.port}")
     # damaged runs are allowed: the page with the list says what is wrong with each
@@ -82,7 +91,7 @@ def dashboard(args: argparse.Namespace) -> int:
         "fingerprint": server.fingerprint,
     }
     output.print_answer(args.json, {"command": "dashboard", **facts}, server.address)
-    # a program that waits for the address gets it now
+    # Output may be buffered: a program that waits for the address has to get it now.
     sys.stdout.flush()
     if server.fingerprint:  # it speaks HTTPS
         print(

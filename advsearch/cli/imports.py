@@ -47,6 +47,13 @@ Understood = tuple[dict[str, Any], list[str]]
     ),
 )
 def file(args: argparse.Namespace) -> int:
+    """Print what is understood of a mesh or scene file, and return the exit status.
+
+    With `--out`, a picture of it is rendered, too.
+
+    Raises:
+        InputError: the file for the picture is no .png file.
+    """
     out = None if args.out is None else Path(args.out)
     if out is not None and out.suffix.lower() != ".png":
         raise InputError(f"--out: expected the name of a .png file, got {args.out}")
@@ -67,7 +74,12 @@ def file(args: argparse.Namespace) -> int:
 
 
 def _describe_mesh_file(file: str, contents: Contents) -> Understood:
-    """Return what the file of a mesh contains: facts for JSON, and lines of text."""
+    """Return what the file of a mesh contains: facts for JSON, and lines of text.
+
+    Args:
+        file: path of the file, as the user wrote it.
+        contents: the object, nodes, lights and cameras in it.
+    """
     mesh_object = contents.object
     materials = mesh_object.mesh.materials  # indices of faces by name
     clips, joints, targets = _list_motions(mesh_object.mesh.rig)
@@ -259,6 +271,7 @@ def _describe(parser: argparse.ArgumentParser) -> None:
     output.add_flags,
 )
 def threedb(args: argparse.Namespace) -> int:
+    """Make a run of a folder that 3DB wrote, and return the exit status."""
     from advsearch.questions.sweep.result import import_threedb  # takes seconds
 
     path = import_threedb(Path(args.folder), args.run, overwrite=args.overwrite)
