@@ -100,7 +100,12 @@ def doctor(args: argparse.Namespace) -> int:
 
 
 def _print_parts(parts: Sequence[Component], *, is_good: bool) -> None:
-    """Print a table of the parts, what to do about each, and whether all is good."""
+    """Print a table of the parts, what to do about each, and whether all is good.
+
+    Args:
+        parts: the parts with their states.
+        is_good: whether everything that is necessary works.
+    """
     # late: where rich is missing, --json still says so
     from rich.console import Console
     from rich.markup import escape

@@ -184,8 +184,11 @@ def _explain_slow_features(mesh_object: Any) -> list[str]:
 
 
 def _format_nodes(file: str, nodes: Sequence[Any]) -> list[str]:
-    """Return the lines of a table of the nodes of a file, with examples of how to use
-    them.
+    """Return lines with a table of the nodes of a file, and examples of their use.
+
+    Args:
+        file: path of the file, as the user wrote it.
+        nodes: the nodes, at least one.
     """
     rows = [["node", "in controls", "", "size"]]
     for node in nodes:
@@ -206,7 +209,11 @@ def _format_nodes(file: str, nodes: Sequence[Any]) -> list[str]:
 def _describe_mitsuba_file(file: str, out: Path | None) -> Understood:
     """Describe what advsearch understands of a Mitsuba file; render it if `out` is given.
 
-    The first shape that is no light stands for the object.
+    The first shape that is no light is taken as the object.
+
+    Args:
+        file: path of the file, as the user wrote it.
+        out: file of the picture; None renders none.
 
     Returns:
         What is in the file, for JSON; and the lines of the text.

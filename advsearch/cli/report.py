@@ -136,6 +136,10 @@ def _format_evidence(evidence: Any, output_paths: Sequence[Path]) -> str:
 def _check_arguments(args: argparse.Namespace, output_paths: Sequence[Path]) -> None:
     """Check the arguments of `report` before anything is read.
 
+    Args:
+        args: arguments of the command.
+        output_paths: files that will be written.
+
     Raises:
         InputError: one is missing or out of range, or a file exists already.
     """

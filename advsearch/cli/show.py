@@ -237,8 +237,14 @@ def _show_declared(kind: str, name: str, as_json: bool) -> int:
 
 
 def _describe_control(name: str, control: Any) -> tuple[dict[str, Any], list[str]]:
-    """Return the parameters and choices of a kind of control, for JSON and as
-    paragraphs.
+    """Return the parameters and choices of a kind of control.
+
+    Args:
+        name: name of the kind.
+        control: its class.
+
+    Returns:
+        The same facts twice: for JSON, and as paragraphs of text.
     """
     facts = {
         "parameters": to_json_value(control.parameters),

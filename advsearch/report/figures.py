@@ -572,7 +572,15 @@ def _paste_tile(
     corner: tuple[int, int],
     size: tuple[int, int],
 ) -> None:
-    """Put a picture of a size (width, height) on a sheet, and its caption below it."""
+    """Put a picture on a sheet, and its caption below it.
+
+    Args:
+        sheet: the sheet, which is drawn on.
+        picture: (H, W, 3) in [0, 1].
+        lines: lines of the caption.
+        corner: (left, top) of the picture on the sheet, pixels.
+        size: (width, height) to which the picture is scaled, pixels.
+    """
     left, top = corner
     width, height = size
     tile = Image.fromarray(to_8bit(picture)).resize(size, Image.Resampling.NEAREST)
@@ -589,7 +597,15 @@ def _write_caption(
     width: int,
     font: Any,
 ) -> None:
-    """Write lines of text below each other, each cut to a width in pixels."""
+    """Write lines of text below each other, each cut to a width.
+
+    Args:
+        draw: draws on the sheet.
+        lines: the lines.
+        corner: (left, top) of the first line, pixels.
+        width: width of a line, pixels.
+        font: font of the text.
+    """
     left, top = corner
     for index, line in enumerate(lines):
         # No tile has room for 200 letters. The loop below cuts one at a time, and would

@@ -305,8 +305,12 @@ def _is_table(value: object) -> bool:
 def _find_plain_facts(
     result: Result, values: Mapping[str, Any], tables: Iterable[str]
 ) -> dict[str, str]:
-    """Return, as texts by name, those fields of a result that no table and no other
-    part of the page shows.
+    """Return the fields of a result that nothing else on the page shows, as texts.
+
+    Args:
+        result: the result.
+        values: values of its fields by name.
+        tables: names of the fields that become tables.
     """
     # facts are named as a page shows them, fields as Python does
     fact_names = [name.replace(" ", "_") for name in result.facts()]
@@ -319,7 +323,12 @@ def _find_plain_facts(
 
 
 def _make_table(name: str, rows: Sequence[Fields]) -> ResultPart:
-    """Return rows as a table, without the columns that are empty in all of them."""
+    """Return rows as a table, without the columns that are empty in all of them.
+
+    Args:
+        name: name of the field that has the rows.
+        rows: the rows, which may have different fields.
+    """
     names = dict.fromkeys(name for row in rows for name in type(row).model_fields)
     columns = [
         column

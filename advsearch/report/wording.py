@@ -269,7 +269,11 @@ def format_prediction_cells(task: str, prediction: AnyPrediction) -> list[str]:
     """Return the two cells of a prediction in a table: what is predicted, and a number.
 
     For instance ``["vase", "84 %"]`` and ``["no cup found", "best score of cup
-    0.12"]``. The second is empty where there is none.
+    0.12"]``. The second cell is empty if there is no number.
+
+    Args:
+        task: name of the task, which decides what the number is called.
+        prediction: has the label, the probability and perhaps a payload.
     """
     label = prediction.label
     probability = prediction.probability

@@ -30,7 +30,7 @@ class Sheets(Exporter):
         known_size = options["size"]
         if known_size is None:
             known_size = exports.get_real_size(run)
-        # length of the object's longest side in millimetres
+        # the object's longest side in millimetres: `--size`, or the known real size
         longest = USUAL_SIZE if known_size is None else known_size
         pieces = exports.make_printable_pieces(run, longest)
         profile = None if options["icc"] is None else Path(options["icc"])

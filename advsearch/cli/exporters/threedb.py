@@ -80,7 +80,7 @@ def _get_label(row: Any) -> str:
 
 
 def _complete_indices(index_of_label: Mapping[str, int | None]) -> dict[str, int]:
-    """Return the index of each label; those without one come behind all others."""
+    """Return the index of each label; labels without one get the next free indices."""
     class_index = {
         label: index for label, index in index_of_label.items() if index is not None
     }

@@ -270,7 +270,8 @@ CURVE_NOTE = (
 def _view_curve(result: CurveResult) -> ShownResult:
     """Return the view of robust accuracy against epsilon.
 
-    A page has a chart if there are several epsilons; of a single one a notebook has it.
+    The chart needs several epsilons to be worth its place on a page. With a single one,
+    only a notebook shows it.
     """
     known = [point for point in result.curve if point.accuracy is not None]
     # without the controls' own epsilons, which have no place on an axis
@@ -387,7 +388,13 @@ def epsilon_text(value: EpsilonBudget) -> str:
 
 
 def _draw_curve(result: CurveResult, points: Sequence[CurvePoint], axes: Any) -> None:
-    """Draw the robust accuracy over epsilon on matplotlib axes."""
+    """Draw the robust accuracy over epsilon on matplotlib axes.
+
+    Args:
+        result: result of the curve, for the title.
+        points: the epsilons with a robust accuracy, ascending.
+        axes: axes of matplotlib.
+    """
     epsilon = [point.epsilon for point in points]
     accuracy = [point.accuracy for point in points]
     low = [point.interval[0] for point in points]
@@ -534,7 +541,11 @@ def _matrix_text(result: MatrixResult) -> str:
 
 
 def _draw_matrix(result: MatrixResult, axes: Any) -> None:
-    """Draw the rates of a matrix on matplotlib axes."""
+    """Draw the rates of a matrix on matplotlib axes.
+
+    A row is a model that was attacked, and a column a model on which the scene was
+    tried.
+    """
     rows = [row for row in result.table if row.tested]
     rates = [[cell.verified.rate for cell in row.tested] for row in rows]
     axes.imshow(rates, cmap="Reds", vmin=0.0, vmax=1.0, aspect="auto")

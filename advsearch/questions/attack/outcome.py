@@ -296,7 +296,11 @@ def _summarize_controls(problem: Problem) -> dict[str, Any]:
 
 
 def _summarize_verification(problem: Problem, findings: RunState) -> dict[str, Any]:
-    """Return the fields of a summary about the trials of the configurations."""
+    """Return the fields of a summary about the trials of the configurations.
+
+    These are the trials of the clean scene, of the adversarial one and of the random
+    search, and the samples per pixel.
+    """
     verification = findings.verification
     adversarial_trials = verification.adversarial_trials if verification else ()
     samples = findings.sample_count
@@ -574,7 +578,8 @@ def _compute_objective_values(trials: Sequence[Judgement]) -> ObjectiveValues | 
 def _summarize_printability(problem: Problem, findings: RunState) -> Printability:
     """Return how printable the scenes are, and what that costs in margin.
 
-    The cost is known if a search without print terms was verified, too.
+    Print terms of the objective keep colors printable. Their cost is the difference in
+    margin from a search without them, if that was verified, too.
     """
 
     def measure_terms(search: SearchResult | None) -> PrintTerms | None:
@@ -784,7 +789,13 @@ def _count_renders(findings: RunState, problem: Problem) -> dict[str, int]:
 
 
 def _make_remarks(findings: RunState, problem: Problem, journal: Journal) -> list[str]:
-    """Return sentences about doubts in the result, and about what was not finite."""
+    """Return sentences about doubts in the result, and about what was not finite.
+
+    Args:
+        findings: findings of the attack.
+        problem: problem of the attack.
+        journal: journal of the run, which knows of lost workers.
+    """
     remarks = list[str]()
     rendering_remark = make_rendering_remark(findings.predictor_refusal)
     if rendering_remark:
@@ -834,6 +845,10 @@ def describe_failures(problem: Problem, findings: RunState) -> DifferentFailures
     """Return the failures that a search found which differ from each other.
 
     None if the policy does not look for several failures.
+
+    Args:
+        problem: problem of the attack.
+        findings: findings of the attack, with the verifications of the first failures.
     """
     known = findings.search.failures if findings.search else None
     if known is None:

@@ -454,8 +454,12 @@ def _is_known(row: ObjectRow, epsilon: float | None) -> bool:
 def _compute_accuracy(rows: Sequence[ObjectRow], epsilon: float | None) -> CurvePoint:
     """Compute the robust accuracy at an epsilon, with its Clopper-Pearson interval.
 
-    Without an object about which anything is known there, the accuracy is None, and the
-    interval all of [0, 1].
+    Only objects whose robustness at this epsilon is known are counted. If there are
+    none, the accuracy is None and the interval is [0, 1].
+
+    Args:
+        rows: row of the last attack on each object.
+        epsilon: the epsilon; None for the own epsilon of each control.
     """
     known = [row for row in rows if _is_known(row, epsilon)]
     n_objects = len(known)

@@ -255,6 +255,10 @@ def select_choices(
 
     A choice is a setting of a control that is no parameter, such as the kind of a
     light. Such a control samples nothing, but its choices still decide the images.
+
+    Args:
+        config: settings of the original sweep.
+        grid: axes of the new sweep, by parameter.
     """
     controls = {}
     for instance, options in config.controls.items():

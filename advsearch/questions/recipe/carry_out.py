@@ -221,6 +221,10 @@ def _list_scene_names(recipe: Recipe, config: RecipeConfig) -> dict[str, list[st
 def check_recipe(recipe: Recipe, config: RecipeConfig) -> None:
     """Check the photographs and figures of a recipe before anything is rendered.
 
+    Args:
+        recipe: the recipe.
+        config: settings of the command.
+
     Raises:
         InputError: if something that the recipe describes cannot work.
     """
@@ -352,7 +356,14 @@ def check_figures(
 def _check_option_parts(
     recipe: Recipe, options: Options, baseline: str | None, location: str
 ) -> None:
-    """Raise an error if an option of a figure names a part that does not exist."""
+    """Raise an error if an option of a figure names a part that does not exist.
+
+    Args:
+        recipe: the recipe with its parts.
+        options: options of the figure, with the parts `of`.
+        baseline: the part that all others are compared with; None without one.
+        location: location of the figure, for messages.
+    """
     option_parts = [("of", part) for part in options.of]
     if baseline:
         option_parts.append(("beside", baseline))
@@ -435,8 +446,12 @@ def _run_parts(
 ) -> tuple[list[DoneRun], list[str]]:
     """Run what is not finished, until a run is interrupted.
 
-    A run around a search samples from what the search found. If that has no
-    distribution, the run is left out.
+    A run may sample around the result of a search, that is from the distribution that
+    the search found. If the search found none, the run is left out.
+
+    Args:
+        runs: all runs, a search before the runs around it.
+        context: context of the recipe's run.
 
     Returns:
         The runs with their results, and a sentence for each run that was left out.

@@ -409,6 +409,10 @@ def check_powers(recipe: Recipe, runs: Iterable[PlannedRun], name: str) -> None:
 def apply_command_settings(recipe: Recipe, config: RecipeConfig) -> Recipe:
     """Return the recipe with the settings of the command, and of `quick` if it is set.
 
+    Args:
+        recipe: the recipe.
+        config: settings of the command; those that are None stay as in the recipe.
+
     Raises:
         InputError: if neither names an object.
     """

@@ -40,7 +40,12 @@ class PredictionsOptions(Options):
 
 
 def make_predictions_figure(rows: Rows, options: PredictionsOptions) -> FigureContent:
-    """Make a figure of the most frequent predictions by the values of a column."""
+    """Make a figure of the most frequent predictions by the values of a column.
+
+    Args:
+        rows: rows of the parts that the figure shows.
+        options: the column, and how many predictions each value has.
+    """
     groups = dict[str, list[PredictionCount]]()
     for value, group_rows in rates.split_rows(rows, options.by).items():
         groups[value] = []
@@ -191,7 +196,12 @@ class CuesOptions(Options):
 def make_cues_figure(rows: Rows, options: CuesOptions) -> FigureContent:
     """Make a figure of how often the prediction is the object or its texture.
 
-    Its sentences also say which of both cues predicts the predictions better.
+    Its sentences also state whether the predictions depend more on the shape or on the
+    texture.
+
+    Args:
+        rows: rows with object and texture.
+        options: the columns of both, and the classes that name each texture.
     """
     # The three mappings are by the name of the texture. `names_texture` has a flag for
     # each row: whether its prediction names the texture. The others count the rows
@@ -274,7 +284,13 @@ def _draw_cues(
     by_shape: Mapping[str, ClusteredFraction],
     by_texture: Mapping[str, ClusteredFraction],
 ) -> None:
-    """Draw for each texture the fractions of predictions by shape and by texture."""
+    """Draw for each texture the fractions of predictions by shape and by texture.
+
+    Args:
+        figure: figure of matplotlib.
+        by_shape: for each texture, how often the prediction names the object.
+        by_texture: for each texture, how often the prediction names the texture.
+    """
     axes = figure.subplots()
     ordered = sorted(by_shape, key=lambda name: by_shape[name].fraction or 0.0)
     shape_shares = [by_shape[name].fraction or 0.0 for name in ordered]
@@ -452,7 +468,13 @@ class TernaryOptions(Options):
 def make_ternary_figure(rows: Rows, options: TernaryOptions) -> FigureContent:
     """Make a figure of where in a mixture each prediction is frequent.
 
-    If all predictions are the same, it shows the margin of the right label instead.
+    A mixture has three ingredients, whose fractions add up to 1. It is a point in a
+    triangle, which is cut into small triangles. If all predictions are the same, the
+    figure shows the margin of the right label instead.
+
+    Args:
+        rows: rows of one mixture each.
+        options: the columns of the ingredients, and how the figure is drawn.
     """
     mixtures = _read_mixtures(rows, options)
     names = [rates.strip_control(name) for name in options.shares]

@@ -615,7 +615,13 @@ def _describe_cells(
 def _describe_map_cells(
     cells: Cells, series: Sequence[str], options: RatesOptions
 ) -> list[str]:
-    """Describe the lowest and the highest cell of all rows and series of a map."""
+    """Describe the lowest and the highest cell of all rows and series of a map.
+
+    Args:
+        cells: for each row by its name, a tally for each series.
+        series: names of the series.
+        options: options of the figure.
+    """
     pairs = []
     for row_name, tallies in cells.items():
         names = _name_series(series, options)
@@ -727,7 +733,14 @@ def _tabulate_rates(
     series: Sequence[str],
     options: RatesOptions,
 ) -> list[list[Cell]]:
-    """Return the table of a rates figure; with series, their totals come last."""
+    """Return the table of a rates figure; with series, their totals come last.
+
+    Args:
+        cells: for each row by its name, a tally for each series.
+        totals: totals of each series over all rows.
+        series: names of the series.
+        options: options of the figure.
+    """
     tallies_of_row = dict(cells)
     if options.series:
         tallies_of_row["all"] = totals
@@ -819,6 +832,10 @@ def _group_rows(
 
     Without `bins`, and unless lines are drawn, each value is a group. Rows outside of
     the `range` are in no bin.
+
+    Args:
+        rows: the rows.
+        options: the column, and the number and range of its bins.
 
     Returns:
         The rows by the name of the value or bin; and the centers of the bins, None
@@ -1000,9 +1017,13 @@ AGREEMENT_HEADS = [
 def make_agreement_figure(rows: Rows, options: AgreementOptions) -> FigureContent:
     """Compare predictions about renderings with those about other images of the same.
 
-    A pair agrees if the model is right about both or wrong about both. The other images
-    are photographs, and those of the other parts; without photographs a sentence says
-    so.
+    The other images are photographs, and the images of other parts. A pair agrees if
+    the model is right about both images, or wrong about both. If there are no
+    photographs, a sentence states it.
+
+    Args:
+        rows: rows of the parts and of the photographs.
+        options: the part with the renderings, and the parts to compare them with.
 
     Raises:
         InputError: if a part has no rows or other configurations.
@@ -1198,6 +1219,10 @@ def _describe_where(right: bool, pairs: Rows) -> str:
 def make_scaling_figure(rows: Rows, options: Options) -> FigureContent:
     """Make a figure of the throughput of sweeps, images per second, by worker count.
 
+    Args:
+        rows: rows of sweeps, with the times when they were stored.
+        options: options of the figure.
+
     Raises:
         InputError: if no sweep sets `workers`, or a run is too short.
     """
@@ -1289,7 +1314,13 @@ def _describe_scaling(rates_by_count: Mapping[int, Any]) -> list[str]:
 def _draw_scaling(
     figure: Any, rates_by_count: Mapping[int, Any], max_rate: float
 ) -> None:
-    """Draw median and range of the throughput by worker count, and linear scaling."""
+    """Draw median and range of the throughput by worker count, and linear scaling.
+
+    Args:
+        figure: figure of matplotlib.
+        rates_by_count: images per second of several runs, by ascending worker count.
+        max_rate: the largest of all rates.
+    """
     axes = figure.subplots()
     counts = list(rates_by_count)
     fewest, slowest = next(iter(rates_by_count.items()))

@@ -352,6 +352,14 @@ def _find_python_only(
     """Return what exists in this session only, so that no command can repeat it.
 
     That may be models, the scene, the task, metrics, the tracker and controls.
+
+    Args:
+        config: the settings.
+        models: models as the caller passed them; a name or a file can be loaded again.
+        scenes: scenes that the caller has loaded.
+        task: task as the caller passed it.
+        tracker: makes the tracker of a drive; None for the default one.
+        controls: controls as the caller passed them.
     """
     parts = [
         PythonOnly("model", get_model_name(model))
@@ -757,7 +765,15 @@ def _find_scene_notes(
     controls: Sequence[Control],
     axes: Sequence[Axis],
 ) -> list[str]:
-    """Return the notes on the scenes, with the environments that controls choose."""
+    """Return the notes on the scenes, such as what an importer could not read.
+
+    A control may choose among environments; the notes on these are included.
+
+    Args:
+        named_scenes: all scenes of the sweep.
+        controls: controls that are sampled.
+        axes: axes of the grid.
+    """
     notes = list[str]()
     for named_scene in named_scenes:
         description = named_scene.scene.description
@@ -825,6 +841,10 @@ def expand_photographs(
 
     Scenes without such a folder stay as they are. So do all scenes if a control of the
     sweep or an axis of its grid chooses the photograph.
+
+    Args:
+        config: the settings, which name the controls and the axes.
+        scenes: the scenes, each in its first photograph.
     """
     control_names = [
         *config.controls,
@@ -868,7 +888,14 @@ def _check_different(names: Sequence[str]) -> None:
 def _run_in_directory(
     config: SweepConfig, job: Job, progress: Progress, resumed: Path | None
 ) -> SweepResult:
-    """Run a sweep in its run directory, or continue it in the one of before."""
+    """Run a sweep in its run directory, or continue one that was stopped.
+
+    Args:
+        config: the settings.
+        job: the loaded scenes, models and controls.
+        progress: reports the progress.
+        resumed: the run directory of the sweep to continue; None for a new one.
+    """
     with (
         RunDirectory.open(config, resumed) as run,
         open_executor(config, WORKER, progress) as executor,
@@ -877,6 +904,7 @@ def _run_in_directory(
             f"metric {name}": function for name, function in job.metrics.items()
         }
         functions["task"] = get_task_function(job.tasks[0])
+        # A sweep can only be continued with the same models and functions.
         check_digests(run, job.models, functions)
         return Sweep(job, run, progress, executor).execute()
 

@@ -134,7 +134,13 @@ def _only_axis(summary: SweepSummary) -> Sequence[AxisRow]:
 
 
 def _draw_map(axes: Any, summary: SweepSummary, cells: SweepMap) -> None:
-    """Draw the map of a sweep on matplotlib axes."""
+    """Draw the map of a sweep: accuracy or mean margin over two axes.
+
+    Args:
+        axes: axes of matplotlib.
+        summary: summary of the sweep, for the title.
+        cells: the map.
+    """
     x_axis, y_axis = cells.axes
     # Cells are 1 wide and high, and their centers are whole numbers.
     extent = (-0.5, len(x_axis.values) - 0.5, -0.5, len(y_axis.values) - 0.5)
@@ -166,7 +172,13 @@ def _draw_map(axes: Any, summary: SweepSummary, cells: SweepMap) -> None:
 
 
 def _draw_accuracy(axes: Any, summary: SweepSummary, rows: Sequence[AxisRow]) -> None:
-    """Draw the accuracy at each value of an axis, with intervals."""
+    """Draw the accuracy at each value of an axis, with intervals.
+
+    Args:
+        axes: axes of matplotlib.
+        summary: summary of the sweep, for the title.
+        rows: values of the axis with their counts, at least one.
+    """
     values = [row.value for row in rows]
     # A single draw has no interval.
     intervals = [
@@ -969,7 +981,8 @@ def _bound_distance(
     """
     from scipy.special import bdtr, bdtrc  # takes a tenth of a second
 
-    # probabilities of at least k and of at most k right images, if half of them are
+    # Binomial tests: the probabilities of at least k and of at most k right images of n
+    # if each is right with probability one half.
     p_at_least = bdtrc(k - 1.0, n, HALF)
     p_at_most = bdtr(k * 1.0, n, HALF)
     is_above_half = p_at_least < significance
@@ -992,7 +1005,8 @@ def _find_crossing(
     crosses_half = falling[0] >= HALF > falling[-1]
     if not crosses_half:
         return None
-    # negated, since interp needs ascending abscissae
+    # Interpolate log(distance) as a function of the fraction. `interp` needs ascending
+    # abscissae, so that the falling fractions are negated.
     return float(np.exp(np.interp(-HALF, -falling, np.log(distance))))
 
 
@@ -1065,7 +1079,14 @@ def _clause_beyond_dips(
 
 
 def _interval_clause(estimate: DetectionDistance, unit: str) -> str:
-    """Return the interval of the detection distance."""
+    """Return the interval of the detection distance as a clause.
+
+    An interval may have one bound only, or none if there are too few images.
+
+    Args:
+        estimate: estimate of the detection distance.
+        unit: unit of distances.
+    """
     low = None if estimate.lower is None else f"{estimate.lower:.3g}"
     high = None if estimate.upper is None else f"{estimate.upper:.3g}"
     if low and high:
@@ -1134,9 +1155,10 @@ def _dip_clause(dip: Dip, unit: str) -> str:
 
 
 def _loose_sentence(estimate: DetectionDistance, unit: str) -> str:
-    """Return in how many images a loose box is on the object, by distance.
+    """Return in how many images only a loose box is on the object, by distance.
 
-    Empty if there is none.
+    A loose box overlaps the object, but too little to count as right. The text is empty
+    if there is none.
     """
     if not sum(estimate.loose_counts):
         return ""
@@ -1173,7 +1195,14 @@ def _add_loose_fractions(estimate: DetectionDistance) -> list[float]:
 
 
 def draw_detection_distance(estimate: DetectionDistance, axes: Any) -> None:
-    """Draw the fraction of detections over the distance on matplotlib axes."""
+    """Draw the fraction of detections over the distance.
+
+    A horizontal line marks one half, and a vertical one the detection distance.
+
+    Args:
+        estimate: estimate of the detection distance.
+        axes: axes of matplotlib.
+    """
     low, high = zip(*estimate.intervals, strict=True)
     axes.fill_between(
         estimate.distances,

@@ -806,7 +806,13 @@ class Sweep:
         verified: WorstVerified | None,
         changes: Sequence[ChangeRates],
     ) -> Iterator[str]:
-        """Yield sentences about what limits the result, and what stands out in it."""
+        """Yield sentences about what limits the result, and what stands out in it.
+
+        Args:
+            predictions: predictions of all rows so far.
+            verified: trials of the worst configuration; None without them.
+            changes: how often predictions about changed images are as claimed.
+        """
         yield from make_lost_remarks(self._n_lost)
         yield from self.journal.remarks
         if self.units.noise > 1 and self.units.photographs == 1:

@@ -205,6 +205,10 @@ def _describe_images(
     They are in a folder beside the page, or embedded in it. A page embeds only as many
     as fit.
 
+    Args:
+        source: where the page gets its rows and images.
+        thumbnails: the thumbnails of the sweep.
+
     Returns:
         The description; and a note if some are left out, else None.
     """
@@ -246,9 +250,13 @@ def _describe_for_explorer(run: Path, summary: SweepSummary | None) -> JsonObjec
     """Return what the page's explorer of rows has to know of a sweep.
 
     That is the task, the axes of the grid, and height and width of the evaluated images
-    in pixels, in which boxes are. With several models there is no size, since they may
-    differ in it. A sweep without a summary yet has the task only, as far as its
+    in pixels, which are the units of boxes. With several models there is no size, since
+    they may differ in it. A sweep without a summary yet has the task only, if its
     settings can be read.
+
+    Args:
+        run: the run directory.
+        summary: summary of the sweep; None without one.
     """
     if summary is None:
         with suppress(AdvsearchError):

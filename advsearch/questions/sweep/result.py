@@ -160,7 +160,12 @@ class Predictions:
         self._index_by_label = dict[str, int]()
 
     def add(self, row: int, judgement: Judgement) -> None:
-        """Add the judgement of a row; one that was there before is replaced."""
+        """Add the judgement of a row; one that was there before is replaced.
+
+        Args:
+            row: number of the row.
+            judgement: what the task says of the prediction.
+        """
         label = judgement.prediction.label
         self.is_known[row] = True
         self.is_right[row] = judgement.right
