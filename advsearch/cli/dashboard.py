@@ -131,8 +131,13 @@ def dashboard(args: argparse.Namespace) -> int:
     examples=("view mug-sweep-001", "view mug-sweep-001 mug-sweep-002 --bundle site"),
 )
 def view(args: argparse.Namespace) -> int:
-    """Make the page of a run anew, or a folder with it that any web server can
-    serve.
+    """Write the page of a run again, or a folder with pages for any web server.
+
+    Returns:
+        The exit status.
+
+    Raises:
+        InputError: several runs were given without a folder.
     """
     folders = [find_run(name) for name in args.runs]
     if args.bundle is None and len(folders) > 1:

@@ -139,8 +139,9 @@ TRIALS: dict[str, Callable[[], str]] = {
 
 
 def main() -> int:
-    """Try every part, and print a line of JSON for each; an error of one does not keep
-    the next from being tried.
+    """Try every part, and print a line of JSON for each.
+
+    After an error of one part, the next ones are still tried.
     """
     for name, trial in TRIALS.items():
         printed = io.StringIO()

@@ -103,8 +103,8 @@ def make_config(
             f"{args.scene}#{name}" for name in split_names(data["object"])
         )
     config = config_type(**data)
-    # Code that a person typed as a flag may run. Code that a file names needs --code, so
-    # that only the settings in `typed` are allowed.
+    # Code that a person typed as a flag may run. Code that a file names needs --code,
+    # so that only the settings in `typed` are allowed.
     allow_named({name: getattr(config, name) for name in typed})
     return config
 

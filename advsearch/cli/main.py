@@ -418,8 +418,8 @@ def _status(words: list[str]) -> int:
     """
     try:
         status = _run_and_report_errors(words)
-        # There was an interrupt, but some code has swallowed it. Raise it again, so that
-        # the branch below handles it.
+        # There was an interrupt, but some code has swallowed it. Raise it again, so
+        # that the branch below handles it.
         if status != INTERRUPTED and INTERRUPTS.count:
             raise KeyboardInterrupt
         return status
@@ -434,8 +434,10 @@ def _status(words: list[str]) -> int:
 
 
 def _run_and_report_errors(words: list[str]) -> int:
-    """Run a command and return its exit status; an `AdvsearchError` is printed as a
-    message.
+    """Run a command and return its exit status; print an `AdvsearchError` as a message.
+
+    Args:
+        words: words of the command line, without the program's name.
     """
     try:
         status = _run(words)
@@ -461,7 +463,7 @@ def _run_and_report_errors(words: list[str]) -> int:
 def _run(words: list[str]) -> int:
     """Run the command that the words of the command line name; return its exit status.
 
-    Code that `--code` names is allowed here, for the whole process.
+    Python code that the flag `--code` names is allowed to run from here on.
     """
     name = words[0] if words and not words[0].startswith("-") else None
     if name == "plan":

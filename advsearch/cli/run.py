@@ -93,8 +93,8 @@ def run_file(
             as one that connects to other machines.
     """
     config = read_file_config(read_command(file), file, changes)
-    # `left_out` has the settings that count only when typed; they are not set. If such a
-    # setting decides no number of the result, a run is continued without it.
+    # `left_out` has the settings that count only when typed; they are not set. If such
+    # a setting decides no number of the result, a run is continued without it.
     for setting in config.left_out:
         decides_numbers = setting.name not in config.free
         if resumed is None or decides_numbers:

@@ -112,12 +112,13 @@ def _find_choice_description(command: str) -> Any:
 def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
     """Print the result of a run, or how far it has come if it has none yet.
 
-    Returns the exit status.
-
     Args:
         name: name of the run, or its path.
         as_json: print it as JSON.
         picture: draw its pictures in the terminal, too.
+
+    Returns:
+        The exit status.
     """
     path = find_run(name)
     has_result = (path / NAME).is_file()

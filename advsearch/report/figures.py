@@ -466,12 +466,11 @@ def _write_label(
     font: Any,
     text_boxes: Sequence[tuple[int, int, int, int]],
 ) -> tuple[int, int, int, int]:
-    """Write the text of a shape at its box, and return the box (x0, y0, x1, y1) of the
-    text.
+    """Write the text of a shape at its box, and return the box of the text.
 
-    The text of the model stands above its shape's box, that of the true shape below.
-    Where that would cover another text, it moves to the nearest free height. All
-    lengths are pixels.
+    The text of a prediction stands above its box, that of a true shape below. If it
+    would cover another text, it moves to the nearest free height. All lengths are
+    pixels; the returned box is (x0, y0, x1, y1).
 
     Args:
         draw: draws on the image.
@@ -505,9 +504,10 @@ def _find_free_height(
     size: tuple[int, int],
     text_boxes: Sequence[tuple[int, int, int, int]],
 ) -> int:
-    """Return the height nearest to a preferred one at which a text covers no other one.
+    """Return the free height for a text that is nearest to a preferred one.
 
-    If there is none, it is the preferred one.
+    At a free height the text covers no other text. If there is none, the preferred
+    height is returned.
 
     Args:
         x: left side of the text.
@@ -622,7 +622,8 @@ def choose_column_count(count: int) -> int:
     """Return the number of columns for a sheet of `count` tiles.
 
     It is the smallest divisor of the count between the square root and twice that, so
-    that the last row is full; without such a divisor, it is the square root, rounded up.
+    that the last row is full; without such a divisor, it is the square root, rounded
+    up.
     """
     min_columns = math.ceil(math.sqrt(count))
     # with a divisor of the count, the last row is full

@@ -210,8 +210,9 @@ def arrange_pages(
 ) -> Iterator[list[PlacedPart]]:
     """Yield the parts on each page, with their places.
 
-    Pieces are cut into parts that fit on a page. The highest part comes first, and
-    parts fill a page row by row from its upper left corner.
+    Pieces are cut into parts that fit on a page. Parts are sorted by height, the
+    highest first, so that the parts of a row have about the same height. They fill a
+    page row by row from its upper left corner.
 
     Args:
         pieces: what is printed.

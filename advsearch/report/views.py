@@ -372,8 +372,8 @@ def _explain_words(
 def _format_value(value: object) -> str:
     """Return a value as text for a table; None and NaN are empty.
 
-    Two floats are a range, other lists are separated by semicolons, and mappings and
-    objects with fields become "name value" pairs.
+    A list of two floats is written as a range, "0.1 to 0.3". Items of other lists are
+    separated by semicolons. Mappings and objects with fields become "name value" pairs.
     """
     if value is None:
         return ""

@@ -102,8 +102,7 @@ def _list_class_names(class_index: Mapping[str, int]) -> list[str]:
 def make_line(row: Any, names: Iterable[str], prediction: int) -> dict[str, Any]:
     """Return one line of a 3DB log, for a row of a sweep.
 
-    3DB minimizes where we maximize, so its loss is the negative margin: over 0 where a
-    prediction is wrong.
+    The loss of a line is the negative margin: it is positive if a prediction is wrong.
 
     Args:
         row: row of the results.

@@ -663,7 +663,7 @@ def open_executor(
 ) -> AbstractContextManager[Workers | None]:
     """Return the workers that run a function of a configuration.
 
-    None if the settings ask for no workers: then this process does it.
+    The context is None if no workers are requested: then this process does the work.
 
     Args:
         config: the settings.

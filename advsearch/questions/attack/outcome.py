@@ -473,8 +473,8 @@ def _summarize_average(findings: RunState) -> AverageCase | None:
 def _summarize_bracket(problem: Problem, findings: RunState) -> SmallestEpsilon | None:
     """Return the bounds of the smallest epsilon, by control; None if not searched.
 
-    The bounds of the bracket are factors of the budgets: `high` is the smallest at which
-    a wrong prediction was found, and `low` the largest at which none was found.
+    The bounds of the bracket are factors of the budgets: `high` is the smallest at
+    which a wrong prediction was found, and `low` the largest at which none was found.
     """
     bracket = findings.bracket
     if bracket is None:

@@ -254,7 +254,7 @@ def search_and_verify(
 ) -> RunState:
     """Search a problem with a policy and at random, and verify what was found.
 
-    Ctrl-C ends it with what there is.
+    After Ctrl-C the findings so far are returned.
 
     Args:
         policy: proposes configurations.

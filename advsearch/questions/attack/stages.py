@@ -600,9 +600,10 @@ class Searches:
     def _evaluate(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
         """Evaluate queries with predicted or rendered images.
 
-        A predictor predicts the steps of a search. The ranking of the best
-        configurations is rendered, but only the window of the image that the predictor
-        covers. Print terms are subtracted from the objective.
+        If there is a predictor, it predicts the steps of the search. The ranking of the
+        best configurations is rendered, but only the part of the image that the
+        predictor covers. If colors are to be printable, print terms are subtracted from
+        the objective.
 
         Args:
             queries: all of one phase, "search" or "ranking".

@@ -113,9 +113,9 @@ def cluster_points(points: FloatArray) -> tuple[float, IntArray]:
     compute_silhouette = rules.import_library("sklearn.metrics").silhouette_score
     best_silhouette = -1.0
     best_cluster = np.zeros(len(points), dtype=np.int64)
-    # The silhouette needs fewer clusters than points, and k-means needs at least as many
-    # different points as clusters. Points that differ by rounding errors alone count as
-    # the same.
+    # The silhouette needs fewer clusters than points, and k-means needs at least as
+    # many different points as clusters. Points that differ by rounding errors alone
+    # count as the same.
     n_distinct = len(np.unique(points.round(9), axis=0))
     max_clusters = min(MAX_CLUSTERS, n_distinct - 1)
     for k in range(2, max_clusters + 1):

@@ -48,8 +48,8 @@ def find_envelope(
     if choosing.empty:
         return None
     # The choosing rows have to reach a little more than the accuracy, since their
-    # estimate is biased. Near 1, where `ACCURACY_RESERVE` might exceed 1, the reserve is
-    # half of the distance to 1.
+    # estimate is biased. Near 1, where `ACCURACY_RESERVE` might exceed 1, the reserve
+    # is half of the distance to 1.
     required = min(accuracy + ACCURACY_RESERVE, (1.0 + accuracy) / 2.0)
     box: rules.RuleConditions = ()  # without conditions: everything
     inside = choosing
@@ -70,10 +70,11 @@ def find_envelope(
 def find_best_peel(
     box: rules.RuleConditions, inside: pd.DataFrame, choosing: pd.DataFrame
 ) -> rules.RuleConditions | None:
-    """Return the slightly smaller box with the highest accuracy, the first of several.
+    """Return the slightly smaller box with the highest accuracy.
 
-    Boxes with fewer than `MIN_BOX_UNITS` rows, or draws if rows share them, are left
-    out; None if none is left.
+    If several have it, the first one is returned. Boxes with fewer than `MIN_BOX_UNITS`
+    independent units are left out: a unit is a row, or a draw if several rows share it.
+    None if no box remains.
 
     Args:
         box: the conditions of the box.
@@ -121,8 +122,10 @@ def list_peels(
 def list_factor_peels(
     condition: rules.RuleCondition, column: pd.Series
 ) -> Iterator[rules.RuleCondition]:
-    """Yield slightly narrower conditions on a factor: without one of its names, or
-    without its lowest or its highest numbers.
+    """Yield slightly narrower conditions on a factor.
+
+    A condition on names loses one of them. A range of numbers loses its lowest or its
+    highest numbers.
 
     Args:
         condition: condition on the factor, of the box.

@@ -80,12 +80,14 @@ def find_importance(table: pd.DataFrame) -> list[ParameterWeight]:
 def _find_interacting_pairs(
     table: pd.DataFrame, sample: ClusteredPredictions
 ) -> list[ParameterWeight]:
-    """Return the weights of the pairs of factors that interact significantly: together
-    they decide more than the sum of what each decides alone.
+    """Return the weights of the pairs of factors that interact significantly.
+
+    Two factors interact if together they decide more than the sum of what each decides
+    alone.
 
     Args:
-        table: the predictions and the values of their factors.
-        sample: the same predictions.
+        table: the predictions, and a column of values for each factor.
+        sample: the same predictions with their clusters.
     """
     # so few groups of each factor that the cells of two have enough rows on average
     n_groups = max(2, math.isqrt(sample.n_clusters // MIN_ROWS_PER_CELL))
@@ -244,12 +246,13 @@ class ClusteredPredictions:
     def expected_statistic(self, group: IntArray) -> float:
         """Compute the expected chi-squared statistic of a factor without effect.
 
-        The statistic is the rows times `explained_fraction`. With independent rows, its
-        expectation is (groups - 1). With clusters it is that times the design effect
-        (Rao and Scott 1981, section 3): the variance of the rates of the groups, less
-        that of the overall rate, both from how the residuals of clusters scatter. It is
-        at least `MIN_INFLATION` times (groups - 1); NaN if a group has fewer than two
-        clusters.
+        The statistic is the number of rows times `explained_fraction`. With independent
+        rows, its expectation is (groups - 1). With clusters, the expectation is (groups
+        - 1) times the design effect (Rao and Scott 1981, section 3). It is computed as
+        the variance of the rates of the groups, less that of the overall rate, divided
+        by the variance of a prediction; both are estimated from how the residuals of
+        clusters scatter. The result is at least `MIN_INFLATION` times (groups - 1), and
+        NaN if a group has fewer than two clusters.
 
         Args:
             group: (n,) the group of each prediction.

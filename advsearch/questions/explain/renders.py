@@ -142,8 +142,8 @@ class Renders:
         rule = counted_rules[index]
         earlier_conditions = [earlier.conditions for earlier in counted_rules[:index]]
         covered_rows = self.table[rules.find_covered(rule.conditions, self.table)]
-        # Renders that earlier rules cover are left out, too. So the smaller the fraction
-        # that stays, the more configurations are rendered.
+        # Renders that earlier rules cover are left out, too. So the smaller the
+        # fraction that stays, the more configurations are rendered.
         uncovered_fraction = max(
             float(is_outside(earlier_conditions, covered_rows).mean()),
             MIN_UNCOVERED_FRACTION,

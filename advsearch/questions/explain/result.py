@@ -419,8 +419,12 @@ def make_explain_claims(result: ExplainResult) -> Iterator[views.Claim]:
 def _make_rule_claim(number: int, rule: RuleRow) -> views.Claim:
     """Return what is claimed of a rule, by its number from 1.
 
-    The counts are those of fresh renders if there are any; else of the rows that did
-    not choose it.
+    The counts are those of fresh renders if there are any; else those of the half of
+    the rows that did not choose the rule.
+
+    Args:
+        number: number of the rule, from 1.
+        rule: the rule with its counts.
     """
     counts: RightCounts = rule.confirmed or rule
     source = "rows that did not choose the rule"

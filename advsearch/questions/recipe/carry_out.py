@@ -282,9 +282,9 @@ def check_runs(runs: Sequence[PlannedRun]) -> dict[str, set[str]]:
 def _check_run(config: SceneConfig, search: SceneConfig | None) -> set[str]:
     """Check a run by loading what it names, and return the parameters of its rows.
 
-    The rows of a sweep have what its scenes describe. A run that samples around the
-    result of a search is not loaded, since its ranges follow from the result; its rows
-    have the parameters of the search's controls.
+    The parameters of a sweep are those that its scenes describe. A run that samples
+    around the result of a search cannot be loaded yet, since its ranges follow from
+    that result; its parameters are those of the search's controls.
 
     Args:
         config: the settings of the run.
@@ -400,6 +400,7 @@ def _check_column(
     if name in known:
         return
     # a control that does not declare its parameters may have this one
+    # ("mitsuba.*" stands for any parameter of the control "mitsuba")
     matching = {name, f"{name.partition('.')[0]}.{ANY_PARAMETER}"}
     lacking = [
         part

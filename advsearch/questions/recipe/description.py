@@ -373,7 +373,7 @@ def _make_run_config(
     except settings.SettingsError as error:
         raise settings.SettingsError(error.problems, where) from None
     except errors.UnknownNameError:
-        raise  # it is an InputError, too, but must stay as it is: it has the known names
+        raise  # it is an InputError, too, but lists the known names: keep it
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
 

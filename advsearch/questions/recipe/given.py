@@ -485,7 +485,7 @@ def make_ternary_figure(rows: Rows, options: TernaryOptions) -> FigureContent:
     ranking = rates.rank_predictions(rows[rates.PREDICTION_COLUMN])
     margins = _margins_by_ingredient(rows, names, main_ingredient)
     has_single_prediction = len(ranking) == 1
-    # a mean margin has an interval from two values on
+    # The margins are compared by intervals, for which each ingredient needs two values.
     by_margin = has_single_prediction and min(map(len, margins.values())) >= 2
     ranking = ranking[: options.most]
     if by_margin:
@@ -530,8 +530,8 @@ def _make_panels(
 ) -> dict[str, list[float | None]]:
     """Return what the diagram of each prediction shows: a value for each triangle.
 
-    That is the fraction of the mixtures inside for which the prediction is given, or
-    with `by_margin` the mean margin; None where no mixture lies.
+    The value is the fraction of the mixtures in the triangle that have this prediction;
+    with `by_margin` it is their mean margin. It is None if no mixture lies there.
 
     Args:
         rows: rows of one mixture each.
@@ -746,8 +746,8 @@ def find_triangle(mixture: Sequence[float], side: int) -> Triangle:
             b -= 1
         else:
             c -= 1
-    # Before rounding down, the three numbers add up to `side`. Rounding takes 1 in total
-    # from the sum in a triangle that points up, and 2 in one that points down.
+    # Before rounding down, the three numbers add up to `side`. Rounding takes 1 in
+    # total from the sum in a triangle that points up, and 2 in one that points down.
     points_down = a + b + c < side - 1
     return a, b, points_down
 
@@ -755,10 +755,10 @@ def find_triangle(mixture: Sequence[float], side: int) -> Triangle:
 def list_triangles(side: int) -> dict[Triangle, tuple[Mixture, Mixture, Mixture]]:
     """Return the triangles of a ternary diagram with the mixtures at their corners.
 
-    The key of a triangle is (a, b, points_down): the first two fractions inside it,
-    times `side` and rounded down, and whether it points down. Two triangles have the
-    same a and b, and share an edge; at the side of the diagram where the third fraction
-    is small, there is only the one that points up.
+    The key of a triangle is (a, b, points_down): the first two fractions of a mixture
+    in it, times `side` and rounded down, and whether it points down. For each a and b
+    there are two triangles that share an edge, except at the side of the diagram where
+    the third fraction is near 0: there is only the one that points up.
 
     Args:
         side: number of triangles along a side of the diagram.
@@ -784,9 +784,9 @@ def list_triangles(side: int) -> dict[Triangle, tuple[Mixture, Mixture, Mixture]
 def _compare_margins(margins: Mapping[str, Float64Array]) -> str:
     """Describe for which ingredient the mean margin is smallest, and for which largest.
 
-    The margin is by how much the right label leads the next. Whether the two differ is
-    decided by intervals that are widened, since they were chosen for being extreme
-    among all ingredients (Bonferroni).
+    The margin is by how much the right label leads the next one. The two ingredients
+    were selected as extremes among all, so that their intervals are widened
+    (Bonferroni) before they are compared.
 
     Args:
         margins: margins of the mixtures in which each ingredient is the largest, by its

@@ -282,9 +282,9 @@ def parse_axis_values(
 ) -> tuple[ParameterValue, ...]:
     """Parse and check the values of an axis.
 
-    ``"FIRST:LAST:COUNT"`` is COUNT values evenly spaced from FIRST to LAST, both
-    included; of a periodic parameter over a full turn, LAST would repeat FIRST and is
-    left out.
+    ``"FIRST:LAST:COUNT"`` stands for COUNT evenly spaced values from FIRST to LAST,
+    both included. If it is a full turn of an angle, such as 0:360:24, LAST would repeat
+    FIRST, and is left out.
 
     Args:
         where: how messages name the axis.
@@ -456,10 +456,11 @@ def _check_count(where: str, count: int) -> None:
 def add_grid_axes(
     controls: Sequence[Control], axes: Sequence[Axis], scene: SceneDescription
 ) -> tuple[Control, ...]:
-    """Return the controls with the axes among their parameters as discrete choices.
+    """Return the controls, where parameters on an axis are choices among its values.
 
-    The other parameters of a sampled control stay sampled; those of a control that is
-    only in the grid stay as the scene has them.
+    A control may be sampled and also have a parameter on an axis: then its other
+    parameters stay sampled. If a control is only in the grid, its other parameters keep
+    the values of the scene.
 
     Args:
         controls: controls that are sampled.
@@ -714,14 +715,17 @@ class Points:
     def _assign_blocks(self, domain: Domain) -> Iterator[SampledNumber]:
         """Decide for each block of coordinates where its values come from.
 
-        A block is the coordinates of one parameter. If an axis of the grid has the
-        parameter, its values come from there, else from columns of the draws: a column
-        for each coordinate, and in a ball one more for the length. This fills the lists
-        of grid coordinates and of sampled blocks.
+        A block is the coordinates of one parameter. If the parameter is an axis of the
+        grid, its values come from the axis. Otherwise they come from columns of the
+        draws: one for each coordinate, and for a ball (L2 norm) one more for the
+        length. This fills `_grid_coordinates`, `_small_blocks` and `_large_blocks`.
+
+        Args:
+            domain: the blocks of all controls, with their norms and budgets.
 
         Yields:
-            The sampled numbers that tables show: those of short blocks, of controls
-            that know their ranges.
+            The sampled numbers that tables show. These have few components, and a
+            control that knows their ranges.
         """
         controls = {control.name: control for control in self.space.controls}
         for group, (block, coordinates) in zip(
@@ -903,9 +907,10 @@ class Points:
     def _transform(self, sampled: _SampledBlock, uniform: Float64Array) -> Float64Array:
         """Return coordinates inside the budget of a block from uniform numbers.
 
-        They are uniform in the box, or in the ball around the start (Muller 1959): a
-        direction from k normal numbers, and a length. An option of a choice stands for
-        an equal part of [0, 1]; its coordinate is the center of that part.
+        The coordinates are uniform in the box, or in the ball around the start. In a
+        ball they are a direction from k normal numbers, times a length (Muller 1959). A
+        choice of n options cuts [0, 1] into n equal parts; the coordinate of an option
+        is the center of its part.
 
         Args:
             sampled: the block, of k coordinates.
@@ -945,8 +950,8 @@ class Points:
     def describe_images(self, u: Tensor, first_image: int) -> list[dict[str, Value]]:
         """Return the stored values of neighbouring images: parameter to value and unit.
 
-        As `Space.describe` returns them, except that a parameter of the grid has the
-        value that was listed, not its rounding to single precision.
+        They are what `Space.describe` returns, with one exception: a parameter of the
+        grid has the value that the user listed, not its float32 rounding.
 
         Args:
             u: (n, d) configurations.

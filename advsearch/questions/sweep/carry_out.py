@@ -326,6 +326,7 @@ def _describe_scenes(
         loaded: the loaded ones: all of them or none.
     """
     if not loaded:
+        # A name may itself be a list with commas, as in a YAML file.
         names = [
             ",".join(split_names(scene)) if isinstance(scene, str) else str(scene)
             for scene in scenes
@@ -530,7 +531,7 @@ def _add_adversarial_arm(
     fixed_controls = make_configured_controls(attack_config, attack_config.controls)
     _check_not_varied(fixed_controls, sampled, axes, directory)
     u = torch.from_numpy(read_configuration(directory))
-    arm = directory.resolve().name
+    arm = directory.resolve().name  # the arm is named after the run of the attack
     if arm == CLEAN:
         arm = f"{arm}'s"  # the two arms need different names
     clean = [

@@ -75,8 +75,8 @@ MAX_LABELS_LENGTH = 50
 def figure_size(summary: SweepSummary) -> tuple[float, float] | None:
     """Return width and height of a sweep's figure in inches.
 
-    A map has room for the names of its values, with long ones below aslant. None if
-    there is neither a map nor a single axis.
+    A map is larger if the labels of its values are long; long labels below it are
+    rotated. None if there is neither a map nor a single axis to draw.
     """
     if not summary.cells:
         return (5.6, 3.6) if _only_axis(summary) else None
@@ -601,8 +601,9 @@ def make_sweep_claims(result: SweepSummary) -> Iterator[Claim]:
 def _describe_population(result: SweepSummary) -> tuple[str, str]:
     """Return what the rates of a sweep are over, and a caution about the interval.
 
-    A sweep has a grid, samples (then it has a `sampler`), or both; imported rows have
-    neither. Only independent random draws need no caution, which is empty then.
+    A sweep has a grid, samples (then its `sampler` is not None), or both; imported rows
+    have neither. The caution is empty for independent random draws alone, for which the
+    interval is right.
     """
     is_sampled = result.sampler is not None
     if not is_sampled and not result.grid:
@@ -913,8 +914,10 @@ def find_detection_distance(summary: SweepSummary) -> DetectionDistance | None:
 def compute_detection_distance(rows: Sequence[AxisRow]) -> DetectionDistance:
     """Compute the distance at which an object is first detected.
 
-    A line that falls with the distance is fitted to the fraction of right images; the
-    estimate is where it crosses one half. Binomial tests give its bounds.
+    A line that falls with the distance is fitted to the fractions of right images. The
+    estimate is where the line crosses one half. Its bounds come from binomial tests at
+    each distance. A dip is a distance with fewer right images than farther away, which
+    contradicts a falling line.
 
     Args:
         rows: counts by a distance, or by the bounds of a range of it.
@@ -969,9 +972,9 @@ def _bound_distance(
 ) -> tuple[float | None, float | None]:
     """Return the bounds of the detection distance; None if images do not bound it.
 
-    The lower one is the farthest distance at which significantly more than half of the
-    images are right, the upper one the nearest beyond it at which significantly fewer
-    are.
+    The lower bound is the farthest distance at which significantly more than half of
+    the images are right. The upper bound is the nearest distance beyond it at which
+    significantly fewer than half are.
 
     Args:
         distance: (m,) ascending.
@@ -1028,7 +1031,8 @@ def _count_loose(rows: Sequence[AxisRow]) -> tuple[int, ...]:
 def distance_sentence(estimate: DetectionDistance) -> str:
     """Return the detection distance as text: "Seen from 38 m, 31 to 44 m ...".
 
-    Dips, which contradict it, and loose boxes follow.
+    Sentences about dips (distances with fewer detections than farther away) and about
+    loose boxes follow.
     """
     unit = "m" if estimate.unit == "metres" else estimate.unit
     distance = None if estimate.distance is None else f"{estimate.distance:.3g}"
@@ -1108,10 +1112,10 @@ def _interval_clause(estimate: DetectionDistance, unit: str) -> str:
 def _dips_sentences(estimate: DetectionDistance, unit: str) -> list[str]:
     """Return a sentence about dips, distances with fewer detections than farther away.
 
-    It lists all dips that are not chance. If all may be chance, it has the least likely
-    one that contradicts the estimate, if any. Such a dip has fewer than half of the
-    images right, and either the estimate says that the object is seen there, or at
-    least half of the images farther away are right.
+    It lists all significant dips. If none is significant, it has the dip with the
+    smallest p-value that contradicts the estimate, if any. A dip contradicts it if
+    fewer than half of its images are right, although the estimate says that the object
+    is seen there, or at least half of the images farther away are right.
 
     Args:
         estimate: estimate of the detection distance.

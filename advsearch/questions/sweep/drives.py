@@ -60,9 +60,10 @@ def add_frames(
     """Return the controls and the grid of a sweep over the frames of a path.
 
     A control that travels along the path is added if there is none. The times of the
-    frames become the last axis of the grid, unless it has them already: from 0 to the
-    end of the path, `fps` a second, at least two. If there are several paths, all are
-    swept, unless a setting chooses among them or paths are sampled.
+    frames become the last axis of the grid, unless the grid has them already. They go
+    from 0 to the end of the path, with `fps` frames a second, at least two. If there
+    are several paths, they become an axis, too, unless a setting chooses among them or
+    they are sampled.
 
     Args:
         config: settings with a `path`.
@@ -115,8 +116,9 @@ def find_time_axis(axes: Sequence[Axis]) -> int | None:
 def compute_distance_bounds(job: Job, axis: Axis) -> tuple[float, float] | None:
     """Return the nearest and the farthest distance that a drive of a sweep can have.
 
-    These are bounds from the plan: over all paths, also those that were not sampled,
-    all times of an axis, and all scenes.
+    The bounds do not depend on which drives were sampled: they are over all possible
+    paths, all times of the axis, and all scenes. So an interval of the mean distance
+    can use them.
 
     Args:
         job: the sweep.
@@ -345,8 +347,8 @@ class Drives:
             repeats=math.ceil(len(drives.flags) / n_drives),
             frames=n_frames,
             seconds=self.seconds,
-            # `min` or `max` selects the worst drive: it has the fewest right frames, the
-            # longest gap, the smallest distance of the first detection.
+            # `min` or `max` selects the worst drive: it has the fewest right frames,
+            # the longest gap, the smallest distance of the first detection.
             right=summarize_drives(
                 _right_fraction(drives.flags), min, drive_of_value=drive
             ),

@@ -563,9 +563,9 @@ class SweptScene:
     ) -> list[Evaluation]:
         """Evaluate queries of neighbouring rows.
 
-        An image is made once for each size, and a model gets all of its images at once.
-        The last evaluation also has what concerns the batch: what predicted its images,
-        and how many values were not finite.
+        An image is made once for each size, and a model gets all images of the batch
+        together. The last evaluation also has the facts about the full batch: what
+        predicted its images, and how many values were not finite.
 
         Args:
             queries: queries of this scene.
@@ -643,7 +643,7 @@ class SweptScene:
     ) -> dict[int, Judgement]:
         """Return the judgements of all queries by their numbers.
 
-        Queries are numbered by image, then by model.
+        The number of a query is image * models + model.
 
         Args:
             queries: queries of all models.

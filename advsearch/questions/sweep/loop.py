@@ -269,8 +269,9 @@ class Sweep:
     def _sweep_hint(self) -> str:
         """Return what the progress says of the work ahead.
 
-        That is the number of predictions, and how large the stored thumbnails are,
-        about: the size of a typical one, scaled by the pixels that they have.
+        That is the number of predictions, and about how much disk space the stored
+        thumbnails will take: the bytes of a typical one, scaled by the number of
+        pixels.
         """
         hint = (
             f"{self.n_rows} predictions, pictures of "
@@ -865,7 +866,7 @@ class Sweep:
             )
 
     def _prediction_remarks(self, predictions: Predictions) -> Iterator[str]:
-        """Yield which predictions do not count, or not as right."""
+        """Yield sentences about predictions that do not count, or not as right."""
         n_hidden = int(predictions.is_hidden.sum())
         if n_hidden:
             images = format_count(int(predictions.is_known.sum()), "picture")

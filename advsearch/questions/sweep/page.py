@@ -346,8 +346,8 @@ def verdict_text(summary: SweepSummary) -> str:
 def _still_html(path: Path, summary: SweepSummary) -> Html:
     """Return what a page without a script shows in the explorer's place.
 
-    These are the figure of the accuracy (of the margin where no cell has two
-    configurations) and the worst image, as far as the run has them.
+    These are the figure of the accuracy and the worst image, if the run has them. If no
+    cell of the map has two configurations, the figure shows the margin instead.
 
     Args:
         path: the run directory.

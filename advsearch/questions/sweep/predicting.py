@@ -199,8 +199,8 @@ class BasisPictures:
     def find_refusal(self, make_groups: MakeGroups, spp: int) -> Refusal | None:
         """Return why images are rendered; None if they are predicted.
 
-        They are predicted if that takes at most 1 / `MIN_SAVING_FACTOR` of the samples
-        of rendering a group, and the basis images fit into memory.
+        Images are predicted if that takes at most 1 / `MIN_SAVING_FACTOR` of the
+        samples that rendering a group takes, and if the basis images fit into memory.
 
         Args:
             make_groups: makes the groups.
@@ -541,10 +541,11 @@ class SweepPredictor:
     def _load_predictor(self, group: int, number: int) -> Predictor | None:
         """Return the predictor of a group; None if its images are rendered.
 
-        A new one is compared with traced images first, and not used where it deviates
-        too much. It depends on the index of its group alone, not on the image that asks
-        for it, so that a sweep that was stopped continues with the same predictors. If
-        too many are cached, the oldest is released.
+        A new predictor is compared with traced images first. If it deviates too much,
+        the images of its group are rendered. A predictor depends on the index of its
+        group alone, not on the image that needs it first, so that a sweep that was
+        stopped continues with the same predictors. If too many are cached, the oldest
+        is released.
 
         Args:
             group: index of the group.
@@ -617,9 +618,10 @@ class SweepPredictor:
         )
 
     def summarize(self) -> LinearTransport | None:
-        """Return what a result holds of the predictions.
+        """Return what a result states about predicted images.
 
-        None if nothing moves that any method follows.
+        It is their worst deviation, the memory and the time, or why images are
+        rendered. None if nothing varies that any method could predict.
         """
         if self.refusal is NOTHING_MOVES:
             return None
@@ -645,7 +647,7 @@ class SweepPredictor:
             used=True,
             way=self.method.name,
             reason=reason,
-            entries=0,
+            entries=0,  # of a matrix, which sweeps do not use
             bytes=self.method.bytes + predictor_bytes,
             seconds=self.seconds,
             renewed=0,

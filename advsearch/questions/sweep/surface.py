@@ -194,8 +194,9 @@ def _permutation_p_value(
 ) -> Float64Array:
     """Compute how likely it is that any part stands out as far as each by chance.
 
-    That is the fraction of the permutations in which the largest statistic of all parts
-    reaches that of the part; the data themselves count as one more permutation.
+    The p-value of a part is the fraction of permutations in which the largest statistic
+    of all parts is at least the statistic of this part. The data themselves count as
+    one more permutation, so that p is never 0.
 
     Args:
         counts: counts with the permuted failures of all parts.
@@ -348,8 +349,8 @@ class SurfaceCounts:
     ) -> SurfaceTable:
         """Return how a model's predictions go with the parts of one kind.
 
-        `strongest` lists the most significant parts, none close to another: those that
-        go with wrong predictions, and then with right ones.
+        `strongest` of the table lists the most significant parts, no two close to each
+        other: first those that go with wrong predictions, then with right ones.
 
         Args:
             object_name: name of the object.
@@ -581,9 +582,10 @@ def _select_known(
 def permute_draws(
     wrong: npt.NDArray[np.int8], draws: Int64Array, seed: int
 ) -> npt.NDArray[np.uint8] | None:
-    """Permute the predictions of whole draws among the draws, N_PERMUTATIONS times.
+    """Permute predictions among the draws, `N_PERMUTATIONS` times.
 
-    Images of one draw are not independent, so that they stay together.
+    Images of one draw are not independent. Therefore all predictions of a draw move
+    together to another draw.
 
     Args:
         wrong: (n,) whether each prediction is wrong, or UNKNOWN; every draw has as many

@@ -173,8 +173,8 @@ def describe_marks(control: Any, marked_texels: Sequence[MarkedTexel]) -> list[s
     half_width = math.tan(math.radians(control.part.fov) / 2.0)
     lines = []
     for index, texel in enumerate(marked_texels, 1):
-        # Position in the picture, from -1 to 1 around its middle. Multiplied by the half
-        # width or the half height, it is the tangent of the angle.
+        # Position in the picture, from -1 to 1 around its middle. Multiplied by the
+        # half width or the half height, it is the tangent of the angle.
         right_of_middle = 2 * texel.x - 1
         above_middle = 1 - 2 * texel.y
         right = math.degrees(math.atan(right_of_middle * half_width))
