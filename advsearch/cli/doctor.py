@@ -227,7 +227,8 @@ def _describe_ending(status: int, error_text: str) -> str:
 def check_packages(tried: dict[str, tuple[bool, str]]) -> Iterator[Component]:
     """Yield what was found about the packages that were tried, with their versions.
 
-    Mitsuba and Dr.Jit were tried together by a render, which has its own entry.
+    Mitsuba and Dr.Jit have no trial of their own: a render tries both together, and has
+    an entry of its own.
 
     Args:
         tried: what `run_probe` returns.

@@ -119,11 +119,10 @@ def write_sheets(
     max_sheets: int = DEFAULT_MAX_SHEETS,
     make_last_page: Callable[[str, tuple[float, float], Any], Figure] | None = None,
 ) -> int:
-    """Write pieces at their real size to a PDF for a printer, and return how many pages
-    it has.
+    """Write pieces at their real size to a PDF, and return its number of pages.
 
-    The first page has the title and how to print; sheets with the parts of the pieces
-    follow.
+    The first page has the title and explains how to print. Sheets with the parts of the
+    pieces follow.
 
     Args:
         path: path of the PDF.

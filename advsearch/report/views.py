@@ -767,7 +767,8 @@ def make_chart_svg(
 ) -> Html:
     """Return a chart as an SVG element for a page.
 
-    The title of the axes is left out, and the legend stands above in the page's colour.
+    The title of the axes is left out, since the page has a heading. The legend stands
+    above the chart, in the color of the page's text.
 
     Args:
         draw: draws on the axes that it is given.

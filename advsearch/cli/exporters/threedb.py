@@ -139,7 +139,14 @@ class ThreeDB(Exporter):
     def write(
         self, run: str, out: Path, options: Mapping[str, Any], progress: Progress
     ) -> Exported:
-        """See `Exporter.write`."""
+        """Write the rows of a run as a folder of 3DB.
+
+        Args:
+            run: name or folder of the run.
+            out: the folder, which is made, or empty.
+            options: `kind` of the rows; None stands for those of a sweep.
+            progress: not used.
+        """
         from advsearch.extend import exports  # takes seconds
 
         run_path = directory.find_run(run)

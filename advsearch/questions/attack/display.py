@@ -81,7 +81,10 @@ def _matrix_claims(result: MatrixResult) -> Iterator[Claim]:
 
 
 def _view_attack(summary: AttackSummary) -> ShownResult:
-    """Return the view of one attack."""
+    """Return the view of one attack: its verdict, tables, facts and cautions.
+
+    Facts with an empty text are left out.
+    """
     sections = [_rates_part(summary)]
     if summary.failures and summary.failures.tried:
         sections.append(make_failures_part(summary.failures, tried=True))
@@ -155,7 +158,11 @@ def _rate_cells(
 
 
 def make_ambient_parts(summary: AttackSummary) -> list[ResultPart]:
-    """Return the section about ambient light, if it was tried."""
+    """Return the section about ambient light, if it was tried.
+
+    It is about an image from a projector: up to which other light on the object it
+    still makes the model wrong.
+    """
     light = summary.ambient
     if light is None:
         return []

@@ -146,6 +146,8 @@ def _image_parts(
 ) -> Iterator[ResultPart]:
     """Yield the sections with images.
 
+    Sections with `live` are filled by the page's script, and hidden without it.
+
     Args:
         run: the run directory.
         summary: summary of the attack.

@@ -188,6 +188,9 @@ def distribute_attacks(
 ) -> None:
     """Have workers make the attacks of a study that have not begun, if requested.
 
+    A worker gets all attacks of a chain at once. A chain of which any attack has begun
+    here is left to this process.
+
     Args:
         config: settings of the study.
         chains: all of its attacks, in chains of growing epsilon.

@@ -42,7 +42,12 @@ _RENDER_KINDS = {
 
 
 def attack_verdict(summary: AttackSummary) -> str:
-    """Return what the run found, in sentences that need nothing before them."""
+    """Return what the run found, in sentences that stand by themselves.
+
+    The ending of the search decides the form: "The model calls this mug a vase in 20 of
+    20 fresh renders (...)" if a scene was found, else that none was found and why the
+    search ended.
+    """
     ending = summary.ending
     verified = summary.verified
     thing = _name_thing(summary)
@@ -564,7 +569,11 @@ def _short(value: float) -> str:
 
 
 def transport_text(summary: AttackSummary) -> str:
-    """Return what predicted images of the search; empty if that is not known."""
+    """Return how images of the search were predicted; empty if that is not known.
+
+    Images may be rendered in full, rendered in part, or predicted by a matrix of light
+    transport or by light on surfaces.
+    """
     transport = summary.transport
     if transport is None:
         return ""

@@ -225,7 +225,11 @@ MAX_LABELS = 3
 
 
 def make_explain_view(result: ExplainResult) -> ShownResult:
-    """Return the view of an explanation."""
+    """Return the view of an explanation.
+
+    Its sections are the rules, the weights of the parameters, the box in which the
+    model can be relied on, pairs of a failure and a right image, and kinds of failures.
+    """
     rule_sentences = [
         f"{number}. {describe_rule_row(number, rule)}"
         for number, rule in enumerate(result.rules, start=1)

@@ -695,6 +695,8 @@ def _draw_panels(
 ) -> None:
     """Draw a ternary diagram for each prediction, with one or several color bars.
 
+    All diagrams share a color bar, unless each is normalised to its own values.
+
     Args:
         figure: figure of matplotlib.
         panels: the value of each triangle, by prediction.

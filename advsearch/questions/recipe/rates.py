@@ -1278,6 +1278,9 @@ def _compute_gains(run_rates: Any, rates_by_count: Mapping[int, Any]) -> Any:
 def _describe_scaling(rates_by_count: Mapping[int, Any]) -> list[str]:
     """Describe the throughput of each worker count, relative to the fewest workers.
 
+    Each count has several runs, one of each object: the sentences have their median and
+    range.
+
     Args:
         rates_by_count: throughput of several runs, by ascending worker count.
     """
@@ -1399,6 +1402,12 @@ def _list_surface_cells(surface_table: Any) -> list[Cell]:
 
 def make_surface_figure(rows: Rows, options: Options) -> FigureContent:
     """Make a figure of the surface parts that are visible when predictions are wrong.
+
+    It puts the images that the sweeps have written below each other.
+
+    Args:
+        rows: rows of the runs; their `attrs` have the summaries of the surfaces.
+        options: options of the figure.
 
     Raises:
         InputError: if no sweep has `surface: true`.

@@ -285,7 +285,7 @@ SURFACE_COLUMNS: dict[str, Column] = {
 
 
 def make_sweep_view(summary: SweepSummary) -> ShownResult:
-    """Return the view of a sweep."""
+    """Return the view of a sweep: what a text, a page and a notebook show of it."""
     axes = _group_axes(summary)
     sections = [*_text_sections(summary, axes)]
     size = figure_size(summary)
@@ -299,6 +299,7 @@ def make_sweep_view(summary: SweepSummary) -> ShownResult:
         )
     sections += (replace(part, only="page") for part in _page_parts(summary, axes))
     run_images = f"{summary.run}/images"
+    # empty texts are left out
     has_drive_file = bool(summary.drives and summary.run)
     facts = {
         "worst": _worst_configuration(summary),
@@ -762,7 +763,7 @@ def drive_rows(drive_rates: DriveRates) -> list[tuple[str, str, str, str]]:
     """
     tracks = drive_rates.tracks
     never = f", never in {drive_rates.never_seen}" if drive_rates.never_seen else ""
-    # name, values, unit and remark on the mean
+    # tuples of a name, the values, their unit, and a remark after the mean
     rates: list[tuple[str, OverDrives | None, str, str]] = [
         ("frames in which it is right", drive_rates.right, PERCENT, ""),
         (
@@ -813,6 +814,7 @@ def surface_sentences(surface: SurfaceMap) -> list[str]:
     """Return which cells of each surface go with wrong predictions, in a sentence."""
     sentences = []
     for table in surface.tables:
+        # The faces of a mesh may be counted, too; the sentence is about cells.
         if table.part != "cell":
             continue
         cells = format_count(table.compared, table.part)

@@ -328,6 +328,7 @@ class Drives:
         n_frames = len(self.times)
         first_distance = _first_right_distance(drives)
         drive_records = self._describe_drives(drives, first_distance)
+        # drives with any right frame: only these have a distance of first detection
         has_right = np.asarray((drives.flags == RIGHT).any(axis=1))
 
         # Rows of one draw differ in noise alone: they are repeats of one drive. All

@@ -148,6 +148,8 @@ def make_sweep_page(
     explorer = make_element("div", id="explorer", hidden="hidden")
     if not explored:
         explorer = _too_many_rows_html(runs)
+    # An address of rows or images is fetched by the page's script, which the security
+    # policy of the page has to allow.
     needs_connection = any(
         isinstance(source.rows, str) or source.thumbnail_address for source in sources
     )

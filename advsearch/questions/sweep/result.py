@@ -502,6 +502,8 @@ def import_threedb(
 def _summarize_threedb(rows: pd.DataFrame, run: Path, folder: Path) -> SweepSummary:
     """Return the summary of a sweep that 3DB made.
 
+    Fields that the log of 3DB says nothing about are None, 0 or empty.
+
     Args:
         rows: rows of the sweep.
         run: the run directory.

@@ -559,6 +559,7 @@ def _count_scene(
                 len(batch),
                 before=scene * n_images,
             )
+            # at least `MIN_RAYS` rays along the shorter side of the image
             rays_per_pixel = ceil(MIN_RAYS / min(size))
             renderer = swept_scene.renderer_of_size[size]
             for number, u in zip(batch, configurations, strict=True):
@@ -857,7 +858,9 @@ def _render_views(asset: ObjectAsset, parts: SurfaceParts) -> Iterator[MapView]:
 
 
 def _draw(panels: Sequence[Panel], figure: Any) -> None:
-    """Draw a row per panel, at one scale: the map, and the object from some sides.
+    """Draw a row for each panel: the map of the surface, and the object from six sides.
+
+    All panels have the same scale of colors, which is symmetric around 0.
 
     Args:
         panels: panels from the first row on.
