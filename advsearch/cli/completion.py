@@ -48,6 +48,18 @@ OR_A_FILE = ("--object", "--environment", "--model")
     ),
 )
 def completion(args: argparse.Namespace) -> int:
+    """Print a script for a shell that completes commands, flags, names and files.
+
+    Each argument of each command gets what shtab completes: for a flag with a known
+    kind of name (`NAMED`) the names, for one that also takes a file (`OR_A_FILE`) names
+    and files, for all others files.
+
+    Args:
+        args: `shell` is the shell, and `json` prints the script as JSON.
+
+    Returns:
+        The exit status.
+    """
     try:
         import shtab  # an optional extra
     except ImportError as error:
@@ -66,7 +78,7 @@ def completion(args: argparse.Namespace) -> int:
             has_choices = action.choices is not None  # which shtab completes itself
             if takes_no_value or has_choices:
                 continue
-            # a positional argument has no flag
+            # The last one is the long form, "--json". A positional argument has none.
             flag = action.option_strings[-1] if action.option_strings else ""
             names = names_of_kind.get(NAMED.get(flag, ""))
             if names and flag not in OR_A_FILE:
@@ -88,6 +100,10 @@ def _complete_name_or_file(flag: str, names: Sequence[str]) -> dict[str, Any]:
     """Return what shtab writes for a flag whose value is a name or a file.
 
     Each shell has code of its own; tcsh completes files only.
+
+    Args:
+        flag: the flag, such as "--object".
+        names: names that it may take besides files.
     """
     function = f"_advsearch{flag.replace('-', '_')}"
     words = " ".join(names)

@@ -66,6 +66,15 @@ PRIVACY_NOTE = (
     ),
 )
 def dashboard(args: argparse.Namespace) -> int:
+    """Serve the pages of runs until Ctrl-C, and return the exit status.
+
+    The address is printed on standard output, and all other messages on standard error.
+    If others in the network can reach the server, its address has a token, and a note
+    on privacy and a QR code are printed.
+
+    Raises:
+        InputError: the port is out of range, or a run does not exist.
+    """
     if not 0 <= args.port <= 65535:
         raise InputError(f"--port: expected a number from 0 to 65535, got {args.port}")
     # damaged runs are allowed: the page with the list says what is wrong with each
@@ -82,7 +91,7 @@ def dashboard(args: argparse.Namespace) -> int:
         "fingerprint": server.fingerprint,
     }
     output.print_answer(args.json, {"command": "dashboard", **facts}, server.address)
-    # a program that waits for the address gets it now
+    # Output may be buffered: a program that waits for the address has to get it now.
     sys.stdout.flush()
     if server.fingerprint:  # it speaks HTTPS
         print(
@@ -122,8 +131,13 @@ def dashboard(args: argparse.Namespace) -> int:
     examples=("view mug-sweep-001", "view mug-sweep-001 mug-sweep-002 --bundle site"),
 )
 def view(args: argparse.Namespace) -> int:
-    """Make the page of a run anew, or a folder with it that any web server can
-    serve.
+    """Write the page of a run again, or a folder with pages for any web server.
+
+    Returns:
+        The exit status.
+
+    Raises:
+        InputError: several runs were given without a folder.
     """
     folders = [find_run(name) for name in args.runs]
     if args.bundle is None and len(folders) > 1:

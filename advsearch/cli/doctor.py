@@ -73,6 +73,11 @@ class Component:
 
 @command(output.add_flags)
 def doctor(args: argparse.Namespace) -> int:
+    """Check every part of the installation, and print what was found.
+
+    Returns:
+        The exit status: 0 if everything that is necessary works, else `FELL_SHORT`.
+    """
     print(
         "advsearch: trying every part, a first render among them; that takes some "
         "seconds",
@@ -95,7 +100,12 @@ def doctor(args: argparse.Namespace) -> int:
 
 
 def _print_parts(parts: Sequence[Component], *, is_good: bool) -> None:
-    """Print a table of the parts, what to do about each, and whether all is good."""
+    """Print a table of the parts, what to do about each, and whether all is good.
+
+    Args:
+        parts: the parts with their states.
+        is_good: whether everything that is necessary works.
+    """
     # late: where rich is missing, --json still says so
     from rich.console import Console
     from rich.markup import escape
@@ -145,9 +155,9 @@ def run_probe(command: Sequence[str] = PROBE) -> dict[str, tuple[bool, str]]:
             it has tried.
 
     Returns:
-        By name, whether the part worked, with a detail or the error. The part that
-        ended the process and those after it are missing. Under the name
-        `PROBE_PROCESS` stands whether the process itself ended well, with how it ended.
+        For each part, by its name, whether it worked, and a detail or the error. If a
+        part ended the process, it and those after it are missing. The entry
+        `PROBE_PROCESS` is about the process: whether it ended well, and how it ended.
     """
     output_text, ended_well, ending = _run_probe_process(command)
     tried = {}
@@ -162,7 +172,10 @@ def run_probe(command: Sequence[str] = PROBE) -> dict[str, tuple[bool, str]]:
 
 
 def _run_probe_process(command: Sequence[str]) -> tuple[str, bool, str]:
-    """Run a process.
+    """Run a process for at most `SECONDS_ALLOWED`.
+
+    Args:
+        command: program and arguments.
 
     Returns:
         What it wrote to standard output, whether it ended well, and how it ended, which
@@ -178,7 +191,7 @@ def _run_probe_process(command: Sequence[str]) -> tuple[str, bool, str]:
             cwd=SUBPROCESS_DIRECTORY,
         )
     except subprocess.TimeoutExpired as expired:
-        # then the output is not decoded, whatever `text` says, and may be missing
+        # After a timeout the output is bytes even with `text=True`, or None.
         partial_output = expired.stdout or ""
         if isinstance(partial_output, bytes):
             partial_output = partial_output.decode("utf-8", "replace")
@@ -207,13 +220,15 @@ def _describe_ending(status: int, error_text: str) -> str:
     if status < 0:
         status_text = f"signal {signal.Signals(-status).name}"
     ending = f"the trial ended with {status_text}"
+    # 120 characters of the first error line, so that the table stays readable
     return ending + (f" ({error_lines[0][:120]})" if error_lines else "")
 
 
 def check_packages(tried: dict[str, tuple[bool, str]]) -> Iterator[Component]:
     """Yield what was found about the packages that were tried, with their versions.
 
-    Mitsuba and Dr.Jit were tried together by a render, which has its own entry.
+    Mitsuba and Dr.Jit have no trial of their own: a render tries both together, and has
+    an entry of its own.
 
     Args:
         tried: what `run_probe` returns.
@@ -234,7 +249,7 @@ def check_packages(tried: dict[str, tuple[bool, str]]) -> Iterator[Component]:
         elif name in ("mitsuba", "drjit"):
             yield Component(name, version, OK, "tried by the render below")
         elif name not in tried:
-            # a part before it ended the process
+            # A part before it crashed the process; usually that is an old libLLVM.
             _, ending = tried[PROBE_PROCESS]
             detail = f"not reached: {ending}"
             yield Component(name, version, BROKEN, detail, "see libLLVM below")
@@ -316,7 +331,8 @@ def _reinstall(name: str) -> str:
 def check_llvm() -> Component:
     """Check which libLLVM will be used.
 
-    The detail names the other ones too, and why they are not used.
+    The detail names the other libraries that were found, too: those that could be used
+    instead, and those that are refused, with the reason.
     """
     library_setting = os.environ.get(llvm.ENVIRONMENT_VARIABLE, "")
     libraries = llvm.find_libraries()

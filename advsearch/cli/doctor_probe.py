@@ -31,8 +31,11 @@ def probe_import(name: str) -> str:
 def probe_renderer() -> str:
     """Render a wall in uniform light, and the derivative by the wall's reflectance.
 
-    Reflectance 0.5 under light of radiance 1 has brightness 0.5, and the derivative of
-    the brightness is 1. Returns what was used.
+    The brightness is reflectance times radiance. With reflectance 0.5 and radiance 1 it
+    is 0.5, and its derivative by the reflectance is 1.
+
+    Returns:
+        The variant of Mitsuba, the version of LLVM and the threads that were used.
 
     Raises:
         ArithmeticError: the numbers differ by more than noise.
@@ -136,8 +139,9 @@ TRIALS: dict[str, Callable[[], str]] = {
 
 
 def main() -> int:
-    """Try every part, and print a line of JSON for each; an error of one does not keep
-    the next from being tried.
+    """Try every part, and print a line of JSON for each.
+
+    After an error of one part, the next ones are still tried.
     """
     for name, trial in TRIALS.items():
         printed = io.StringIO()

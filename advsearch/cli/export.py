@@ -86,14 +86,19 @@ def _begin_lower(sentence: str) -> str:
     ),
 )
 def export(args: argparse.Namespace) -> int:
-    """Write what the arguments of `export` ask for, and return the exit status."""
+    """Write a run in another format, as the arguments say, and return the exit status.
+
+    Raises:
+        InputError, UnknownNameError: the format does not exist, or a flag does not
+            belong to it.
+    """
     out = None if args.out is None else Path(args.out)
     # the suffix of the file, which may name the format
     by_name = "" if out is None else out.suffix.removeprefix(".").lower()
     usable = EXPORTERS.list_usable()
     format = _choose_format(args, by_name, usable)
     _reject_other_options(args, format, usable)
-    # A suffix that no format has means a table too.
+    # If the suffix of the file is that of no format, a table is written.
     if format in FORMATS or format not in EXPORTERS:
         return _write_table(args, out, by_name)
     exporter = EXPORTERS[format]()
@@ -161,8 +166,18 @@ def _choose_format(
 
 
 def _write_table(args: argparse.Namespace, out: Path | None, by_name: str) -> int:
-    """Write the rows of a run as a table to a file, or print them, and return the exit
-    status.
+    """Write the rows of a run as a table to a file, or print them.
+
+    Args:
+        args: arguments of the command.
+        out: the file; None prints the table.
+        by_name: the suffix of the file, without its dot.
+
+    Returns:
+        The exit status.
+
+    Raises:
+        InputError: flags contradict each other, or the run is a study without rows.
     """
     format = args.format or _choose_table_format(args, out, by_name)
     if args.json and out is None and format != "json":

@@ -103,7 +103,8 @@ def make_config(
             f"{args.scene}#{name}" for name in split_names(data["object"])
         )
     config = config_type(**data)
-    # code that a person typed may run; what a file named needs --code
+    # Code that a person typed as a flag may run. Code that a file names needs --code,
+    # so that only the settings in `typed` are allowed.
     allow_named({name: getattr(config, name) for name in typed})
     return config
 
@@ -161,11 +162,12 @@ def _format_inside(scene: str) -> str:
 
 
 def format_as_flags(message: str) -> str:
-    """Return an error's message with the flags of the settings that it names.
+    """Return an error's message with settings written as flags.
 
-    Messages name a setting as Python and YAML do: before a colon at their beginning, or
-    else in backticks, with a value or without. ``epsilon: ...; lower `steps` or use
-    `denoise=none` `` becomes ``--epsilon: ...; lower --steps or use --denoise none``.
+    Messages name a setting as Python and YAML do: before a colon at the beginning of a
+    clause, or in backticks, with or without a value. Example: ``epsilon: ...; lower
+    `steps` or use `denoise=none` `` becomes ``--epsilon: ...; lower --steps or use
+    --denoise none``.
     """
     known = [setting for config in CONFIGS.values() for setting in settings(config)]
     flags = {**_NO_SETTINGS, **{setting.name: setting.flag for setting in known}}

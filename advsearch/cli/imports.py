@@ -47,6 +47,13 @@ Understood = tuple[dict[str, Any], list[str]]
     ),
 )
 def file(args: argparse.Namespace) -> int:
+    """Print what is understood of a mesh or scene file, and return the exit status.
+
+    With `--out`, a picture of it is rendered, too.
+
+    Raises:
+        InputError: the file for the picture is no .png file.
+    """
     out = None if args.out is None else Path(args.out)
     if out is not None and out.suffix.lower() != ".png":
         raise InputError(f"--out: expected the name of a .png file, got {args.out}")
@@ -67,7 +74,12 @@ def file(args: argparse.Namespace) -> int:
 
 
 def _describe_mesh_file(file: str, contents: Contents) -> Understood:
-    """Return what the file of a mesh contains: facts for JSON, and lines of text."""
+    """Return what the file of a mesh contains: facts for JSON, and lines of text.
+
+    Args:
+        file: path of the file, as the user wrote it.
+        contents: the object, nodes, lights and cameras in it.
+    """
     mesh_object = contents.object
     materials = mesh_object.mesh.materials  # indices of faces by name
     clips, joints, targets = _list_motions(mesh_object.mesh.rig)
@@ -172,8 +184,11 @@ def _explain_slow_features(mesh_object: Any) -> list[str]:
 
 
 def _format_nodes(file: str, nodes: Sequence[Any]) -> list[str]:
-    """Return the lines of a table of the nodes of a file, with examples of how to use
-    them.
+    """Return lines with a table of the nodes of a file, and examples of their use.
+
+    Args:
+        file: path of the file, as the user wrote it.
+        nodes: the nodes, at least one.
     """
     rows = [["node", "in controls", "", "size"]]
     for node in nodes:
@@ -194,7 +209,11 @@ def _format_nodes(file: str, nodes: Sequence[Any]) -> list[str]:
 def _describe_mitsuba_file(file: str, out: Path | None) -> Understood:
     """Describe what advsearch understands of a Mitsuba file; render it if `out` is given.
 
-    The first shape that is no light stands for the object.
+    The first shape that is no light is taken as the object.
+
+    Args:
+        file: path of the file, as the user wrote it.
+        out: file of the picture; None renders none.
 
     Returns:
         What is in the file, for JSON; and the lines of the text.
@@ -259,6 +278,7 @@ def _describe(parser: argparse.ArgumentParser) -> None:
     output.add_flags,
 )
 def threedb(args: argparse.Namespace) -> int:
+    """Make a run of a folder that 3DB wrote, and return the exit status."""
     from advsearch.questions.sweep.result import import_threedb  # takes seconds
 
     path = import_threedb(Path(args.folder), args.run, overwrite=args.overwrite)

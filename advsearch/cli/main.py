@@ -116,9 +116,10 @@ class ExperimentCommand:
         return self.experiment.examples
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        """Add the flags of the experiment's settings, and the words without a flag.
+        """Add the flags of the experiment's settings, and arguments without a flag.
 
-        Such words name the subject, of experiments that take it so.
+        An argument without a flag is the subject of an experiment, such as the run in
+        ``advsearch explain mug-sweep-001``.
         """
         # late, so that --help answers at once
         from advsearch.cli.flags import add_settings
@@ -180,8 +181,11 @@ class ExperimentCommand:
     def read_config(self, args: argparse.Namespace) -> Config:
         """Return the settings that the arguments describe.
 
-        Some experiments take the settings that were not given from the run that they
-        are about; from the first one if there are several.
+        Some experiments are about an earlier run. Settings that were not given are then
+        taken from that run, or from the first one if there are several.
+
+        Raises:
+            InputError: a required setting and the run are both missing.
         """
         # late, so that --help answers at once
         from advsearch.cli.flags import make_config
@@ -361,12 +365,14 @@ class Parser(argparse.ArgumentParser):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit status. An exception that is a bug of ours
-    passes through.
+    """Run one command and return its exit status.
+
+    An exception that is no `AdvsearchError` is a bug, and is not caught.
 
     Args:
-        argv: words of the command line. None takes those of this process, which is then
-            the command's alone: standard streams and Ctrl-C are set up for it.
+        argv: words of the command line. None takes those of this process; then standard
+            streams and the handling of Ctrl-C are set up, too, since the process does
+            nothing else.
     """
     owns_process = argv is None
     if owns_process:
@@ -384,10 +390,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run_interruptibly(words: list[str]) -> int:
-    """Run a command and return its exit status, as `_status` does; Ctrl-C interrupts it.
+    """Run a command with a handler for Ctrl-C, and return its exit status.
 
-    An interrupt leaves no traceback. Once the command has ended, nothing is left to
-    interrupt.
+    An interrupt leaves no traceback. After the command has ended, further interrupts
+    are ignored.
+
+    Args:
+        words: words of the command line, without the program's name.
     """
     sys.unraisablehook = unless_interrupted
     try:
@@ -404,13 +413,13 @@ def _run_interruptibly(words: list[str]) -> int:
 def _status(words: list[str]) -> int:
     """Run a command and return its exit status.
 
-    After any interrupt the status is `INTERRUPTED`, whatever error or result came of
-    it.
+    If there was an interrupt, the status is `INTERRUPTED`, even if the command ended
+    with another error or with a result.
     """
     try:
         status = _run_and_report_errors(words)
-        # Some code has swallowed the interrupt: it ends the command all the same, in
-        # the branch below.
+        # There was an interrupt, but some code has swallowed it. Raise it again, so
+        # that the branch below handles it.
         if status != INTERRUPTED and INTERRUPTS.count:
             raise KeyboardInterrupt
         return status
@@ -425,8 +434,10 @@ def _status(words: list[str]) -> int:
 
 
 def _run_and_report_errors(words: list[str]) -> int:
-    """Run a command and return its exit status; an `AdvsearchError` is printed as a
-    message.
+    """Run a command and return its exit status; print an `AdvsearchError` as a message.
+
+    Args:
+        words: words of the command line, without the program's name.
     """
     try:
         status = _run(words)
@@ -436,9 +447,9 @@ def _run_and_report_errors(words: list[str]) -> int:
         # late, so that --help answers at once
         from advsearch.cli.flags import format_as_flags
 
-        # A message names settings as a file does where they come from a file, else as
-        # flags. Some advice is always a flag, such as --code: no file may allow its own
-        # code.
+        # A message names settings as in a file ("steps") if they come from a file, else
+        # as flags ("--steps"). Some advice is always a flag, such as --code, since no
+        # file may allow its own code.
         advises_flag = isinstance(error, (UnknownNameError, CodeNotAllowedError))
         is_about_file = words[0] in ("run", "resume") and not advises_flag
         text = str(error) if is_about_file else format_as_flags(str(error))
@@ -452,7 +463,7 @@ def _run_and_report_errors(words: list[str]) -> int:
 def _run(words: list[str]) -> int:
     """Run the command that the words of the command line name; return its exit status.
 
-    Code that `--code` names is allowed here, for the whole process.
+    Python code that the flag `--code` names is allowed to run from here on.
     """
     name = words[0] if words and not words[0].startswith("-") else None
     if name == "plan":
@@ -475,8 +486,8 @@ def _run(words: list[str]) -> int:
 def _parse(words: list[str], command: str | None) -> argparse.Namespace:
     """Parse the words of the command line.
 
-    Only the flags of `command` are made, since making all of them takes half a second.
-    Without a command the help is printed and the process ends.
+    Only the flags of `command` are made, since making those of all commands takes half
+    a second. Without a command the help is printed and `SystemExit` is raised.
     """
     parser, subparsers = make_parser_without_commands()
     for name in list_commands():
@@ -591,8 +602,13 @@ def add_command(
 def _unknown_argument(argument: str, parser: argparse.ArgumentParser) -> InputError:
     """Return the error for an argument that a parser does not know.
 
-    It suggests, in this order: `--object` before a bare word, the command whose flag it
-    is, a flag that is spelled alike or a word for the same thing.
+    The message has the first suggestion that applies: for a word without dashes, to
+    write `--object` before it; for a flag of another command, that command; else a flag
+    with a similar spelling or meaning.
+
+    Args:
+        argument: the unknown argument, such as "--step=3".
+        parser: parser of the command.
     """
     # late, so that --help answers at once
     from advsearch.calls import suggest_keyword

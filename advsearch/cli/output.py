@@ -137,8 +137,10 @@ def open_descriptors() -> None:
 
 
 def end_output() -> None:
-    """Write out what standard output still holds; where that fails, drop it, so that
-    the interpreter does not complain when it ends.
+    """Write out what standard output has buffered; drop it if that fails.
+
+    The interpreter writes the buffer when it ends, and would print an error if that
+    failed. So the output is redirected to nothing after a failure here.
     """
     try:
         sys.stdout.flush()
@@ -249,9 +251,12 @@ def explain_resume(result: Result) -> str:
 
 
 def make_resume_command(run: str | Path) -> str:
-    """Return the shell command that goes on with the run in a folder.
+    """Return the shell command that continues the run in a folder.
 
-    It allows the Python code that the run's settings name.
+    If the settings of the run name Python code, the command allows it with `--code`.
+
+    Args:
+        run: the run directory.
     """
     # late, so that --help answers at once
     from advsearch.cli.flags import read_command, read_file_config
@@ -268,8 +273,8 @@ def make_resume_command(run: str | Path) -> str:
             return shlex.join(words)
         metrics = getattr(config, "metrics", {}).values()
         all_names = "".join([config.model, *config.control_kinds, *metrics])
-        # Names of code are "module:name". The exact list takes seconds, so it is made
-        # only where there is a colon anywhere.
+        # Code is named as "module:name". Listing it exactly takes seconds, so that is
+        # done only if there is a colon in any name.
         if ":" in all_names:
             from advsearch.engine.naming import list_imported_code  # takes seconds
 
@@ -282,10 +287,10 @@ def make_resume_command(run: str | Path) -> str:
 
 @contextmanager
 def redirect_output() -> Iterator[None]:
-    """Inside the block, send all that is printed to standard error, by Python or by a
-    native library.
+    """Inside the block, send everything that is printed to standard error.
 
-    So one JSON value, printed afterwards, is all that standard output holds.
+    This includes what native libraries print. A JSON value that is printed after the
+    block is then the only text on standard output.
     """
     sys.stdout.flush()
     stdout_descriptor: int | None = None
@@ -298,7 +303,8 @@ def redirect_output() -> Iterator[None]:
             yield
     finally:
         if stdout_descriptor is not None:
-            # what the C library holds back, before its descriptor changes
+            # The C library buffers what native code prints: write that out before
+            # descriptor 1 is standard output again.
             with suppress(OSError, AttributeError):
                 ctypes.CDLL(None).fflush(None)
             os.dup2(stdout_descriptor, 1)

@@ -81,7 +81,11 @@ LARGEST_POSES = 1 << 20
     ),
 )
 def report(args: argparse.Namespace) -> int:
-    """Write page, Markdown and JSON about runs, and return the exit status."""
+    """Write page, Markdown and JSON about runs, and return the exit status.
+
+    Raises:
+        InputError: an argument is wrong, or the folder cannot be made.
+    """
     # late, so that --help answers at once
     from advsearch.extend import directory, writing
     from advsearch.questions.report.evidence import collect_evidence, read_exposure
@@ -131,6 +135,10 @@ def _format_evidence(evidence: Any, output_paths: Sequence[Path]) -> str:
 
 def _check_arguments(args: argparse.Namespace, output_paths: Sequence[Path]) -> None:
     """Check the arguments of `report` before anything is read.
+
+    Args:
+        args: arguments of the command.
+        output_paths: files that will be written.
 
     Raises:
         InputError: one is missing or out of range, or a file exists already.
@@ -209,12 +217,14 @@ def _check_photographs(files: Sequence[Path], folder: str) -> None:
 def _copy_named_by_pose(folder: Path, run: Path, out: Path) -> Path:
     """Copy photographs, each under the name of the rendering that has its pose.
 
-    Returns `out`.
-
     Args:
-        folder: has the photographs, and the table `POSES` of their poses.
-        run: a sweep, of which exactly one rendering has each pose.
+        folder: has the photographs, and a table `POSES` with a line for each: its
+            `file`, and the values of the pose, such as `pose.yaw`.
+        run: directory of a sweep with exactly one rendering of each pose.
         out: an empty folder.
+
+    Returns:
+        The folder `out`, with files such as "rendering-12-photo.jpg".
 
     Raises:
         InputError: a photograph is missing, or its pose is that of no or several
@@ -232,7 +242,8 @@ def _copy_named_by_pose(folder: Path, run: Path, out: Path) -> Path:
     # line 1 has the heads, so that poses begin on line 2
     for line, pose in enumerate(csv.DictReader(table.splitlines()), 2):
         location = f"photographs: {folder / POSES}, line {line}"
-        # the name alone: no photograph outside of the folder
+        # Only the name of the file is used, without its folders: a table cannot name a
+        # file outside of the folder.
         file = folder / Path(str(pose.pop("file", ""))).name
         if not file.is_file():
             raise InputError(

@@ -53,14 +53,18 @@ def run(args: argparse.Namespace) -> int:
 
 
 def parse_changes(words: Sequence[str]) -> dict[str, object]:
-    """Return the settings that are changed by words ``NAME=VALUE``, and allow the code
-    that they name.
+    """Return the settings that are changed by words ``NAME=VALUE``.
+
+    If a value names Python code, that code is allowed to run, since a person typed it.
+
+    Args:
+        words: words of the command line, such as "steps=80" or "controls.pose.yaw=3".
 
     Raises:
         InputError: a word is no such assignment.
     """
     changes = dict(parse_assignment(text, f"change {text!r}") for text in words)
-    # The nested mapping that dotted names stand for. What a person types may name code.
+    # the nested mapping that dotted names stand for
     typed = dict[str, object]()
     for name, value in changes.items():
         set_dotted(typed, name, value)
@@ -89,8 +93,8 @@ def run_file(
             as one that connects to other machines.
     """
     config = read_file_config(read_command(file), file, changes)
-    # Such settings count as not set. A run is continued without one that decides none
-    # of its numbers.
+    # `left_out` has the settings that count only when typed; they are not set. If such
+    # a setting decides no number of the result, a run is continued without it.
     for setting in config.left_out:
         decides_numbers = setting.name not in config.free
         if resumed is None or decides_numbers:
@@ -129,8 +133,16 @@ def run_file(
     ),
 )
 def resume(args: argparse.Namespace) -> int:
-    """Do what is left of the run and print its result; of a run that is done, its
-    result.
+    """Continue a run that was stopped, and print its result.
+
+    If the run has finished already, its result is printed, unless the changes add
+    something to it.
+
+    Returns:
+        The exit status.
+
+    Raises:
+        InputError: the run has no settings, or parts of it exist only in Python.
     """
     path = find_run(args.run)
     changes = parse_changes(args.change)
@@ -139,8 +151,8 @@ def resume(args: argparse.Namespace) -> int:
             f"{path}: expected a run with its {CONFIG}, got none; start it again"
         )
     command = read_command(path / CONFIG)
-    # These add to a run that is done: the map of a sweep's surface, or a recipe's
-    # figures anew, with the photographs that were taken since.
+    # Two cases add something to a finished run: a sweep gets a map of the surface, and
+    # a recipe makes its figures again, with photographs that were taken since.
     adds_surface = changes.get("surface") is True and command == "sweep"
     adds_to_finished_run = command == "recipe" or adds_surface
     if is_finished(path) and not adds_to_finished_run:
@@ -170,6 +182,13 @@ MOST_NAMES = 4  # controls of a run that the table names
     output.add_flags,
 )
 def runs(args: argparse.Namespace) -> int:
+    """Print a table of the runs in a folder, and return the exit status.
+
+    Faults of corrupt runs are printed on standard error.
+
+    Raises:
+        InputError: the folder does not exist.
+    """
     folder = HOME if args.folder is None else Path(args.folder)
     if args.folder is not None and not os.path.isdir(folder):
         raise InputError(

@@ -64,7 +64,14 @@ def _set_usage(parser: argparse.ArgumentParser) -> None:
     output.add_flags,
 )
 def show(args: argparse.Namespace) -> int:
-    """Show a run, or a control, policy, task or recipe that is given by kind and name."""
+    """Show a run, or a control, policy, task or recipe that is given by kind and name.
+
+    Returns:
+        The exit status.
+
+    Raises:
+        InputError: the words name nothing that can be shown.
+    """
     if args.picture and (args.json or len(args.what) > 1):
         raise InputError(
             "--picture: draws the pictures of one run, after its text; "
@@ -105,12 +112,13 @@ def _find_choice_description(command: str) -> Any:
 def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
     """Print the result of a run, or how far it has come if it has none yet.
 
-    Returns the exit status.
-
     Args:
         name: name of the run, or its path.
         as_json: print it as JSON.
         picture: draw its pictures in the terminal, too.
+
+    Returns:
+        The exit status.
     """
     path = find_run(name)
     has_result = (path / NAME).is_file()
@@ -165,7 +173,15 @@ def _print_agreement(photos: Any) -> None:
 
 
 def _show_unfinished(run: ListedRun, as_json: bool) -> int:
-    """Show a run without a result: how far it is, and how it can be resumed."""
+    """Show a run without a result: how far it is, and how it can be resumed.
+
+    Args:
+        run: what the listing of runs knows of it.
+        as_json: print JSON instead of text.
+
+    Returns:
+        The exit status.
+    """
     resume_command = None
     if run.begun and run.state == "stopped":
         resume_command = output.make_resume_command(run.path)
@@ -196,7 +212,16 @@ PLURALS = {"control": "controls", "policy": "policies", "task": "tasks"}
 
 
 def _show_declared(kind: str, name: str, as_json: bool) -> int:
-    """Show the parameters and options of a control, policy or task."""
+    """Show the parameters and options of a control, policy or task.
+
+    Args:
+        kind: "control", "policy" or "task".
+        name: its name.
+        as_json: print JSON instead of text.
+
+    Returns:
+        The exit status.
+    """
     with open_answer_progress():
         registry = _registry(PLURALS[kind])  # takes seconds
     # a control may be named as "module:name", code that a person typed and that may run
@@ -213,8 +238,14 @@ def _show_declared(kind: str, name: str, as_json: bool) -> int:
 
 
 def _describe_control(name: str, control: Any) -> tuple[dict[str, Any], list[str]]:
-    """Return the parameters and choices of a kind of control, for JSON and as
-    paragraphs.
+    """Return the parameters and choices of a kind of control.
+
+    Args:
+        name: name of the kind.
+        control: its class.
+
+    Returns:
+        The same facts twice: for JSON, and as paragraphs of text.
     """
     facts = {
         "parameters": to_json_value(control.parameters),
@@ -241,7 +272,13 @@ def _describe_control(name: str, control: Any) -> tuple[dict[str, Any], list[str
 def _describe_options(
     kind: str, name: str, entry: Any
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return the options of a policy or task, for JSON and as a paragraph."""
+    """Return the options of a policy or task, for JSON and as a paragraph.
+
+    Args:
+        kind: "policy" or "task".
+        name: its name.
+        entry: its class.
+    """
     options = list[dict[str, Any]]()
     for option, field in list_declared_options(entry).items():
         default = get_option_default(field)
@@ -336,8 +373,10 @@ def find_best_images(run: Path) -> list[Path]:
 
 
 def show_pictures(files: Sequence[Path]) -> None:
-    """Draw pictures where standard output is a terminal that can, and say where each
-    is.
+    """Draw pictures in the terminal if it can, and print the path of each.
+
+    Args:
+        files: files of the pictures.
     """
     if not files:
         print("\nThis run has no pictures.")
@@ -445,6 +484,11 @@ def _registry(kind: str) -> Any:
     output.add_flags,
 )
 def list_all(args: argparse.Namespace) -> int:
+    """Print the names of one kind, such as objects, or of all kinds.
+
+    Returns:
+        The exit status.
+    """
     kinds = [args.kind]
     if args.kind == "all":
         # cases are listed only by their own kind

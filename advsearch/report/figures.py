@@ -129,7 +129,9 @@ def draw_fractions(
             fraction, interval = fraction_and_interval
             axes.plot(interval, [y] * 2, color=colour, alpha=0.45, linewidth=3)
             axes.plot(fraction, y, mark, color=colour, ms=5, label=label)
-            label = "_"  # a series has one line in the legend
+            # Only the first dot of a series has its label, so that the legend has it
+            # once; matplotlib leaves out labels that begin with "_".
+            label = "_"
     axes.set_yticks(range(len(rows)), list(rows))
     # upside down: the first row is at the top
     axes.set(xlim=(-0.03, 1.03), ylim=(len(rows) - 0.4, -0.6))
@@ -142,8 +144,10 @@ def draw_searches(
     axes: Any,
     zero_means: str = "",
 ) -> None:
-    """Draw the objectives of searches against their evaluations: a line for the best so
-    far, and a faint dot for each single evaluation.
+    """Draw the objectives of searches over their evaluations.
+
+    Each search has a line for the best objective so far, and a faint dot for each
+    evaluation.
 
     Args:
         objectives: objectives of each evaluation of each search, by the search's name;
@@ -193,7 +197,7 @@ def _draw_search(
         dashes: matplotlib's style of the line.
     """
     objective = np.array(values, dtype=float)  # None is NaN
-    # fmax skips NaN
+    # the best so far; `fmax` ignores NaN
     best = np.fmax.accumulate(objective) if len(objective) else objective
     # of a long search only some points are drawn
     indices = _select_points(len(objective))
@@ -223,7 +227,10 @@ def _select_points(count: int) -> npt.NDArray[np.int_]:
 
 
 def _as_dots(values: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
-    """Return coordinates (3n,) of lines without a length at values (n,), with gaps."""
+    """Return coordinates (3n,) with which a single line looks like n dots.
+
+    Each value comes twice, which is a line of length 0, and a NaN interrupts the line.
+    """
     return np.stack([values, values, values * np.nan], 1).ravel()
 
 
@@ -296,11 +303,11 @@ Shape = Any  # What is drawn, a box or the pixels of a mask: `advsearch.tasks.Ma
 def draw_marks(picture: Any, shapes: Sequence[Shape]) -> Floats:
     """Return a picture with boxes, masks and maps drawn into it.
 
-    What is true is blue, what the model says is orange: boxes and the outline of a true
-    mask are lines, a mask of the model is a tint. The text of the model's box stands
-    above its upper left corner, that of the true box below its lower left. Maps stand
-    to the right of the picture, the true one first, in greys that all use the range of
-    the first.
+    Ground truth is blue, the model's predictions are orange. Boxes and the outline of a
+    true mask are lines; a predicted mask is a tint. The text of a predicted box stands
+    above its upper left corner, that of a true box below its lower left. Maps, such as
+    depth, stand to the right of the picture, the true one first, in greys; black and
+    white are the smallest and the largest value of the first map.
 
     Args:
         picture: (H, W, 3), display-referred sRGB in [0, 1]; a small one is magnified.
@@ -328,7 +335,12 @@ def draw_marks(picture: Any, shapes: Sequence[Shape]) -> Floats:
 
 
 def _draw_mask(image: Image.Image, shape: Shape) -> None:
-    """Tint the pixels of a mask of the model, or draw only the outline of a true mask."""
+    """Tint the pixels of a predicted mask, or draw only the outline of a true mask.
+
+    Args:
+        image: the image, which is drawn on.
+        shape: the mark with the mask, which may be smaller than the image.
+    """
     small_mask = Image.fromarray(np.asarray(shape.mask, dtype=bool))
     mask = np.asarray(small_mask.resize(image.size, Image.Resampling.NEAREST))
     # how much of the colour covers each pixel, in [0, 1]
@@ -361,8 +373,13 @@ def _find_outline(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
 def _draw_boxes(
     image: Image.Image, shapes: Sequence[Shape], factor: int, font: Any
 ) -> None:
-    """Draw the boxes of shapes, then their texts, each placed so that it covers no text
-    before it.
+    """Draw the boxes of shapes, and then their texts, so that no text covers another.
+
+    Args:
+        image: the magnified image, which is drawn on.
+        shapes: marks, some of which have boxes in pixels of the original image.
+        factor: factor by which the image was magnified.
+        font: font of the texts.
     """
     draw = ImageDraw.Draw(image)
     boxes = [
@@ -385,8 +402,13 @@ def _make_map_panels(
 ) -> list[Image.Image]:
     """Return the maps of shapes as grey images with their texts, the true one first.
 
-    Black and white are the smallest and the largest value of the first map; `size` is
-    (width, height) of each image in pixels.
+    Black and white are the smallest and the largest value of the first map, so that all
+    maps have the same scale.
+
+    Args:
+        shapes: marks, some of which have a map (h, w), such as depth.
+        size: (width, height) of each returned image in pixels.
+        font: font of the texts.
     """
     maps = sorted(
         (shape for shape in shapes if shape.map is not None),
@@ -400,7 +422,7 @@ def _make_map_panels(
     panels = []
     for shape in maps:
         values = np.asarray(shape.map, dtype=np.float64)
-        # the small number is for a map of one value
+        # 1e-12: a constant map must not be divided by 0
         greys = np.clip((values - lower) / max(upper - lower, 1e-12), 0.0, 1.0)
         levels = np.rint(255.0 * np.nan_to_num(greys)).astype(np.uint8)
         grey_image = Image.fromarray(levels).resize(size, Image.Resampling.NEAREST)
@@ -444,12 +466,11 @@ def _write_label(
     font: Any,
     text_boxes: Sequence[tuple[int, int, int, int]],
 ) -> tuple[int, int, int, int]:
-    """Write the text of a shape at its box, and return the box (x0, y0, x1, y1) of the
-    text.
+    """Write the text of a shape at its box, and return the box of the text.
 
-    The text of the model stands above its shape's box, that of the true shape below.
-    Where that would cover another text, it moves to the nearest free height. All
-    lengths are pixels.
+    The text of a prediction stands above its box, that of a true shape below. If it
+    would cover another text, it moves to the nearest free height. All lengths are
+    pixels; the returned box is (x0, y0, x1, y1).
 
     Args:
         draw: draws on the image.
@@ -483,9 +504,10 @@ def _find_free_height(
     size: tuple[int, int],
     text_boxes: Sequence[tuple[int, int, int, int]],
 ) -> int:
-    """Return the height nearest to a preferred one at which a text covers no other one.
+    """Return the free height for a text that is nearest to a preferred one.
 
-    If there is none, it is the preferred one.
+    At a free height the text covers no other text. If there is none, the preferred
+    height is returned.
 
     Args:
         x: left side of the text.
@@ -550,7 +572,15 @@ def _paste_tile(
     corner: tuple[int, int],
     size: tuple[int, int],
 ) -> None:
-    """Put a picture of a size (width, height) on a sheet, and its caption below it."""
+    """Put a picture on a sheet, and its caption below it.
+
+    Args:
+        sheet: the sheet, which is drawn on.
+        picture: (H, W, 3) in [0, 1].
+        lines: lines of the caption.
+        corner: (left, top) of the picture on the sheet, pixels.
+        size: (width, height) to which the picture is scaled, pixels.
+    """
     left, top = corner
     width, height = size
     tile = Image.fromarray(to_8bit(picture)).resize(size, Image.Resampling.NEAREST)
@@ -567,10 +597,19 @@ def _write_caption(
     width: int,
     font: Any,
 ) -> None:
-    """Write lines of text below each other, each cut to a width in pixels."""
+    """Write lines of text below each other, each cut to a width.
+
+    Args:
+        draw: draws on the sheet.
+        lines: the lines.
+        corner: (left, top) of the first line, pixels.
+        width: width of a line, pixels.
+        font: font of the text.
+    """
     left, top = corner
     for index, line in enumerate(lines):
-        # so many letters fit in no tile, and the loop below cuts one at a time
+        # No tile has room for 200 letters. The loop below cuts one at a time, and would
+        # be slow for a very long line.
         text = " ".join(line[:200].split())
         start = text
         while start and draw.textlength(text, font=font) > width:
@@ -580,8 +619,11 @@ def _write_caption(
 
 
 def choose_column_count(count: int) -> int:
-    """Return in how many columns `count` tiles stand: about the square root, and a
-    divisor of the count if one is near.
+    """Return the number of columns for a sheet of `count` tiles.
+
+    It is the smallest divisor of the count between the square root and twice that, so
+    that the last row is full; without such a divisor, it is the square root, rounded
+    up.
     """
     min_columns = math.ceil(math.sqrt(count))
     # with a divisor of the count, the last row is full

@@ -119,11 +119,10 @@ def write_sheets(
     max_sheets: int = DEFAULT_MAX_SHEETS,
     make_last_page: Callable[[str, tuple[float, float], Any], Figure] | None = None,
 ) -> int:
-    """Write pieces at their real size to a PDF for a printer, and return how many pages
-    it has.
+    """Write pieces at their real size to a PDF, and return its number of pages.
 
-    The first page has the title and how to print; sheets with the parts of the pieces
-    follow.
+    The first page has the title and explains how to print. Sheets with the parts of the
+    pieces follow.
 
     Args:
         path: path of the PDF.
@@ -210,8 +209,9 @@ def arrange_pages(
 ) -> Iterator[list[PlacedPart]]:
     """Yield the parts on each page, with their places.
 
-    Pieces are cut into parts that fit on a page. The highest part comes first, and
-    parts fill a page row by row from its upper left corner.
+    Pieces are cut into parts that fit on a page. Parts are sorted by height, the
+    highest first, so that the parts of a row have about the same height. They fill a
+    page row by row from its upper left corner.
 
     Args:
         pieces: what is printed.
@@ -226,7 +226,8 @@ def arrange_pages(
     parts = [part for piece in pieces for part in _cut_piece(piece, width, height)]
     parts.sort(key=lambda part: -part.extent[1])
     page: list[PlacedPart] = []
-    # where the next part begins, inside the margins, and the height of its row so far
+    # (x, y): upper left corner of the next part, inside the margins; and the height of
+    # the current row of parts
     x = 0.0
     y = 0.0
     row_height = 0.0
@@ -254,8 +255,15 @@ def arrange_pages(
 def _cut_piece(piece: Piece, width: float, height: float) -> Iterator[PlacedPart]:
     """Cut a piece into equal parts that fit on a page together with bleed and marks.
 
-    The cuts lie between pixels. `width` and `height` of the page are in millimetres.
-    The parts are not placed yet.
+    Cuts lie between pixels. The parts have no position on a page yet.
+
+    Args:
+        piece: what is printed.
+        width: width of a page inside its margins, millimetres.
+        height: height of a page inside its margins, millimetres.
+
+    Raises:
+        InputError: it would take more than `MAX_SHEETS` parts.
     """
     left, top = piece.bleed
     n_rows, n_columns = piece.picture.shape[:2]
@@ -279,11 +287,16 @@ def _cut_piece(piece: Piece, width: float, height: float) -> Iterator[PlacedPart
 
 
 def _cut_evenly(length: int, max_length: float) -> list[tuple[int, int]]:
-    """Cut a length into the fewest equal parts that fit, and return the (begin, end) of
-    each.
+    """Cut a length into the fewest equal parts that fit.
 
-    All numbers are pixels. Parts differ by a pixel where the length is no multiple of
-    their number.
+    Parts differ by one pixel if the length is no multiple of their number.
+
+    Args:
+        length: length in pixels.
+        max_length: largest length of a part in pixels, not rounded.
+
+    Returns:
+        (begin, end) of each part.
 
     Raises:
         InputError: not even one pixel fits.
@@ -325,8 +338,12 @@ def _make_cover(
 ) -> Figure:
     """Return the first page: how to print, a square to measure, and the list of pieces.
 
-    `profile` is the ICC profile to which colors were converted. Lengths are
-    millimetres.
+    Args:
+        pieces: what is printed.
+        title: title of the page.
+        paper: (width, height) in millimetres.
+        sheets: number of sheets that follow.
+        profile: the ICC profile to which colors were converted; None for sRGB.
     """
     figure, axes = make_blank_page(paper)
     x = MARGIN
@@ -376,10 +393,12 @@ def _draw_ruler(axes: Axes, paper: tuple[float, float]) -> None:
 
 
 def _draw_part(axes: Axes, part: PlacedPart, convert: Any) -> None:
-    """Draw a part on its page: picture with bleed, cut marks, outline to cut along, and
-    name.
+    """Draw a part on its page: picture with bleed, cut marks, outline and name.
 
-    `convert` converts colours from sRGB to those of the printer; None leaves them.
+    Args:
+        axes: axes of the page, in millimetres.
+        part: the part with its position.
+        convert: converts colours from sRGB to those of the printer; None leaves them.
     """
     piece = part.piece
     x0, x1, y0, y1 = part.trim
@@ -442,10 +461,13 @@ def _draw_cut_marks(
 
 
 def _draw_cut_line(axes: Axes, part: PlacedPart, inside: Mask) -> None:
-    """Draw the outline of what is cut out of a part; `inside` says which of its pixels
-    are.
+    """Draw the outline of what is cut out of a part.
 
-    It has the shape (rows, columns) of the part without bleed.
+    Args:
+        axes: axes of the page, in millimetres.
+        part: the part with its position.
+        inside: (rows, columns) of the part without bleed: whether each pixel belongs to
+            what is cut out.
     """
     n_rows, n_columns = inside.shape
     pixel_width, pixel_height = part.piece.pixel

@@ -207,8 +207,14 @@ def takes_twins(command: str) -> bool:
 
 
 def list_remarks(result: Result, view: ShownResult) -> list[str]:
-    """Return what to know of a result before it is used: its state, cautions,
-    warnings.
+    """Return sentences to know before a result is used.
+
+    They are about its state (interrupted or running), about how far it holds for
+    photographs, and the cautions and warnings.
+
+    Args:
+        result: the result.
+        view: its view, which has the cautions.
     """
     ending = getattr(result, "ending", "")
     remarks = []
@@ -237,10 +243,14 @@ def list_subjects(result: Result, view: ShownResult) -> list[str]:
 
 
 def collect_facts(result: Result, view: ShownResult) -> dict[str, str]:
-    """Return what a result was made with, as texts by name.
+    """Return what a result was made with, as texts by name, such as the seed.
 
-    Facts of the view come first, and replace common facts of the same name; empty ones
-    are left out.
+    Facts of the view come first, and replace common facts of the same name. So a view
+    leaves out a common fact by an empty text.
+
+    Args:
+        result: the result.
+        view: its view, with facts of its own.
     """
     renders = getattr(result, "renders", None)
     seconds = getattr(result, "seconds", None)
@@ -262,15 +272,15 @@ def collect_facts(result: Result, view: ShownResult) -> dict[str, str]:
 
 
 def make_default_view(result: Result) -> ShownResult:
-    """Return the view of a result that has none of its own.
+    """Return the view of a result whose experiment does not define one.
 
-    Its lists are tables, its other fields facts, and a last table says what their names
-    mean.
+    Lists of rows become tables, and other fields become facts. A last table explains
+    the names of both.
     """
     values = {name: getattr(result, name) for name in type(result).described()}
     tables = {name: value for name, value in values.items() if _is_table(value)}
     facts = _find_plain_facts(result, values, tables)
-    # objects with fields, each with the names of those that are on the page
+    # pairs of an object with fields, and the names of its fields that are on the page
     objects_with_words: list[tuple[Fields, set[str]]] = [
         (result, {name for name, text in facts.items() if text})
     ]
@@ -295,8 +305,12 @@ def _is_table(value: object) -> bool:
 def _find_plain_facts(
     result: Result, values: Mapping[str, Any], tables: Iterable[str]
 ) -> dict[str, str]:
-    """Return, as texts by name, those fields of a result that no table and no other
-    part of the page shows.
+    """Return the fields of a result that nothing else on the page shows, as texts.
+
+    Args:
+        result: the result.
+        values: values of its fields by name.
+        tables: names of the fields that become tables.
     """
     # facts are named as a page shows them, fields as Python does
     fact_names = [name.replace(" ", "_") for name in result.facts()]
@@ -309,7 +323,12 @@ def _find_plain_facts(
 
 
 def _make_table(name: str, rows: Sequence[Fields]) -> ResultPart:
-    """Return rows as a table, without the columns that are empty in all of them."""
+    """Return rows as a table, without the columns that are empty in all of them.
+
+    Args:
+        name: name of the field that has the rows.
+        rows: the rows, which may have different fields.
+    """
     names = dict.fromkeys(name for row in rows for name in type(row).model_fields)
     columns = [
         column
@@ -353,8 +372,8 @@ def _explain_words(
 def _format_value(value: object) -> str:
     """Return a value as text for a table; None and NaN are empty.
 
-    Two floats are a range, other lists are separated by semicolons, and mappings and
-    objects with fields become "name value" pairs.
+    A list of two floats is written as a range, "0.1 to 0.3". Items of other lists are
+    separated by semicolons. Mappings and objects with fields become "name value" pairs.
     """
     if value is None:
         return ""
@@ -451,6 +470,8 @@ def make_case_claim(
     if ending == "found" and rate.successes:
         statement = f"{name}: an adversarial scene holds in {rate_text}."
         return claim("found", statement, extent)
+    # Without a search of its own, a scene that fails in its trials shows nothing about
+    # other scenes: then only the rate is claimed.
     found_nothing = ending in FAILED_SEARCH_ENDINGS
     is_only_tried_again = spent is None
     if is_only_tried_again and (found_nothing or ending == "not verified"):
@@ -534,8 +555,14 @@ class Html(str):
 
 
 def make_element(tag: str, *children: str | None, **attributes: str | float) -> Html:
-    """Return one element. Children that are not `Html` are escaped; None is left out.
-    Of attributes ``class_`` is ``class``, and other underscores become hyphens.
+    """Return an HTML element, in which all text is escaped.
+
+    Args:
+        tag: name of the element, such as "p".
+        children: its content: markup (`Html`), or text that is escaped; None is left
+            out.
+        attributes: its attributes; ``class_`` stands for ``class``, and underscores in
+            other names become hyphens.
     """
     names = {"class_": "class", "viewBox": "viewBox"}
     attribute_text = "".join(
@@ -614,8 +641,11 @@ class InNotebook:
 def make_notebook_html(
     view: ShownResult, pictures: Mapping[str, ArrayLike] | None = None
 ) -> str:
-    """Return a result as HTML for a notebook: its sentence, pictures, figure,
-    tables.
+    """Return a result as HTML for a notebook.
+
+    Args:
+        view: the view of the result, with its sentence, charts and tables.
+        pictures: images (H, W, 3) by name, which come first; None for none.
     """
     figures = []
     for name, image in (pictures or {}).items():
@@ -737,7 +767,8 @@ def make_chart_svg(
 ) -> Html:
     """Return a chart as an SVG element for a page.
 
-    The title of the axes is left out, and the legend stands above in the page's colour.
+    The title of the axes is left out, since the page has a heading. The legend stands
+    above the chart, in the color of the page's text.
 
     Args:
         draw: draws on the axes that it is given.
@@ -779,10 +810,14 @@ def make_chart_svg(
 def _make_inline_svg(svg: str, prefix: str) -> Html:
     """Return the shapes of an SVG file, made small and fit to stand in a page.
 
-    Left out are the head of the file, clipping frames (all that is drawn lies in the
-    frame anyway), digits of coordinates after the first decimal, and ids that nothing
-    refers to. The other ids get a prefix, so that two charts on one page have none in
+    The head of the file, clipping frames (everything lies inside the frame anyway),
+    digits of coordinates after the first decimal, and ids that nothing refers to are
+    left out. All other ids get a prefix, so that two charts on one page have no id in
     common. Fixed colours become variables of the page's style.
+
+    Args:
+        svg: content of the file that matplotlib wrote.
+        prefix: prefix of the ids.
     """
     shapes = svg[svg.index("<g ") : svg.rindex("</svg>")]
     unneeded_patterns = (

@@ -122,10 +122,14 @@ def format_percent_number(fraction: float, max_decimals: int = MAX_DECIMALS) -> 
     """Return ``83`` for 0.83, ``4.6`` for 0.0459, ``0.02`` for 0.000211 and ``99.98``
     for 0.99979.
 
-    Within five percent of 0 or 100 there is at least one decimal. Nearer to them there
-    are so many that the distance from 0 or 100 has a digit that is not 0, up to
-    `max_decimals`. What would still be rounded to 0 or 100 becomes ``under 0.01`` or
-    ``over 99.99``.
+    Numbers are rounded to whole percents, except within five percent of 0 or 100. There
+    the text has as many decimals as show a distance from 0 or 100, from 1 to
+    `max_decimals`. A number that would still be rounded to 0 or 100 becomes ``under
+    0.01`` or ``over 99.99``.
+
+    Args:
+        fraction: the fraction, in [0, 1].
+        max_decimals: number of decimals, at most.
     """
     # in percent, as all below
     value = 100.0 * fraction
@@ -145,11 +149,13 @@ def format_percent_number(fraction: float, max_decimals: int = MAX_DECIMALS) -> 
 def format_fraction_of(
     count: int, total: int, interval: tuple[float, float], share: float | None = None
 ) -> str:
-    """Return a share with its interval and the number that it is of: ``12 % (9 to 16)
-    of 340``.
+    """Return a share with its interval and its total: ``12 % (9 to 16) of 340``.
 
-    The share is count over total unless `share` gives another one, for example
-    weighted.
+    Args:
+        count: how many are counted.
+        total: how many there are.
+        interval: lower and upper bound of the share.
+        share: the share, if it is not count / total, such as a weighted one.
     """
     if not total:
         return "none of 0"
@@ -159,13 +165,15 @@ def format_fraction_of(
 
 
 def explain_repeats(name: str, repeats: int, units: int) -> str:
-    """Return sentences for a sweep in which nothing is drawn by chance, so that repeats
-    of a unit differ in the noise of rendering alone.
+    """Return sentences for a sweep in which nothing is drawn by chance.
+
+    Then the repeats of a unit (such as a drive) differ in the noise of rendering alone,
+    and are no independent predictions.
 
     Args:
-        name: what a unit is called.
+        name: name of a unit, such as "drive".
         repeats: repeats of each unit.
-        units: how many there are.
+        units: number of units.
     """
     if units == 1:
         return (
@@ -202,7 +210,7 @@ def format_paired_rates(run: str, pair: Any) -> str:
     )
     lower, upper = (100.0 * bound for bound in pair.interval)
     if pair.difference < 0:
-        # "fewer" says the sign: the bounds lose theirs, and so swap places
+        # The word "fewer" states the sign. The bounds are negated, and so swap places.
         interval = f"{-upper:.0f} to {-lower:.0f}"
         direction = "fewer"
     else:
@@ -235,8 +243,9 @@ def format_objective(objective: str) -> str:
 
 
 def get_objective_name(objective: str) -> str:
-    """Return what an objective is called beside its value: that of a margin has the
-    margin's sign turned.
+    """Return the name of an objective for a reader.
+
+    The objective "margin" is the negative of the margin, and is called "margin loss".
     """
     return {"margin": "margin loss", "pixel_margin": "margin loss of the pixels"}.get(
         objective, objective
@@ -260,7 +269,11 @@ def format_prediction_cells(task: str, prediction: AnyPrediction) -> list[str]:
     """Return the two cells of a prediction in a table: what is predicted, and a number.
 
     For instance ``["vase", "84 %"]`` and ``["no cup found", "best score of cup
-    0.12"]``. The second is empty where there is none.
+    0.12"]``. The second cell is empty if there is no number.
+
+    Args:
+        task: name of the task, which decides what the number is called.
+        prediction: has the label, the probability and perhaps a payload.
     """
     label = prediction.label
     probability = prediction.probability
@@ -279,8 +292,13 @@ def format_prediction_cells(task: str, prediction: AnyPrediction) -> list[str]:
 
 
 def _similarity_text(probability: float, payload: Any) -> str:
-    """Return how similar the best reference is, and at which rank the right one is if
-    it is not the best.
+    """Return how similar the best reference is, and the rank of the right one.
+
+    The rank is left out if the right reference is the best.
+
+    Args:
+        probability: probability of the best reference.
+        payload: what the task stores: "cosine", and "rank" among "references".
     """
     text = percent(probability, PROBABILITY_DECIMALS)
     if not isinstance(payload, dict) or "cosine" not in payload:
@@ -294,10 +312,12 @@ def _similarity_text(probability: float, payload: Any) -> str:
 
 
 def _detection_cells(label: str, score: float, payload: Any) -> list[str]:
-    """Return the two cells of a detector's prediction: what it finds, and with which
-    score and overlap.
+    """Return the cells of a detector's prediction: the label, and score and overlap.
 
-    Where it missed a cup, `label` is "no cup", and `score` the best one of any cup.
+    Args:
+        label: the predicted label; "no cup" if the detector missed a cup.
+        score: score of the box; if the object was missed, the best score of its class.
+        payload: what the task stores of the prediction, such as the overlap "iou".
     """
     outcome = get_outcome(payload)
     stated = payload if isinstance(payload, dict) else {}
@@ -313,6 +333,10 @@ def _detection_cells(label: str, score: float, payload: Any) -> list[str]:
 def format_prediction(task: str, prediction: AnyPrediction) -> str:
     """Return a prediction on one line: ``vase, 91 %``, ``no cup found (best score of
     cup 0.12)``.
+
+    Args:
+        task: name of the task.
+        prediction: has the label, the probability and perhaps a payload.
     """
     label, number = format_prediction_cells(task, prediction)
     if not number:
@@ -421,16 +445,26 @@ def format_mistake(
 def format_mistake_participle(
     task: str, label: str, outcome: Outcome | None = None
 ) -> str:
-    """Return what a model does wrong with a thing that was named already, as a
-    participle: ``calling it a vase``, ``finding no cup``.
+    """Return what a model does wrong as a participle: ``calling it a vase``.
+
+    The sentence has named the thing already, so that it is "it" here.
+
+    Args:
+        task: task of the model.
+        label: label that the model predicts.
+        outcome: what became of the thing, such as missed; None without outcomes.
     """
     verb, _, rest = format_mistake(task, "it", label, outcome).partition(" ")
     return f"{_DOING[verb]} {rest.removesuffix(' for it')}"
 
 
 def format_outcomes(outcomes: Mapping[str, int] | None, task: str = "") -> str:
-    """Return how often each outcome but the right one came about: ``12 missed, 6 in a
-    loose box``; empty where nothing is known of outcomes.
+    """Return how often each wrong outcome occurred: ``12 missed, 6 in a loose box``.
+
+    Args:
+        outcomes: counts by the name of the outcome; None if they are not known, for
+            which the text is empty.
+        task: task of the model, which decides what a loose match is called.
     """
     names = dict(_OUTCOMES)
     if task in _LOOSELY:
@@ -499,8 +533,9 @@ def format_interval(interval: Interval | None) -> str:
 
 
 def format_rate(rated: VerifiedRate) -> str:
-    """Return ``20 of 20 fresh renders (95 % interval 83-100 %)``, and of how many the
-    model's output was not a number.
+    """Return ``20 of 20 fresh renders (95 % interval 83-100 %)``.
+
+    If the model's output was not a number in some trials, their count follows.
     """
     nan_text = (
         f"in {rated.not_a_number} its output is not a number"
@@ -655,8 +690,11 @@ NO_TWINS = (
 
 
 def format_twin_evidence(evidence: TwinEvidence) -> str:
-    """Return, in a sentence or two, how far a verdict on renders holds for photographs,
-    by a run that compared pairs of both.
+    """Return, in a sentence or two, how far a verdict on renders holds for photographs.
+
+    Args:
+        evidence: the matching row of a run that compared renders with photographs of
+            the same scene, and how well its object and surroundings match.
     """
     name = PurePath(evidence.run).name
     row = evidence.row

@@ -24,13 +24,21 @@ class Sheets(Exporter):
     def write(
         self, run: str, out: Path, options: Mapping[str, Any], progress: Progress
     ) -> Exported:
-        """See `Exporter.write`."""
+        """Write the printable pieces of a run as sheets of a PDF file.
+
+        Args:
+            run: name or folder of the run.
+            out: the PDF file.
+            options: values of the flags by name, or None: `size` in millimetres, the
+                number of `sheets` at most, `paper`, and the file of an `icc` profile.
+            progress: not used.
+        """
         from advsearch.extend import exports  # takes seconds
 
         known_size = options["size"]
         if known_size is None:
             known_size = exports.get_real_size(run)
-        # length of the object's longest side in millimetres
+        # the object's longest side in millimetres: `--size`, or the known real size
         longest = USUAL_SIZE if known_size is None else known_size
         pieces = exports.make_printable_pieces(run, longest)
         profile = None if options["icc"] is None else Path(options["icc"])

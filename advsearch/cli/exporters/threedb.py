@@ -80,7 +80,7 @@ def _get_label(row: Any) -> str:
 
 
 def _complete_indices(index_of_label: Mapping[str, int | None]) -> dict[str, int]:
-    """Return the index of each label; those without one come behind all others."""
+    """Return the index of each label; labels without one get the next free indices."""
     class_index = {
         label: index for label, index in index_of_label.items() if index is not None
     }
@@ -102,8 +102,7 @@ def _list_class_names(class_index: Mapping[str, int]) -> list[str]:
 def make_line(row: Any, names: Iterable[str], prediction: int) -> dict[str, Any]:
     """Return one line of a 3DB log, for a row of a sweep.
 
-    3DB minimizes where we maximize, so its loss is the negative margin: over 0 where a
-    prediction is wrong.
+    The loss of a line is the negative margin: it is positive if a prediction is wrong.
 
     Args:
         row: row of the results.
@@ -140,7 +139,14 @@ class ThreeDB(Exporter):
     def write(
         self, run: str, out: Path, options: Mapping[str, Any], progress: Progress
     ) -> Exported:
-        """See `Exporter.write`."""
+        """Write the rows of a run as a folder of 3DB.
+
+        Args:
+            run: name or folder of the run.
+            out: the folder, which is made, or empty.
+            options: `kind` of the rows; None stands for those of a sweep.
+            progress: not used.
+        """
         from advsearch.extend import exports  # takes seconds
 
         run_path = directory.find_run(run)

@@ -24,10 +24,10 @@ does not: they end at a factor of 1.19.
 def find_ambient(verifier: Verifier, u: Tensor) -> None:
     """Find the ambient light in which a verified configuration no longer holds.
 
-    It is tried in twice the ambient light of the scene, and twice that, and so on, up
-    to the first in which it fails; then between the last two. Nothing else changes: as
-    exposure follows the ambient light, the projector's light gets darker in the image.
-    All points have the same seeds, which nothing else has. The results are in
+    The ambient light is doubled until the configuration fails; then the limit is
+    bisected between the last two lights. Nothing else changes: since exposure follows
+    the ambient light, the projector's light gets darker in the image. The trials have
+    the same seeds in every light, which no other stage uses. The results are stored in
     `verifier.state.ambient_verifications`, by lux.
 
     Args:
@@ -114,10 +114,14 @@ def _find_scene_lux(problem: Problem) -> float | None:
 def make_problem_finder(problem: Problem) -> Callable[[ProblemKey], Problem]:
     """Return the function by which a worker finds the problem of a query.
 
-    A number as the key is a factor on the ambient light; any other key is the problem
-    of the run.
+    If the key of a problem is a float, it is a factor on the ambient light; any other
+    key stands for the problem of the run.
+
+    Args:
+        problem: problem of the run.
     """
 
+    # Two are enough, since lights are tried one after another.
     @lru_cache(maxsize=2)
     def make_problem_in_light(factor: float) -> Problem:
         return with_ambient_light(problem, factor)

@@ -130,7 +130,8 @@ def load_parts(
     Args:
         config: the settings.
         scene: scene to use instead of the one that the settings name.
-        model: model to use likewise; with both, the attack is not stored.
+        model: model to use instead of the one that the settings name. If both are
+            passed, the attack is not stored, and has no metrics.
     """
     if scene is None and len(config.objects) > 1:
         raise make_single_value_error("object", config.objects)
@@ -161,10 +162,15 @@ def load_parts(
 def load_parts_of_run(run: Path) -> AttackParts:
     """Load what is needed to evaluate the result of an attack's run.
 
-    Parts that only the search used are not needed.
+    The objective, the policy and metrics are replaced by default ones if they were the
+    caller's own: only the search used them.
+
+    Args:
+        run: the run directory.
 
     Raises:
-        InputError: some of that exists only in the Python session of the run.
+        InputError: the scene, the model, the task or a control exists only in the
+            Python session of the run.
     """
     missing = [
         part.text for part in read_python_only(run) if part.role not in ROLES_IN_SEARCH
@@ -182,8 +188,9 @@ def move_to_photographs(
 ) -> tuple[dict[str, AttackParts], dict[str, AttackParts]]:
     """Return the parts of an attack with its scene in each photograph of a folder.
 
-    What the camera files state takes the place of what the attack states of camera,
-    pose and ground. Controls that vary by chance what a photograph fixes are left out.
+    Beside each photograph is a camera file. What it states of camera, pose and ground
+    replaces the settings of the attack. Controls that vary by chance something that a
+    photograph fixes are left out.
 
     Args:
         parts: parts of the attack.
@@ -220,7 +227,7 @@ def move_to_photographs(
             config=config,
             scene=replace(scene, description=description),
             random_controls=random_controls,
-            clean_matrix=CleanMatrix(),
+            clean_matrix=CleanMatrix(),  # a new one: the clean scene is another
         )
     return parts_in_unused, parts_in_used
 
@@ -229,6 +236,10 @@ def _set_photograph_folder(config: AttackConfig, folder: str) -> AttackConfig:
     """Return settings with which the scene is rendered into the photographs of a folder.
 
     Settings that the camera files beside the photographs replace are left out.
+
+    Args:
+        config: settings of the attack.
+        folder: folder of photographs with their camera files.
 
     Raises:
         FileFormatError: the folder cannot be used.
@@ -319,7 +330,16 @@ def make_task_and_objective(
 def load_ensemble(
     model: AnyModel | Sequence[AnyModel], config: AttackConfig, task: Task
 ) -> tuple[Model, list[str]]:
-    """Load models, several as one ensemble; return it and warnings."""
+    """Load a model, or several ones as one ensemble.
+
+    Args:
+        model: a name, a file or a module; or a sequence of these.
+        config: the settings.
+        task: task of the models.
+
+    Returns:
+        The model or the ensemble, and warnings of loading.
+    """
     models, warnings = load_models(list_models(model), task, config)
     if len(models) == 1:
         return models[0], warnings
@@ -335,7 +355,7 @@ def check_from_config(config: AttackConfig) -> None:
     """
     parts = load_parts(config)
     model, _ = parts.model_and_warnings
-    # Both raise errors for what does not fit.
+    # The results of both calls are dropped: they raise errors for what does not fit.
     _bind_task(parts, renders_clean_image=False)
     size = config.resolution or model.input_size
     make_space(
@@ -350,7 +370,8 @@ def problem_from_config(
     """Load what a configuration describes, without searching.
 
     Args:
-        config: the settings.
+        config: settings of an attack, or of another experiment with a scene and a
+            model; then the other settings of an attack are the defaults.
         denoise: denoiser to use instead of the setting.
 
     Returns:
@@ -367,7 +388,8 @@ def make_problem_with_warnings(
 
     Args:
         parts: parts of the attack.
-        **changes: other settings; of another `model`, its name.
+        **changes: settings to replace. If `model` is among them, the named model is
+            loaded instead of that of `parts`.
     """
     config = parts.config.model_copy(update=changes)
     model, warnings = parts.model_and_warnings
@@ -456,7 +478,13 @@ def make_problem(parts: AttackParts, *, differentiated: bool = True) -> Problem:
 def _check_printable(
     parts: AttackParts, config: AttackConfig, description: Any
 ) -> None:
-    """Raise an error if colors are to be printed and no searched control prints any."""
+    """Raise an error if colors are to be printed and no searched control prints any.
+
+    Args:
+        parts: parts of the attack.
+        config: the settings; without `printable` nothing is checked.
+        description: the scene.
+    """
     if not config.printable:
         return
     # Without the photographs: the control that chooses among them varies by chance, and
@@ -468,7 +496,11 @@ def _check_printable(
 
 
 def _check_objective_inputs(parts: AttackParts, problem: Problem) -> None:
-    """Raise an error if the objective requests an input that the problem lacks."""
+    """Raise an error if the objective requests an input that the problem lacks.
+
+    A function of the user requests inputs by the names of its parameters, such as
+    `texture`.
+    """
     for name in list_requested_inputs(parts.objective):
         start = problem.add_conditions(problem.domain.start)
         get_input = problem.make_objective_inputs(start)
@@ -506,7 +538,8 @@ def _bind_task(
         config.label,
         judge=config.judge,
     )
-    # `dict` describes no parameter: all have the values of the scene.
+    # Facts are made with a function that describes the configuration. Here it is
+    # `dict`, which returns an empty description: all values are those of the scene.
     scene_facts = make_scene_facts(dict)
     ensemble = task if isinstance(task, EnsembleTask) else None
     members = [(task, model)]
@@ -532,10 +565,15 @@ def _bind_task(
 
 
 def choose_search_size(config: AttackConfig, problem: Problem) -> tuple[int, int]:
-    """Return the steps of a search, and how many conditions each evaluates.
+    """Return the steps of a search, and how many conditions each step evaluates.
 
-    The settings decide. Where they do not, the defaults over conditions depend on how
-    many numbers vary by chance, and on whether the images can be predicted.
+    Conditions are what varies by chance (setting `over`), such as the camera. If the
+    settings do not state both numbers, the defaults depend on how many numbers vary by
+    chance, and on whether images can be predicted, since rendered ones cost more.
+
+    Args:
+        config: the settings.
+        problem: problem of the attack.
     """
     if problem.conditions is None:
         return config.steps or STEPS, 1
@@ -558,9 +596,12 @@ def choose_search_size(config: AttackConfig, problem: Problem) -> tuple[int, int
 def is_named(entry: Task | Policy[Any], make: Callable[[Any], object]) -> bool:
     """Return whether a setting can name a task or a policy.
 
+    It can if the task or policy is equal to the one that is made from its setting. One
+    of a user's own class, for example, is not.
+
     Args:
         entry: the task or policy.
-        make: makes one from a setting.
+        make: makes a task or policy from a setting.
     """
     try:
         return bool(make(to_setting(entry)) == entry)
@@ -622,7 +663,7 @@ def open_executor(
 ) -> AbstractContextManager[Workers | None]:
     """Return the workers that run a function of a configuration.
 
-    None if the settings ask for no workers: then this process does it.
+    The context is None if no workers are requested: then this process does the work.
 
     Args:
         config: the settings.
@@ -633,6 +674,7 @@ def open_executor(
         InputError: the model is behind an address; a single process asks it, which
             counts the calls.
     """
+    # A worker gets the settings of the run, but must not start workers itself.
     in_process = {"workers": None, "cluster": None}
     worker_settings = config.make_repeatable().model_copy(update=in_process).to_json()
     work = WorkerTask(function, worker_settings, FILES, config.used_threads or 1)

@@ -81,7 +81,10 @@ def _matrix_claims(result: MatrixResult) -> Iterator[Claim]:
 
 
 def _view_attack(summary: AttackSummary) -> ShownResult:
-    """Return the view of one attack."""
+    """Return the view of one attack: its verdict, tables, facts and cautions.
+
+    Facts with an empty text are left out.
+    """
     sections = [_rates_part(summary)]
     if summary.failures and summary.failures.tried:
         sections.append(make_failures_part(summary.failures, tried=True))
@@ -155,7 +158,11 @@ def _rate_cells(
 
 
 def make_ambient_parts(summary: AttackSummary) -> list[ResultPart]:
-    """Return the section about ambient light, if it was tried."""
+    """Return the section about ambient light, if it was tried.
+
+    It is about an image from a projector: up to which other light on the object it
+    still makes the model wrong.
+    """
     light = summary.ambient
     if light is None:
         return []
@@ -270,7 +277,8 @@ CURVE_NOTE = (
 def _view_curve(result: CurveResult) -> ShownResult:
     """Return the view of robust accuracy against epsilon.
 
-    A page has a chart if there are several epsilons; of a single one a notebook has it.
+    The chart needs several epsilons to be worth its place on a page. With a single one,
+    only a notebook shows it.
     """
     known = [point for point in result.curve if point.accuracy is not None]
     # without the controls' own epsilons, which have no place on an axis
@@ -387,7 +395,13 @@ def epsilon_text(value: EpsilonBudget) -> str:
 
 
 def _draw_curve(result: CurveResult, points: Sequence[CurvePoint], axes: Any) -> None:
-    """Draw the robust accuracy over epsilon on matplotlib axes."""
+    """Draw the robust accuracy over epsilon on matplotlib axes.
+
+    Args:
+        result: result of the curve, for the title.
+        points: the epsilons with a robust accuracy, ascending.
+        axes: axes of matplotlib.
+    """
     epsilon = [point.epsilon for point in points]
     accuracy = [point.accuracy for point in points]
     low = [point.interval[0] for point in points]
@@ -534,7 +548,11 @@ def _matrix_text(result: MatrixResult) -> str:
 
 
 def _draw_matrix(result: MatrixResult, axes: Any) -> None:
-    """Draw the rates of a matrix on matplotlib axes."""
+    """Draw the rates of a matrix on matplotlib axes.
+
+    A row is a model that was attacked, and a column a model on which the scene was
+    tried.
+    """
     rows = [row for row in result.table if row.tested]
     rates = [[cell.verified.rate for cell in row.tested] for row in rows]
     axes.imshow(rates, cmap="Reds", vmin=0.0, vmax=1.0, aspect="auto")

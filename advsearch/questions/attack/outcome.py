@@ -296,7 +296,11 @@ def _summarize_controls(problem: Problem) -> dict[str, Any]:
 
 
 def _summarize_verification(problem: Problem, findings: RunState) -> dict[str, Any]:
-    """Return the fields of a summary about the trials of the configurations."""
+    """Return the fields of a summary about the trials of the configurations.
+
+    These are the trials of the clean scene, of the adversarial one and of the random
+    search, and the samples per pixel.
+    """
     verification = findings.verification
     adversarial_trials = verification.adversarial_trials if verification else ()
     samples = findings.sample_count
@@ -454,7 +458,8 @@ def _summarize_average(findings: RunState) -> AverageCase | None:
     right = count_right(trials, findings.spp)
     scores = [trial.score for trial in trials]
     known_scores = [score for score in scores if not math.isnan(score)]
-    # A score is the negative of a margin. 0.0 - x, since -x may be -0.0.
+    # A score is the negative of a margin. It is negated as `0.0 - x`, since -x of 0.0
+    # would be -0.0.
     return AverageCase(
         configurations=right.trials,
         correct=right.successes,
@@ -466,10 +471,10 @@ def _summarize_average(findings: RunState) -> AverageCase | None:
 
 
 def _summarize_bracket(problem: Problem, findings: RunState) -> SmallestEpsilon | None:
-    """Return the bracket of the smallest epsilon, by control; None if not searched.
+    """Return the bounds of the smallest epsilon, by control; None if not searched.
 
-    Its ends are factors of the budgets: the smallest at which a wrong prediction was
-    found, and the largest at which none was found.
+    The bounds of the bracket are factors of the budgets: `high` is the smallest at
+    which a wrong prediction was found, and `low` the largest at which none was found.
     """
     bracket = findings.bracket
     if bracket is None:
@@ -543,9 +548,9 @@ def _summarize_distribution(
 def name_objective(task: Task, objective: str | None) -> str:
     """Return the name of what a search maximised.
 
-    "score" is the task's own score. If the task seeks a goal, as a detector may, the
-    score is named after that. The goal "vanish" is a detector's default, and changes
-    nothing: the name stays "score".
+    "score" is the task's own score. A detector may have a goal, such as "create"; then
+    the score is named after it. With the goal "vanish", a detector's default, the name
+    stays "score".
 
     Args:
         task: task of the search.
@@ -573,7 +578,8 @@ def _compute_objective_values(trials: Sequence[Judgement]) -> ObjectiveValues | 
 def _summarize_printability(problem: Problem, findings: RunState) -> Printability:
     """Return how printable the scenes are, and what that costs in margin.
 
-    The cost is known if a search without print terms was verified, too.
+    Print terms of the objective keep colors printable. Their cost is the difference in
+    margin from a search without them, if that was verified, too.
     """
 
     def measure_terms(search: SearchResult | None) -> PrintTerms | None:
@@ -629,8 +635,9 @@ def _describe_configuration(problem: Problem, u: Tensor) -> dict[str, FoundValue
 def _describe_ranges(problem: Problem) -> dict[str, tuple[float, float]]:
     """Return the range of each searched parameter that is a single number.
 
-    It goes from the value where the parameter's coordinate is 0 to that where it is 1;
-    parameters for which that is no range of numbers are left out.
+    Each searched number has a coordinate in [0, 1]. Its range goes from the value at
+    coordinate 0 to the value at 1. Parameters whose values there are no numbers in
+    ascending order are left out.
     """
     start = problem.domain.start
     # The searched parameters come first in the space, and the start has their
@@ -656,7 +663,14 @@ def _describe_ranges(problem: Problem) -> dict[str, tuple[float, float]]:
 def _describe_with(
     problem: Problem, u: Tensor, columns: list[int], coordinate: float
 ) -> dict[str, Value]:
-    """Return the values of a configuration with some coordinates set to `coordinate`."""
+    """Return the values of a configuration with some coordinates replaced.
+
+    Args:
+        problem: problem of the attack.
+        u: (d,) the configuration.
+        columns: indices of the coordinates to replace.
+        coordinate: their new value.
+    """
     changed = u.clone()
     changed[columns] = coordinate
     return problem.describe(changed)
@@ -670,8 +684,10 @@ def _get_value(values: Mapping[str, Value], name: str) -> Any:
 def _describe_conditions(problem: Problem) -> dict[str, VariedValue]:
     """Return the ranges of the parameters that vary by chance, by name.
 
-    These are only parameters that are a single number or a choice: a number has its
-    smallest and largest value, and a choice its options.
+    Only parameters that are a single number or a choice are described: a number by its
+    smallest and largest value, a choice by its options. The values are found by
+    describing configurations with the parameter's coordinate at both ends, or at the
+    center of each option.
     """
     ranges: dict[str, VariedValue] = {}
     if problem.conditions is None:
@@ -709,7 +725,12 @@ def _list_described_coordinates(n_options: int) -> list[float]:
 
 
 def _to_range(described: Sequence[Value], *, is_choice: bool) -> VariedValue:
-    """Return the range of numbers, or the names of a choice."""
+    """Return the range of numbers, or the names of a choice.
+
+    Args:
+        described: values of the parameter, each with its unit, at least one.
+        is_choice: whether they are the options of a choice; options may be numbers.
+    """
     unit = str(described[0]["unit"])
     values = [value["value"] for value in described]
     numbers = [float(value) for value in values if isinstance(value, (int, float))]
@@ -722,9 +743,9 @@ def _to_range(described: Sequence[Value], *, is_choice: bool) -> VariedValue:
 def _count_renders(findings: RunState, problem: Problem) -> dict[str, int]:
     """Count the images of an attack by what they were rendered for.
 
-    An evaluation of a search takes an image for each of the `n_draws` conditions, and
-    so does a gradient. Images that were traced to prepare a predictor count for the
-    search.
+    An evaluation of a search takes an image for each of the `n_draws` conditions that
+    it averages over, and so does a gradient. Images that were traced to prepare a
+    predictor count for the search.
 
     Args:
         findings: findings of the attack.
@@ -768,7 +789,13 @@ def _count_renders(findings: RunState, problem: Problem) -> dict[str, int]:
 
 
 def _make_remarks(findings: RunState, problem: Problem, journal: Journal) -> list[str]:
-    """Return sentences about doubts in the result, and about what was not finite."""
+    """Return sentences about doubts in the result, and about what was not finite.
+
+    Args:
+        findings: findings of the attack.
+        problem: problem of the attack.
+        journal: journal of the run, which knows of lost workers.
+    """
     remarks = list[str]()
     rendering_remark = make_rendering_remark(findings.predictor_refusal)
     if rendering_remark:
@@ -782,7 +809,8 @@ def _make_remarks(findings: RunState, problem: Problem, journal: Journal) -> lis
         for search in (findings.search, findings.baseline)
         if search is not None
     )
-    # The renderer counts those of the searches too, unless they were predicted.
+    # The renderer counts those of the searches, too, unless images were predicted: so
+    # the two counts overlap, and the larger one is stated.
     n_non_finite = max(problem.renderer.non_finite, n_in_searches)
     if n_non_finite:
         remarks.append(
@@ -793,7 +821,7 @@ def _make_remarks(findings: RunState, problem: Problem, journal: Journal) -> lis
 
 
 def _make_samples_remark(spp: int, *, has_conditions: bool) -> str:
-    """Return a sentence about a sample count of which it is not shown that it suffices.
+    """Return a sentence which warns that the sample count may be too small.
 
     Args:
         spp: samples per pixel of the verification.
@@ -817,6 +845,10 @@ def describe_failures(problem: Problem, findings: RunState) -> DifferentFailures
     """Return the failures that a search found which differ from each other.
 
     None if the policy does not look for several failures.
+
+    Args:
+        problem: problem of the attack.
+        findings: findings of the attack, with the verifications of the first failures.
     """
     known = findings.search.failures if findings.search else None
     if known is None:
@@ -887,10 +919,11 @@ def _describe_failure(
 def _describe_failure_ranges(
     problem: Problem, failure: FoundFailure
 ) -> dict[str, tuple[float, float] | str]:
-    """Return the ranges of a failure and of those that it stands for, by coordinate.
+    """Return the ranges in which a failure lies, by the name of the coordinate.
 
-    A range is in the parameter's unit if the parameter is a single number, else in u. A
-    discrete choice has the name of its option instead.
+    A failure stands for a cell of similar configurations, whose bounds these are. A
+    range is in the parameter's unit if the parameter is a single number, such as
+    "pose.yaw"; else it is in coordinates. A discrete choice has the name of its option.
 
     Args:
         problem: problem of the attack.

@@ -47,7 +47,8 @@ MARKED = "-prediction.png"  # end of the names of files with marks
 def make_page(run: Path, result: Result) -> str | None:
     """Return the page of an attack.
 
-    None of a study, whose page is that of any result.
+    The result of a study (a curve or a matrix) has the default page instead: then this
+    is None.
 
     Args:
         run: the run directory.
@@ -145,6 +146,8 @@ def _image_parts(
 ) -> Iterator[ResultPart]:
     """Yield the sections with images.
 
+    Sections with `live` are filled by the page's script, and hidden without it.
+
     Args:
         run: the run directory.
         summary: summary of the attack.
@@ -231,7 +234,8 @@ def _find_trial_images(images: Path) -> list[Picture]:
 def _changes_part(summary: AttackSummary) -> ResultPart:
     """Return the table of the parameters that were changed.
 
-    Columns that are empty in all rows are left out; then there are no bars either.
+    Columns that are empty in all rows are left out. If any column is left out, there
+    are no bars of the ranges either.
     """
     rows = []
     bars = []

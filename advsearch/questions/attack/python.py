@@ -189,6 +189,14 @@ def _check_can_use_workers(
     Workers are other processes. They load everything by its name, and do not have the
     objects of this session.
 
+    Args:
+        scene: scene as the caller passed it; names and paths can be loaded.
+        model: model or models as the caller passed them.
+        task: task as the caller passed it.
+        objective: a name, or a function of the session.
+        session_controls: names of the controls that exist in this session only.
+        options: the settings that the caller passed, perhaps with `workers`.
+
     Raises:
         InputError: such a setting is among `options`.
     """
@@ -214,9 +222,22 @@ def _make_config(
     run: str | Path | None,
     options: dict[str, Any],
 ) -> AttackConfig:
-    """Return the settings of an attack, with the names of the caller's objects."""
-    # What `run.yaml` states. Objects of the caller have the names that they are shown
-    # by.
+    """Return the settings of an attack, as `run.yaml` states them.
+
+    Objects of the caller, such as a loaded model, are replaced by their names.
+
+    Args:
+        scene: the loaded scene.
+        model: model or models.
+        task: a name, settings or an instance.
+        controls: controls that are searched.
+        objective: a name or a function; None for the task's own.
+        policy: a name, settings or an instance.
+        over: controls that vary by chance.
+        metrics: functions by name.
+        run: the run directory; None stores nothing.
+        options: all other settings, by name.
+    """
     objective_name = _name_objective(objective) if callable(objective) else objective
     described = {
         **loading.scene_to_settings(scene),
@@ -268,10 +289,10 @@ def _find_python_only(
     Args:
         config: the settings.
         scene: the loaded scene.
-        model: model as the caller passed it; so are the others.
-        task: task of the model.
-        objective: objective of the search.
-        policy: policy of the search.
+        model: model as the caller passed it.
+        task: task as the caller passed it.
+        objective: a name, or a function of the session.
+        policy: a name, settings or an instance.
         session_controls: names of the controls that exist in this session only.
     """
     parts = [
@@ -304,8 +325,8 @@ def _load_scene(
 
     Args:
         scene: loaded scene, a file, a name, or a dictionary of Mitsuba.
-        shape: its object, if it has several.
-        options: options of the attack.
+        shape: id of the shape that is the object, if the scene has several.
+        options: the settings that the caller passed; those of the scene are used.
     """
     if isinstance(scene, Scene):
         naming.check_no_scene_settings({**options, "object": shape})
@@ -313,6 +334,7 @@ def _load_scene(
     scene_options = {
         name: options[name] for name in naming.SCENE_SETTINGS if name in options
     }
+    # A configuration needs some object. "mug" is not used: only other settings are.
     config = SceneConfig(**{"object": "mug", **scene_options})
     environment = config.environment
     keywords = naming.make_scene_kwargs(config)
@@ -331,6 +353,7 @@ def _name_objective(objective: Callable[..., Tensor]) -> str:
 
 def _make_policy(setting: Any) -> Policy[Any]:
     """Make the policy that a setting names."""
+    # Only the policy of this configuration is used, but it needs some object.
     config = AttackConfig(object="mug", policy=setting)
     return make_policy(config.policy_name, **config.policy_options)
 

@@ -127,13 +127,13 @@ class AttackResult:
             configuration, as in the trial that the summary names; its `clean` has what
             the model says of it.
         adversarial: the same of `u`.
-        artifacts: what the controls hand over of `u`, by name: the texture, say; (h, w,
-            3) sRGB in [0, 1].
+        artifacts: images that the controls make from `u`, by name, such as the texture;
+            (h, w, 3) sRGB in [0, 1].
         search: the search's own log and claim; None where nothing was searched, and of
             a run that was loaded.
         in_memory: the rows, where there is no run directory.
-        parts: returns what the attack was asked with; None of a result that came from
-            another process.
+        parts: returns the parts that the attack was made of (scene, model, settings);
+            None for a result that came from another process.
     """
 
     summary: AttackSummary
@@ -202,8 +202,8 @@ class AttackResult:
     ) -> Rendering:
         """Render the adversarial scene again, and return what a model predicts of it.
 
-        What the adversarial configuration does not state is as the scene comes:
-        conditions of `over` have their start.
+        What the adversarial configuration does not set is as in the original scene. In
+        particular, the controls of `over` have their start values.
 
         Args:
             model: None for the attack's own.
@@ -365,10 +365,10 @@ class StoredImage:
 def choose_stored_trial(findings: RunState) -> int | None:
     """Return the number of the trial whose images of both scenes are stored.
 
-    Both scenes have the same conditions in it. It is a typical one: the first with the
-    most frequent prediction among the successes (among the trials that count, if there
-    are no successes), if possible one in which the clean scene has its own most
-    frequent prediction. None if there were no trials.
+    A trial renders both scenes under the same conditions. The selected one is typical:
+    the first in which the model predicts what it predicts most often among the
+    successes (if there are none, among the trials that count). If possible, the clean
+    scene has its own most frequent prediction in it, too. None if there were no trials.
     """
     verification = findings.verification
     if verification is None:
@@ -379,7 +379,8 @@ def choose_stored_trial(findings: RunState) -> int | None:
     typical_trials = verification.successful_trials or verification.valid_trials
     usual_label = mode(_list_labels(typical_trials))
     usual_clean_label = mode(clean_labels)
-    # of each trial what speaks for it, the most important first
+    # The criteria that each trial meets, the most important first. Tuples of bools are
+    # compared in this order, so that the largest one is the most typical trial.
     ranks = list[tuple[bool, bool, bool]]()
     for label, outcome, clean_label in zip(
         _list_labels(verification.adversarial_trials),
@@ -453,7 +454,17 @@ def save_images(
 def _save_scene_image(
     run: RunDirectory, problem: Problem, name: str, image: StoredImage
 ) -> None:
-    """Save the image of a scene, its radiance, its marks and its layers."""
+    """Save the image of a scene, its radiance, its marks and its layers.
+
+    Marks are what a task draws on an image, such as the boxes of a detector. Layers are
+    ground truth for each pixel, such as depth, if the settings request any.
+
+    Args:
+        run: run directory into which they are saved.
+        problem: problem of the attack.
+        name: name of the files, "clean" or "adversarial".
+        image: the rendered image.
+    """
     run.save_image(name, image.image)
     run.save_exr(name, image.radiance * problem.renderer.formation.gain)
     marks = problem.find_marks(image.image, image.full_configuration)
@@ -480,8 +491,8 @@ def save_trial(
         problem: problem of the attack.
         findings: findings of the attack; an image that it does not have is rendered
             again.
-        trial: its kind and its number.
-        name: name of the file.
+        trial: kind and number of the trial, such as ("verification", 3).
+        name: name of the file without its suffix.
         u: (d,) the configuration.
     """
     _, number = trial
@@ -504,10 +515,11 @@ def save_with_marks(
 
 
 def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
-    """Write the object before and after, to turn in a browser.
+    """Write the clean and the adversarial object as a file that a browser can turn.
 
-    Meshes near it that controls move or paint are written, too. Meshes with many faces
-    are simplified, so that all together have `MAX_FACES` at most, which a note says.
+    Other meshes that controls move or paint are written, too, if they are near. Meshes
+    with many faces are simplified, so that all together have at most about `MAX_FACES`;
+    the file has a note on it.
 
     Args:
         run: run directory into which it is written.
@@ -519,6 +531,7 @@ def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
         return
     adversarial = _assemble(problem, u)
     clean = _assemble(problem, problem.domain.start)
+    # An input of the scene is named as "mug.bsdf.reflectance": the mesh comes first.
     changed_names = {OBJECT, *(name.partition(".")[0] for name in adversarial)}
     meshes = [mesh for name, mesh in scene.meshes.items() if name in changed_names]
     max_faces = MAX_FACES // len(meshes)
@@ -598,7 +611,7 @@ def evaluate_drive(
 ) -> AlongDrive | None:
     """Evaluate both scenes at evenly spaced times of each path that varies by chance.
 
-    The images are saved. Other conditions are as the scene comes.
+    The images are saved as an animation. Other conditions have their start values.
 
     Args:
         problem: problem of the attack.
@@ -703,7 +716,17 @@ def _read_time(problem: Problem, path: Any, u: Tensor) -> float:
 def _render_frames(
     problem: Problem, frames: Tensor, spp: int
 ) -> tuple[list[npt.NDArray[np.float32]], int]:
-    """Return the images of frames (n, d) with marks, and how many are right."""
+    """Render frames, and evaluate the model on them.
+
+    Args:
+        problem: problem of the attack.
+        frames: (n, d) configurations of the frames.
+        spp: samples per pixel.
+
+    Returns:
+        The images (H, W, 3) with the marks of the task, and in how many the model is
+        right.
+    """
     images = list[npt.NDArray[np.float32]]()
     n_right = 0
     for number, configuration in enumerate(frames):
@@ -728,8 +751,9 @@ def save_drive(
     Args:
         run: run directory into which they are saved.
         name: name of the files.
-        images: (h, w, 3) in sRGB.
-        seconds: seconds from the first frame to the last.
+        images: (h, w, 3) of each frame, sRGB in [0, 1].
+        seconds: seconds from the first frame to the last; the animation lasts as long,
+            but a frame at least `MIN_FRAME_MILLISECONDS`.
     """
     frames = [Image.fromarray(files.to_8bit(picture)) for picture in images]
     stream = io.BytesIO()

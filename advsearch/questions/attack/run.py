@@ -159,7 +159,14 @@ def _report_warnings(
     problem: Problem,
     loading_notes: Sequence[str],
 ) -> list[str]:
-    """Report and return the warnings of loading and of the controls."""
+    """Report and return the warnings of loading and of the controls.
+
+    Args:
+        parts: parts of the attack.
+        progress: gets each warning as a message.
+        problem: problem of the attack, whose controls have notes on the scene.
+        loading_notes: warnings of loading the model.
+    """
     warnings = [
         *problem.space.list_notes(parts.scene.description),
         *loading_notes,
@@ -191,9 +198,20 @@ def _search(
     journal: Journal,
     stages: Stages,
 ) -> Any:
-    """Search and verify the worst configuration, with the settings of the attack."""
-    # Otherwise there are as many trials as the verdict needs. To bracket the smallest
-    # change takes many verdicts, so that their number of trials is fixed.
+    """Search and verify the worst configuration, with the settings of the attack.
+
+    Args:
+        parts: parts of the attack, of which the clean matrix is used.
+        config: the settings.
+        policy: policy that searches.
+        journal: journal of the run.
+        stages: reports what is done.
+
+    Returns:
+        The findings, a `RunState`.
+    """
+    # Without a fixed number, trials end as soon as the verdict is clear. The search of
+    # the smallest change needs many verdicts, so its number of trials is fixed.
     has_trial_count = config.trials is not None or config.smallest
     return search_and_verify(
         policy,
@@ -236,7 +254,7 @@ def search_and_verify(
 ) -> RunState:
     """Search a problem with a policy and at random, and verify what was found.
 
-    Ctrl-C ends it with what there is.
+    After Ctrl-C the findings so far are returned.
 
     Args:
         policy: proposes configurations.
@@ -311,6 +329,9 @@ def search_and_verify(
 def _choose_looks(problem: Problem, trials: int | None) -> tuple[int, ...]:
     """Return the numbers of trials after which a verdict may be reached.
 
+    A verification looks at its trials after each of these numbers, and ends as soon as
+    they suffice. Conditions that vary by chance need more trials.
+
     Args:
         problem: problem of the attack.
         trials: the requested number; None for as many as the verdict needs.
@@ -323,10 +344,10 @@ def _choose_looks(problem: Problem, trials: int | None) -> tuple[int, ...]:
 def search_with_baselines(
     searches: Searches, policy: Policy[Any], *, seconds: float | None, baseline: bool
 ) -> None:
-    """Search with a policy, and for comparison in two other ways.
+    """Search with a policy, and make up to two other searches to compare with.
 
-    These are a search without print terms, if the objective has any, and a random
-    search, if it is requested and the policy is another one.
+    One is a search without print terms, if the objective has print terms. The other is
+    a random search, if it is requested and the policy is not itself random.
 
     Args:
         searches: searches of the attack.
@@ -375,9 +396,11 @@ def choose_policy(
 ) -> Policy[Any]:
     """Return the policy that searches a problem: the requested one, or a special `auto`.
 
-    `auto` follows the model's gradient. For a model without one it is replaced by
-    "nes", which estimates a gradient from differences. A model behind an address has no
-    gradient either; in ranges alone, `auto` keeps its samples and its surrogate.
+    `auto` follows the model's gradient. If the model has no gradient, `auto` is
+    replaced by "nes", which estimates a gradient from differences. A model behind an
+    address (a remote one) has no gradient either. If only ranges are searched, without
+    any budget epsilon, `auto` then leaves out its gradient steps, and keeps its samples
+    and its surrogate model.
 
     Args:
         policy: the requested one.

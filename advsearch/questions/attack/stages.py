@@ -88,9 +88,9 @@ def plan_renders(
 ) -> None:
     """Choose light bounces, gradient estimators and samples of a search by measurement.
 
-    The choice is set in the journal's problem, and stored: a run that is continued has
-    the same. Bounces are measured for images that the search renders, and estimators
-    for gradients that it renders; what predicts images needs neither.
+    The choice is set in the journal's problem and stored, so that a run that is
+    continued uses the same. Bounces are measured only if the search renders images, and
+    gradient estimators only if it renders gradients: predicted images need neither.
 
     Args:
         policy: policy of the search; only for one with gradients they are measured.
@@ -138,7 +138,11 @@ def plan_renders(
 
 
 def _choose_bounces(problem: Problem, stages: Stages) -> None:
-    """Choose how many bounces of light the search renders."""
+    """Choose how many bounces of light the search renders.
+
+    Fewer bounces are faster to render. The choice is stored in the problem; the
+    verification always renders all bounces.
+    """
     stages.begin(
         "setup",
         "finding how many bounces of light the search needs",
@@ -212,6 +216,7 @@ def _choose_gradient_steps(
     Returns:
         The samples per pixel that suffice for gradients; None if that is not known.
     """
+    # The measurement compares gradients by their cosine; its cost is in samples.
     samples = planning.count_cosine_samples(problem.plan)
     stages.begin(
         "setup",
@@ -229,7 +234,13 @@ def _choose_gradient_steps(
 def evaluate_clean_scene(
     journal: Journal, stages: Stages, spp: int
 ) -> tuple[Judgement, ...]:
-    """Render the clean configuration a few times, and return the judgements."""
+    """Render the clean configuration `N_FIRST_LOOKS` times, and evaluate the images.
+
+    Args:
+        journal: journal of the run.
+        stages: reports the progress.
+        spp: samples per pixel.
+    """
     problem = journal.problem
     seed = seeds.stream(problem.seed, "first look")
     start = problem.domain.start
@@ -250,8 +261,13 @@ def evaluate_clean_scene(
 def is_already_wrong(verifier: Verifier, *, in_any_case: bool) -> bool:
     """Return whether the clean scene is wrong, so that there is nothing to search for.
 
-    The full trials decide. They are made only if every first look was wrong, or with
-    `in_any_case`. A rule that does not compare with the clean scene never has it wrong.
+    The full trials decide. They are made only if the model was wrong in every one of
+    the first renders, or with `in_any_case`. If the rule of success does not compare
+    with the clean scene, a wrong clean scene is no reason to stop.
+
+    Args:
+        verifier: verifier of the attack, whose state has the first renders.
+        in_any_case: whether the trials are made even if the model was right once.
     """
     problem = verifier.problem
     findings = verifier.state
@@ -280,11 +296,10 @@ def choose_predictor(
 ) -> PredictedSearch | None:
     """Prepare and return the cheapest predictor that is accurate here.
 
-    None if there is none: then every step is rendered. Predictors are tried in turn:
-    one that turns out to be too inaccurate is followed by the next, one that takes too
-    much memory by none. Why images are rendered, or predicted by another predictor, is
-    stored in `findings` and reported. A refusal is the reason why a predictor is not
-    used; None if it may be used.
+    Predictors replace renders by something faster. They are tried in turn. If one turns
+    out to be too inaccurate, the next one is tried; if one takes too much memory, no
+    other is. A refusal is the reason why a predictor is not used, or None if it may be
+    used. Refusals are stored in `findings` and reported.
 
     Args:
         policy: policy of the search.
@@ -293,6 +308,10 @@ def choose_predictor(
         findings: findings of the attack.
         specialise: whether images may be predicted.
         clean: the matrix of the clean scene, of attacks that share it.
+
+    Returns:
+        The predictor, perhaps one that renders only a part of each image; None if every
+        step is rendered in full.
     """
     problem = journal.problem
     steps = problem.steps
@@ -338,18 +357,23 @@ def choose_predictor(
 def _is_about_matrices(
     problem: Problem, surface_refusal: Refusal, findings: RunState, *, specialise: bool
 ) -> bool:
-    """Return whether the user is told why no matrix predicts the images.
+    """Return which of two refusals is reported: that of matrices, or of surface light.
 
-    Else it is why light on surfaces does not. It is the reason that is easier to
-    change: more steps, if matrices pay then; or that of matrices where no camera moves.
+    Neither a matrix nor light on surfaces predicts the images, and the user is told one
+    reason. It is that of matrices if the user could change it by more steps, or if no
+    camera moves, so that light on surfaces would not help anyway.
 
     Args:
         problem: problem of the attack.
         surface_refusal: why light on surfaces does not predict the images.
         findings: findings of the attack.
         specialise: whether images may be predicted.
+
+    Returns:
+        True for the refusal of matrices.
     """
     was_inaccurate = findings.surface_light_refusal is not None
+    # None as the number of steps: whether matrices would do for any number
     pays_with_more_steps = (
         not was_inaccurate and find_matrix_refusal(problem, None, specialise) is None
     )
@@ -383,7 +407,12 @@ def _crop_search(
 
 
 def _prepare(predictor: PredictedSearch, stages: Stages) -> Refusal | None:
-    """Prepare a predictor, and return why it cannot be used; None if it can."""
+    """Prepare a predictor, and return why it cannot be used; None if it can.
+
+    Args:
+        predictor: what predicts the images of a search, or renders parts of them.
+        stages: reports the preparation.
+    """
     hint = (
         f"from here on the search {predictor.what_it_renders} (counted in samples a "
         "pixel); `specialise=false` leaves it out"
@@ -446,10 +475,11 @@ class Searches:
         self.stages.begin(name, title, n_renders, hint=hint, at_most=True)
 
     def _mark_domain(self, domain: Domain, policy: Policy[Any]) -> Domain:
-        """Return a domain that states what its evaluations are: predicted or rendered.
+        """Return the domain, marked with what its evaluations are like.
 
-        Predicted ones may be exact, that is without noise, and may draw conditions
-        themselves, for policies that use their gradients.
+        `exact` means that evaluations have no noise; rendered ones always have some.
+        `draws_conditions` means that the predictor itself draws the conditions of an
+        evaluation, which it does for policies that use gradients.
 
         Args:
             domain: domain to search.
@@ -517,6 +547,8 @@ class Searches:
     ) -> Callable[[Sequence[Query]], Iterator[Evaluation]]:
         """Return the function that evaluates the queries of a search.
 
+        Evaluations that the journal has stored are replayed instead of made again.
+
         Args:
             steps: steps of the search.
             has_frames: whether evaluations have an image at most `MAX_FRAMES` times, in
@@ -568,9 +600,10 @@ class Searches:
     def _evaluate(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
         """Evaluate queries with predicted or rendered images.
 
-        A predictor predicts the steps of a search. The ranking of the best
-        configurations is rendered, but only the window of the image that the predictor
-        covers. Print terms are subtracted from the objective.
+        If there is a predictor, it predicts the steps of the search. The ranking of the
+        best configurations is rendered, but only the part of the image that the
+        predictor covers. If colors are to be printable, print terms are subtracted from
+        the objective.
 
         Args:
             queries: all of one phase, "search" or "ranking".
@@ -612,11 +645,11 @@ def _choose_verification_samples(
 def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
     """Verify with fresh seeds what the searches claim, paired with the clean scene.
 
-    First the sample count is chosen, so that more samples would leave the margin on its
-    side. A search of the smallest change keeps the count that was chosen for the clean
-    scene: its result lies where the prediction flips, and no count suffices there. Then
-    the clean configuration, the adversarial one, that of the search without print terms
-    and that of the random search are tried with equal seeds.
+    First the samples per pixel are chosen, so that more samples would not change the
+    sign of the margin. A search of the smallest change keeps the count that was chosen
+    for the clean scene: its result has a margin near 0, whose sign no count settles.
+    Then the clean configuration, the adversarial one, that of the search without print
+    terms and that of the random search are tried with equal seeds.
 
     Args:
         verifier: verifier of the attack, whose state gets the results.
@@ -645,14 +678,16 @@ def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
     verifier.try_clean()
     findings.verification = verifier.verify("verification", candidate)
     if findings.verification.ending is Ending.ALREADY_WRONG:
-        # The sample count is another one than in the search, and with it the clean
-        # scene is wrong: the smallest change is none at all.
+        # The clean scene is wrong at the sample count of the verification, which is
+        # another one than in the search: no change is needed at all.
         findings.bracket = None
     if unprinted is not None:
         findings.unprinted_verification = verifier.verify(
             "unprinted verification", unprinted
         )
     if baseline is not None:
+        # If the policy's result is verified, the trials of the random search's result
+        # may end early, as soon as it cannot be verified any more (`curtailed`).
         is_found = findings.verification.ending is Ending.FOUND
         findings.baseline_verification = verifier.verify(
             "baseline verification", baseline, curtailed=is_found
@@ -669,9 +704,9 @@ def _replace_if_random_is_worse(
 ) -> None:
     """Replace the result of the policy by that of the random search if that is worse.
 
-    "Worse" is worse for the model. The random search's configuration would be chosen
-    for its trials, in which it may just be lucky. So it is tried again, and has to be
-    worse in fresh trials, too.
+    "Worse" means worse for the model. A configuration that is selected because of its
+    trials may just have been lucky in these. So it is tried again, and has to be worse
+    in the new trials, too.
 
     Args:
         verifier: verifier of the attack, whose state is changed.
@@ -687,6 +722,7 @@ def _replace_if_random_is_worse(
         return
     if _rank(random) <= _rank(policy_verification):
         return
+    # twice the trials: of the configuration, and of the clean scene with their seeds
     title = "checking what the random search found again"
     verifier.begin_stage(title, 2 * verifier.n_trials, at_most=True)
     random = verifier.verify("baseline verification", baseline, with_new_trials=True)
@@ -712,12 +748,13 @@ They are made in several checks, each of as many trials as a verification.
 
 
 def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -> None:
-    """Bracket the smallest epsilon at which the model is wrong.
+    """Find bounds (a bracket) of the smallest epsilon at which the model is wrong.
 
-    Smaller and smaller budgets are searched. What a search claims is tried in trials
-    with seeds of their own. While the bracket gets smaller, the fewest trials that can
-    verify anything are enough if none fails. At the end, the configuration at the upper
-    bound of the bracket is tried again in full; it is the result.
+    Smaller and smaller budgets are searched. What a search claims is checked in trials
+    with seeds of their own. While the bracket gets smaller, a check needs only the
+    fewest trials that can verify anything, if none of them fails. At the end, the
+    configuration at the upper bound of the bracket is checked again with all trials; it
+    is the result. The bracket and the result are stored in the findings.
 
     Args:
         searches: searches of the attack.
@@ -729,6 +766,8 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
     n_trials = verifier.n_trials
     max_failures = problem.rule.count_allowed_failures(n_trials)
     results: list[SearchResult] = []
+    # A matrix predicts scores without noise: it tells which configurations are likely
+    # to pass, and learns from the trials by how much it is off.
     transport = None
     if isinstance(findings.predictor, Transport):
         transport = findings.predictor
@@ -816,7 +855,7 @@ def _confirm(
         verifier: verifier that tries it.
         domain: domain with the full budget.
     """
-    # so many full checks have `MIN_CONFIRMING_TRIALS` trials together
+    # as many full checks as have `MIN_CONFIRMING_TRIALS` trials in total
     n_checks = math.ceil(MIN_CONFIRMING_TRIALS / verifier.n_trials)
     if bracket.u is not None:
         verifier.begin_stage(
@@ -901,9 +940,9 @@ MAX_TRIED_FAILURES = 8  # of the failures that a search lists, the first
 def verify_failures(verifier: Verifier, result: SearchResult) -> None:
     """Verify the first of the different failures that a search found, each by itself.
 
-    The trials have the same seeds as those of the clean scene. They end with the first
-    one after which a failure can no longer be verified. Nothing is tried if conditions
-    vary by chance: a failure would take hundreds of trials.
+    The trials have the same seeds as those of the clean scene. They end early, as soon
+    as a failure can no longer be verified. Nothing is tried if conditions vary by
+    chance: then a verdict takes hundreds of trials for each failure.
 
     Args:
         verifier: verifier of the attack.
@@ -915,8 +954,9 @@ def verify_failures(verifier: Verifier, result: SearchResult) -> None:
     rule = problem.rule
     if known is None or not known.examples or rule.is_conditional:
         return
-    # If the model is wrong about the clean scene, a failure says nothing.
-    clean_counts = count_right(findings.clean_trials, 1)  # at any sample count
+    # If the model is wrong about the clean scene, a failure says nothing. The 1 stands
+    # for samples per pixel, which do not matter for the counts.
+    clean_counts = count_right(findings.clean_trials, 1)
     if rule.is_already_wrong(clean_counts):
         return
     failures = known.examples[:MAX_TRIED_FAILURES]

@@ -99,7 +99,16 @@ def make_chains(config: AttackConfig) -> list[Chain]:
 
 
 def _matrix_chains(config: AttackConfig) -> list[Chain]:
-    """Return an attack for each model, or the one on the ensemble."""
+    """Return the attacks of a matrix: one for each model, or the one on the ensemble.
+
+    Each is a chain of a single attack.
+
+    Args:
+        config: settings of the study.
+
+    Raises:
+        InputError: a model comes twice.
+    """
     names: Sequence[str] = check_distinct(config.models, "model")
     if config.ensemble:
         names = [ALL]
@@ -137,8 +146,9 @@ def _curve_chains(config: AttackConfig) -> list[Chain]:
 def attacks_of(settings: JsonObject) -> BatchFunction:
     """Return the function by which a worker makes the attacks of a chain.
 
-    It takes a list of one number, the index of the chain. It returns, for each attack,
-    the name of its directory, the path where that was, and its files by relative path.
+    The function takes a list of one number, the index of the chain. It returns, for
+    each attack, the name of its directory, the path of the directory on the worker, and
+    its files by relative path.
 
     Args:
         settings: settings of the study.
@@ -146,7 +156,7 @@ def attacks_of(settings: JsonObject) -> BatchFunction:
     chains = make_chains(AttackConfig(**settings))
 
     def make_chain(numbers: Sequence[int]) -> list[tuple[str, str, dict[str, bytes]]]:
-        """Make the attacks of the chain that the only number is the index of."""
+        """Make the attacks of one chain; `numbers` has its index alone."""
         finished = []
         clean = CleanMatrix()
         with tempfile.TemporaryDirectory(prefix="advsearch-part-") as directory:
@@ -177,6 +187,9 @@ def distribute_attacks(
     config: AttackConfig, chains: Sequence[Chain], run: Path, progress: Progress
 ) -> None:
     """Have workers make the attacks of a study that have not begun, if requested.
+
+    A worker gets all attacks of a chain at once. A chain of which any attack has begun
+    here is left to this process.
 
     Args:
         config: settings of the study.
@@ -265,6 +278,11 @@ class StudyRun:
     """
 
     def __init__(self, context: RunContext[AttackConfig]) -> None:
+        """Report warnings, and have workers make attacks, if any are requested.
+
+        Args:
+            context: settings, run directory and progress of the study.
+        """
         self.context = context
         self.run = context.run
         self.progress = context.progress
@@ -302,6 +320,7 @@ class StudyRun:
         config = study.config
         path = self.run.path / PARTS / study.name
         self.names.append(study.name)
+        # epsilon may also be None or a mapping by control, which is not reported
         budget = ""
         if isinstance(config.epsilon, float):
             budget = f", epsilon {config.epsilon:.3g}"
@@ -356,10 +375,10 @@ def _find_label_warnings(config: AttackConfig) -> list[str]:
 def curve(context: RunContext[AttackConfig]) -> CurveResult:
     """Measure robust accuracy against epsilon, over objects.
 
-    The epsilons are tried from the smallest. An object that flips at one of them flips
-    at every larger one, whose ball has the same configuration in it, so it is not
-    attacked again. An object that is wrong as it is counts as not robust at any
-    epsilon, and is counted apart from those that were found.
+    The epsilons are tried from the smallest. If the prediction of an object flips at
+    one of them, it flips at every larger one, too, since a larger ball contains the
+    same configuration: so the object is not attacked again. An object whose clean scene
+    is wrong already is not robust at any epsilon, and is counted separately.
     """
     study = StudyRun(context)
     rows = [_attack_object(study, chain) for chain in study.chains]
@@ -370,10 +389,18 @@ def curve(context: RunContext[AttackConfig]) -> CurveResult:
 
 
 def _attack_object(study: StudyRun, chain: Chain) -> ObjectRow:
-    """Attack an object with growing epsilons, until one of them settles it.
+    """Attack an object with growing epsilons, until an attack settles it.
 
-    The row is that of the last attack, with the renders of all. After an interrupt
-    before the first attack, it says nothing but the object's name.
+    An attack settles an object if it finds a wrong prediction, or if the clean scene is
+    wrong already.
+
+    Args:
+        study: makes the attacks.
+        chain: attacks on the object, the smallest epsilon first.
+
+    Returns:
+        The row of the last attack, with the renders of all. After an interrupt before
+        the first attack, it has the object's name alone.
     """
     row = ObjectRow(object=chain[0].subject, clean=None, flips_at=None)
     clean = CleanMatrix()
@@ -404,15 +431,16 @@ def _attack_object(study: StudyRun, chain: Chain) -> ObjectRow:
 
 
 def _is_known(row: ObjectRow, epsilon: float | None) -> bool:
-    """Return whether a row says anything about an epsilon.
+    """Return whether it is known if an object is robust at an epsilon.
 
-    It does if the object was attacked there, and at every epsilon once it has flipped
-    or is wrong as it is. It does not if the attack ended without a number, or if the
-    noise alone makes the clean scene wrong so often that no scene can be verified.
+    It is known if the object was attacked with this epsilon or a larger one, if a wrong
+    prediction was found, or if the clean scene is wrong already. It is not known if the
+    objective was not a number, or if noise alone makes the clean scene wrong so often
+    that no adversarial scene can be verified.
 
     Args:
         row: row of the last attack on the object.
-        epsilon: None for the controls' own ones.
+        epsilon: the epsilon; None for the own epsilon of each control.
     """
     if row.ending in (None, "non-finite objective"):
         return False
@@ -429,8 +457,12 @@ def _is_known(row: ObjectRow, epsilon: float | None) -> bool:
 def _compute_accuracy(rows: Sequence[ObjectRow], epsilon: float | None) -> CurvePoint:
     """Compute the robust accuracy at an epsilon, with its Clopper-Pearson interval.
 
-    Without an object about which anything is known there, the accuracy is None, and the
-    interval all of [0, 1].
+    Only objects whose robustness at this epsilon is known are counted. If there are
+    none, the accuracy is None and the interval is [0, 1].
+
+    Args:
+        rows: row of the last attack on each object.
+        epsilon: the epsilon; None for the own epsilon of each control.
     """
     known = [row for row in rows if _is_known(row, epsilon)]
     n_objects = len(known)
@@ -472,11 +504,15 @@ MIN_TRIAL_SPP = 64
 def matrix(context: RunContext[AttackConfig]) -> MatrixResult:
     """Attack several models, and try every adversarial scene on each of them.
 
-    Trial k has the same seed for every scene and every model, and none that a search or
-    its verification has used. Models of one input size get the same image; for another
-    size the same configuration is rendered anew. A success needs the model to be right
-    on the clean scene with the same seed, as everywhere. Samples per pixel are those of
-    `verify_spp`, else the most that an attack needed, at least `MIN_TRIAL_SPP`.
+    Trial k has the same seed for every scene and every model; no search or verification
+    has used these seeds. Models of one input size get the same image; for another size
+    the same configuration is rendered anew. As in an attack, a trial is a success only
+    if the model is right on the clean scene with the same seed. Samples per pixel are
+    the setting `verify_spp`, or else the most that an attack needed, at least
+    `MIN_TRIAL_SPP`.
+
+    Args:
+        context: settings, run directory and progress.
     """
     config = context.config
     names = check_distinct(config.models, "model")

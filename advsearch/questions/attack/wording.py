@@ -42,7 +42,12 @@ _RENDER_KINDS = {
 
 
 def attack_verdict(summary: AttackSummary) -> str:
-    """Return what the run found, in sentences that need nothing before them."""
+    """Return what the run found, in sentences that stand by themselves.
+
+    The ending of the search decides the form: "The model calls this mug a vase in 20 of
+    20 fresh renders (...)" if a scene was found, else that none was found and why the
+    search ended.
+    """
     ending = summary.ending
     verified = summary.verified
     thing = _name_thing(summary)
@@ -149,8 +154,9 @@ def make_remarks(summary: AttackSummary) -> list[str]:
 def _clean_remark(summary: AttackSummary) -> str:
     """Return in how many trials the model is wrong about the clean scene.
 
-    Empty if in none, if the verdict is about nothing else, or if the search makes the
-    object easier to recognise, for which a wrong clean scene is no fault.
+    The text is empty if there are none, or if the verdict states it already ("already
+    wrong"). It is also empty if the search makes the object easier to recognise: then a
+    wrong clean scene is expected.
     """
     control = summary.clean.control
     if control is None or summary.ending == "already wrong" or summary.minimises:
@@ -339,12 +345,13 @@ def _error_clause(
 ) -> str:
     """Return what the model gets wrong, as in "The model calls this mug a vase".
 
-    - Of a commanded action, or of a scene that is easier to recognise, it is the claim,
-      with the direction of the action.
-    - If all trials have one prediction, it is that.
-    - If they have several, it is the most frequent one, or the outcomes of a detector.
-    - If the labels of the trials are not known, it is the prediction in the stored
-      image of a classifier; of another task the clause names no prediction.
+    - For a commanded action, or a scene that is easier to recognise, the clause is
+      `claim`; that of an action also has its direction.
+    - If all trials have the same prediction, the clause names it.
+    - If they have several, it names the most frequent one, or the outcomes of a
+      detector.
+    - If the labels of the trials are not known, it names the prediction in the stored
+      image for a classifier, and no prediction for other tasks.
 
     Args:
         summary: summary of the attack.
@@ -386,8 +393,8 @@ def _mixed_error_clause(
 ) -> str:
     """Return what the model gets wrong if trials have several predictions.
 
-    That is the most frequent prediction, or the outcomes of a detector if there are
-    several.
+    It names the most frequent prediction. If a detector has several outcomes, such as
+    missed and loose, it names these instead.
 
     Args:
         summary: summary of the attack.
@@ -410,9 +417,10 @@ def _mixed_error_clause(
 def _clauses(summary: AttackSummary, thing: str) -> tuple[str, str]:
     """Return what a trial counts as, and the goal of the search.
 
-    "the model is wrong about this mug", "makes the model miss this mug". Where the goal
-    comes first in a sentence, which has named the model, the claim is "it is wrong". Of
-    a commanded action only the command is claimed: nothing has moved.
+    Example: "the model is wrong about this mug" and "makes the model miss this mug". If
+    nothing was found, the sentence begins with the goal, which names the model; then
+    the claim is "it is wrong". For a commanded action, only the command is claimed,
+    since no vehicle has moved.
 
     Args:
         summary: summary of the attack.
@@ -561,7 +569,11 @@ def _short(value: float) -> str:
 
 
 def transport_text(summary: AttackSummary) -> str:
-    """Return what predicted images of the search; empty if that is not known."""
+    """Return how images of the search were predicted; empty if that is not known.
+
+    Images may be rendered in full, rendered in part, or predicted by a matrix of light
+    transport or by light on surfaces.
+    """
     transport = summary.transport
     if transport is None:
         return ""

@@ -167,7 +167,12 @@ def _analyze_rows(
     """Find rules, the importance of parameters, and where predictions are right.
 
     One half of the rows chooses rules and the box of right predictions; the other half
-    counts.
+    tests them.
+
+    Args:
+        table: the rows, with a column for each parameter that varies.
+        config: the settings.
+        progress: reports the progress.
 
     Returns:
         The rules, the weights of the parameters, and the box (`find_envelope`).

@@ -40,10 +40,15 @@ class Clusters:
 def find_clusters(features: FloatArray, seed: int) -> Clusters:
     """Cluster failures by k-means over the directions of their features (n, F).
 
-    The number of clusters is chosen by the mean silhouette (Rousseeuw 1987). They are
-    apart if it is larger than that of each of `N_REFERENCES` clouds of points without
-    clusters, which are clustered in the same way (after Tibshirani, Walther and Hastie
-    2001). Few failures are a single cluster.
+    The number of clusters is chosen by the mean silhouette (Rousseeuw 1987). The
+    clusters count as apart if their silhouette is larger than that of each of
+    `N_REFERENCES` random clouds of points, which are clustered in the same way (after
+    Tibshirani, Walther and Hastie 2001). Fewer failures than `MIN_FAILURES` are a
+    single cluster.
+
+    Args:
+        features: (n, F) features of the model for each failure.
+        seed: seed of the random clouds.
 
     Raises:
         InputError: scikit-learn is missing.
@@ -108,8 +113,9 @@ def cluster_points(points: FloatArray) -> tuple[float, IntArray]:
     compute_silhouette = rules.import_library("sklearn.metrics").silhouette_score
     best_silhouette = -1.0
     best_cluster = np.zeros(len(points), dtype=np.int64)
-    # The silhouette needs fewer clusters than points, and k-means as many different
-    # points as clusters; rounded, as points that differ by rounding are the same.
+    # The silhouette needs fewer clusters than points, and k-means needs at least as
+    # many different points as clusters. Points that differ by rounding errors alone
+    # count as the same.
     n_distinct = len(np.unique(points.round(9), axis=0))
     max_clusters = min(MAX_CLUSTERS, n_distinct - 1)
     for k in range(2, max_clusters + 1):

@@ -34,18 +34,22 @@ def find_envelope(
     """Find the largest box of values inside which a model has an accuracy.
 
     A box is peeled until the lower bound of its accuracy among the choosing rows is
-    large enough; it holds if that among the counting rows is. None if no box of enough
-    rows has it.
+    large enough. It holds if the lower bound among the counting rows is large enough,
+    too.
 
     Args:
-        choosing: rows that choose the box.
-        counting: rows that test it, once.
+        choosing: half of the rows, by which the box is chosen.
+        counting: the other half, which tests the box once.
         accuracy: accuracy in (0, 1), the lower bound of a 95 % interval.
+
+    Returns:
+        The box with its counts; None if no box of enough rows has the accuracy.
     """
     if choosing.empty:
         return None
-    # of the choosing rows; at a high accuracy the reserve is half of what is left to 1,
-    # so that it can be reached
+    # The choosing rows have to reach a little more than the accuracy, since their
+    # estimate is biased. Near 1, where `ACCURACY_RESERVE` might exceed 1, the reserve
+    # is half of the distance to 1.
     required = min(accuracy + ACCURACY_RESERVE, (1.0 + accuracy) / 2.0)
     box: rules.RuleConditions = ()  # without conditions: everything
     inside = choosing
@@ -66,10 +70,11 @@ def find_envelope(
 def find_best_peel(
     box: rules.RuleConditions, inside: pd.DataFrame, choosing: pd.DataFrame
 ) -> rules.RuleConditions | None:
-    """Return the slightly smaller box with the highest accuracy, the first of several.
+    """Return the slightly smaller box with the highest accuracy.
 
-    Boxes with fewer than `MIN_BOX_UNITS` rows, or draws if rows share them, are left
-    out; None if none is left.
+    If several have it, the first one is returned. Boxes with fewer than `MIN_BOX_UNITS`
+    independent units are left out: a unit is a row, or a draw if several rows share it.
+    None if no box remains.
 
     Args:
         box: the conditions of the box.
@@ -117,8 +122,10 @@ def list_peels(
 def list_factor_peels(
     condition: rules.RuleCondition, column: pd.Series
 ) -> Iterator[rules.RuleCondition]:
-    """Yield slightly narrower conditions on a factor: without one of its names, or
-    without its lowest or its highest numbers.
+    """Yield slightly narrower conditions on a factor.
+
+    A condition on names loses one of them. A range of numbers loses its lowest or its
+    highest numbers.
 
     Args:
         condition: condition on the factor, of the box.
@@ -140,9 +147,9 @@ def list_factor_peels(
 def _find_higher_low(values: rules.FloatArray) -> float:
     """Return a lower bound that leaves out the lowest values (n,).
 
-    Values above the bound stay. It leaves out `PEELED_FRACTION` of them, and is rounded
-    to three digits. If rounding would leave out none or all, just the lowest value is
-    left out.
+    Values above the bound stay. The bound leaves out about `PEELED_FRACTION` of the
+    values, and is rounded to three digits. If rounding would leave out none or all of
+    them, only the lowest value is left out.
     """
     lowest = values.min()
     low = _round_to_3_digits(np.quantile(values, PEELED_FRACTION))
@@ -153,9 +160,9 @@ def _find_higher_low(values: rules.FloatArray) -> float:
 def _find_lower_high(values: rules.FloatArray) -> float | None:
     """Return an upper bound that leaves out the highest values (n,).
 
-    Values up to the bound stay. It leaves out `PEELED_FRACTION` of them, and is rounded
-    to three digits. If rounding would leave out none or all, just the highest value is
-    left out. None if all values are the same.
+    Values up to the bound stay. The bound leaves out about `PEELED_FRACTION` of the
+    values, and is rounded to three digits. If rounding would leave out none or all of
+    them, only the highest value is left out. None if all values are the same.
     """
     highest = values.max()
     high = _round_to_3_digits(np.quantile(values, 1.0 - PEELED_FRACTION))

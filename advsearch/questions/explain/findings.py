@@ -43,8 +43,8 @@ def make_rejected_rule(
 ) -> RejectedRule | None:
     """Return the result of a rule that is not significant; None without a rule.
 
-    Its field `rows` is the number of rows that would make it significant, if their
-    rates were the same; None if no number does.
+    Its field `rows` states how many rows would make the rule significant if the rates
+    stayed the same; None if no number of rows would.
 
     Args:
         rule: the rule.
@@ -72,7 +72,12 @@ def round_up(count: float) -> int:
 def find_row_warnings(
     table: pd.DataFrame, importance: Sequence[ParameterWeight]
 ) -> list[str]:
-    """Return warnings about the rows of a table and the importance of its factors."""
+    """Return warnings about the rows of a table and the importance of its factors.
+
+    Args:
+        table: the rows, with the columns `correct` and `unit` (the draw).
+        importance: weights of the factors.
+    """
     cautions = []
     n_draws = table["unit"].nunique()
     if n_draws == 1:

@@ -1,11 +1,11 @@
 """Which factors decide the predictions, and by how much.
 
 A factor's values are cut into groups that have equally many rows (a name is a group).
-The share is the variance of the model's accuracy between the groups over the variance
-of the yes/no predictions: the first-order Sobol index of the prediction, by groups
-(given-data estimators: Plischke, Borgonovo and Smith 2013). What differs inside a group
-is not in it, so that the index without groups is at least as large. Of two factors it
-is that of the groups of both at once.
+The share of a factor is the variance of the accuracy between its groups, divided by the
+variance of the predictions (1 if right, 0 if wrong). It is the first-order Sobol index,
+estimated by groups (given-data estimators: Plischke, Borgonovo and Smith 2013).
+Differences inside a group are not counted, so that the index without groups is at least
+as large. The share of two factors is that of the groups of both at once.
 
 Of n predictions and k groups, n times the estimated share is Pearson's chi-squared
 statistic of a table of k x 2, and the true share is its noncentrality over n (Cohen's w
@@ -51,12 +51,18 @@ IntArray = npt.NDArray[np.int64]
 def find_importance(table: pd.DataFrame) -> list[ParameterWeight]:
     """Estimate how much each factor, and each interacting pair, decides predictions.
 
-    Numbers are cut into about as many groups as the cube root of the clusters; those of
-    pairs more coarsely, so that a cell has `MIN_ROWS_PER_CELL` rows on average.
+    The number of groups of a factor is about the cube root of the number of clusters.
+    Factors of pairs have fewer groups, so that a cell of both has `MIN_ROWS_PER_CELL`
+    rows on average.
+
+    Args:
+        table: a row for each prediction, with the columns `correct`, `unit` (the
+            cluster) and a column for each factor, whose names are `attrs["units"]`.
 
     Returns:
-        The factors by falling share, without what chance adds to it; then the pairs,
-        likewise. Nothing where all predictions are the same.
+        The factors by falling share, from which the part that chance adds is
+        subtracted; then the pairs in the same way. Empty if all predictions are the
+        same.
     """
     if table["correct"].nunique() < 2:
         return []
@@ -74,12 +80,14 @@ def find_importance(table: pd.DataFrame) -> list[ParameterWeight]:
 def _find_interacting_pairs(
     table: pd.DataFrame, sample: ClusteredPredictions
 ) -> list[ParameterWeight]:
-    """Return the weights of the pairs of factors that interact significantly: together
-    they decide more than the sum of what each decides alone.
+    """Return the weights of the pairs of factors that interact significantly.
+
+    Two factors interact if together they decide more than the sum of what each decides
+    alone.
 
     Args:
-        table: the predictions and the values of their factors.
-        sample: the same predictions.
+        table: the predictions, and a column of values for each factor.
+        sample: the same predictions with their clusters.
     """
     # so few groups of each factor that the cells of two have enough rows on average
     n_groups = max(2, math.isqrt(sample.n_clusters // MIN_ROWS_PER_CELL))
@@ -107,9 +115,14 @@ def sort_by_fraction(weights: list[ParameterWeight]) -> list[ParameterWeight]:
 
 
 def cut_into_groups(column: pd.Series, n_groups: int) -> IntArray:
-    """Return the group of each row (n,).
+    """Return the index of the group of each row (n,).
 
-    Each name is a group; numbers are cut into at most `n_groups` of equally many rows.
+    Each name is a group. Numbers are cut at quantiles into at most `n_groups` groups of
+    equally many rows.
+
+    Args:
+        column: (n,) values of a factor: names (a category) or numbers.
+        n_groups: number of groups of numbers.
     """
     if column.dtype == "category":
         return np.asarray(column.cat.codes, dtype=np.int64)
@@ -172,7 +185,7 @@ class ClusteredPredictions:
                 no group.
         """
         group_weight = np.bincount(group, self.weight)
-        is_used = group_weight > 0
+        is_used = group_weight > 0  # indices without any prediction are left out
         used_weight = group_weight[is_used]
         group_rate = (
             np.bincount(group, self.weight * self.correct)[is_used] / used_weight
@@ -183,14 +196,15 @@ class ClusteredPredictions:
     def estimate_weight(self, factors: list[str], group: IntArray) -> ParameterWeight:
         """Estimate the fraction of the variance between groups with its 95 % interval.
 
-        Groups of a factor without effect differ by chance, too. What that adds to the
-        fraction on average is subtracted: for independent rows as in the adjusted R
+        Even the groups of a factor without effect differ by chance. What this adds to
+        the fraction on average is subtracted: for independent rows as in the adjusted R
         squared, for clusters by `expected_statistic`. If that is not known, or there is
-        a single group, nothing is shown: the fraction is 0, and its interval 0 to 1.
+        a single group, nothing is known of the factor: the fraction is 0, and its
+        interval 0 to 1.
 
-        The interval: the statistic (rows times the fraction, divided by the design
-        effect) is noncentral chi-squared, or with clusters noncentral F. The true
-        fraction is its noncentrality, divided by the rows and times the design effect.
+        Interval: with n rows, fraction s and design effect D, the statistic n s / D has
+        a noncentral chi-squared distribution (with clusters, a noncentral F). Its
+        noncentrality L stands for the true fraction L D / n.
 
         Args:
             factors: their names.
@@ -208,6 +222,7 @@ class ClusteredPredictions:
         if self.is_independent:
             design_effect = 1.0
             error_degrees = math.inf
+            # adjusted R squared: 1 - (1 - R²) (n - 1) / (n - k)
             residual_degrees = max(n_rows - n_groups, 1)
             corrected_share = 1.0 - (1.0 - share) * (n_rows - 1) / residual_degrees
         else:
@@ -231,12 +246,13 @@ class ClusteredPredictions:
     def expected_statistic(self, group: IntArray) -> float:
         """Compute the expected chi-squared statistic of a factor without effect.
 
-        The statistic is the rows times `explained_fraction`. With independent rows, its
-        expectation is (groups - 1). With clusters it is that times the design effect
-        (Rao and Scott 1981, section 3): the variance of the rates of the groups, less
-        that of the overall rate, both from how the residuals of clusters scatter. It is
-        at least `MIN_INFLATION` times (groups - 1); NaN if a group has fewer than two
-        clusters.
+        The statistic is the number of rows times `explained_fraction`. With independent
+        rows, its expectation is (groups - 1). With clusters, the expectation is (groups
+        - 1) times the design effect (Rao and Scott 1981, section 3). It is computed as
+        the variance of the rates of the groups, less that of the overall rate, divided
+        by the variance of a prediction; both are estimated from how the residuals of
+        clusters scatter. The result is at least `MIN_INFLATION` times (groups - 1), and
+        NaN if a group has fewer than two clusters.
 
         Args:
             group: (n,) the group of each prediction.
@@ -282,7 +298,7 @@ class ClusteredPredictions:
         group_weight: npt.NDArray[Any],
         is_used: npt.NDArray[np.bool_],
     ) -> FloatArray:
-        """Return each prediction (n,), less the rate of its group, times its weight.
+        """Return weight * (prediction - rate of its group) of each prediction, (n,).
 
         Args:
             group: (n,) the group of each prediction.
@@ -299,9 +315,9 @@ class ClusteredPredictions:
     def _between_cluster_variance(
         self, cell_cluster: IntArray, cell_residual: npt.NDArray[Any]
     ) -> float:
-        """Return the variance of the overall rate, times the rows.
+        """Return the variance of the overall rate, multiplied by the number of rows.
 
-        It comes from the scatter of the clusters.
+        It is estimated from how the residuals of clusters scatter.
 
         Args:
             cell_cluster: (cells,) the cluster of each cell.
@@ -319,12 +335,12 @@ class ClusteredPredictions:
     ) -> float:
         """Return the p-value of the interaction of two factors.
 
-        The statistic of a grouping is the rows times its explained fraction. Without an
-        interaction, that of both factors together is the sum of those of each. The
-        excess over this sum is the test statistic. For independent rows it is
-        chi-squared of (cells - first - second + 1) degrees of freedom; with clusters it
-        is divided by its expectation, and distributed as F. 1 if the clusters are too
-        few to tell.
+        The statistic of a grouping is the number of rows times its explained fraction.
+        Without an interaction, the statistic of both factors together is the sum of
+        those of each. The excess over this sum is the test statistic. For independent
+        rows its distribution is chi-squared with (cells - first groups - second groups
+        + 1) degrees of freedom. With clusters it is divided by its expectation, and its
+        distribution is F. The p-value is 1 if there are too few clusters.
 
         Args:
             joint_group: (n,) the group of each prediction by both factors.
@@ -355,9 +371,9 @@ def within_group_variance(
     clusters_per_group: IntArray,
     group_weight: npt.NDArray[Any],
 ) -> float:
-    """Return the sum over groups of the variance of the rate, times the weight.
+    """Return the sum over groups of weight * variance of the group's rate.
 
-    Each variance comes from the scatter of the clusters inside the group.
+    Each variance is estimated from how the residuals of clusters scatter in the group.
 
     Args:
         squared_residual: (k,) sum of the squared residuals of the clusters.
@@ -376,8 +392,13 @@ def noncentrality_interval(
 ) -> tuple[float, float]:
     """Return the 95 % interval of the noncentrality of a statistic's distribution.
 
-    At each end, the statistic is a quantile of 97.5 or 2.5 % (`find_noncentrality`,
-    which has the arguments).
+    At the lower end of the interval, the statistic is the 97.5 % quantile of the
+    distribution; at the upper end, it is the 2.5 % quantile.
+
+    Args:
+        statistic: the statistic, chi-squared or `degrees` times one of F.
+        degrees: degrees of freedom.
+        error_degrees: degrees of freedom of F's denominator; infinity for chi-squared.
     """
     # By chance alone the statistic is expected to be its degrees of freedom. If it is
     # smaller, the upper bound would be too small.
@@ -391,11 +412,10 @@ def noncentrality_interval(
 def find_noncentrality(
     statistic: float, degrees: int, error_degrees: float, probability: float
 ) -> float:
-    """Find the noncentrality of a distribution at which the probability of values up to
-    the statistic is `probability`.
+    """Find the noncentrality at which P(value <= statistic) is `probability`.
 
-    The larger the noncentrality, the smaller is that probability. 0 if it is too small
-    already without any.
+    The larger the noncentrality, the smaller is P. If P is at most `probability` even
+    without any noncentrality, this returns 0.
 
     Args:
         statistic: statistic of a noncentral chi-squared distribution, or `degrees`

@@ -90,7 +90,14 @@ class Renders:
     def render_rows(self, name: str, config: SweepConfig) -> pd.DataFrame | None:
         """Run a sweep and return its rows.
 
-        None if it was interrupted, or its scene is no longer available.
+        If its scene is no longer available, a warning is added.
+
+        Args:
+            name: name of the run in the directory of this experiment.
+            config: settings of the sweep.
+
+        Returns:
+            The rows; None if the sweep was interrupted or could not be rendered.
         """
         if self.interrupted:
             return None
@@ -119,20 +126,24 @@ class Renders:
     ) -> Confirmation | None:
         """Confirm a rule by fresh configurations that no earlier rule covers.
 
-        They are rendered in the scene of each sweep. They confirm it if they alone,
-        with the rows elsewhere, make it significant. None where nothing was rendered.
+        They are rendered in the scene of each sweep. The rule is confirmed if it is
+        significant with the fresh rows as its inside, compared with the old rows
+        elsewhere.
 
         Args:
-            counted_rules: all of them, in their order.
+            counted_rules: all rules, in their order.
             index: index of the rule.
+
+        Returns:
+            The counts of the fresh rows; None if nothing was rendered.
         """
         if not self.config.confirm:
             return None
         rule = counted_rules[index]
         earlier_conditions = [earlier.conditions for earlier in counted_rules[:index]]
         covered_rows = self.table[rules.find_covered(rule.conditions, self.table)]
-        # What earlier rules cover is left out of the renders too; so the smaller the rest
-        # is, the more are rendered.
+        # Renders that earlier rules cover are left out, too. So the smaller the
+        # fraction that stays, the more configurations are rendered.
         uncovered_fraction = max(
             float(is_outside(earlier_conditions, covered_rows).mean()),
             MIN_UNCOVERED_FRACTION,
@@ -158,7 +169,8 @@ class Renders:
     ) -> list[pd.DataFrame]:
         """Render fresh configurations inside a rule in the scene of each sweep.
 
-        Where a condition on an angle has two arcs, each has a sweep of its own.
+        A condition on an angle may be two arcs of the circle, such as 0 to 20 and 340
+        to 360 degrees. Then each arc has a sweep of its own.
 
         Args:
             index: index of the rule.
@@ -206,10 +218,11 @@ class Renders:
     ) -> Iterator[NearestRight]:
         """Yield for typical failures the nearest configuration that is predicted right.
 
-        It differs in one parameter: of those of the failure's rule the one with the
-        smallest relative change; if none of these puts the failure right, the first
-        other parameter that does. A failure that no parameter by itself puts right has
-        no pair.
+        That configuration differs from the failure in one parameter. First all
+        parameters of the failure's rule are tried, and the one with the smallest
+        relative change is taken. If none of these makes the prediction right, the other
+        parameters are tried one by one, and the first that does is taken. If no single
+        parameter does, the failure has no pair.
 
         Args:
             counted_rules: all rules, in their order.
@@ -250,14 +263,16 @@ class Renders:
         """Find the nearest value of a factor at which a failure is predicted right.
 
         The failure is rendered at values along the factor, twice, with different noise.
-        It has to be wrong in both at its own value, and right in both at the other one.
-        None if that is not so, if no value puts it right, or if nothing could be
-        rendered.
+        The model has to be wrong in both renders at the failure's own value, and right
+        in both at the other value.
 
         Args:
-            name: name of the pair.
+            name: name of the pair, such as "pair-3".
             index: index of the failure among the rows.
-            factor: which is varied; everything else is as in the failure.
+            factor: the parameter that varies; everything else is as in the failure.
+
+        Returns:
+            The pair; None if there is no such value, or nothing could be rendered.
         """
         config = self.sweeps[self.rows["sweep"][index]].config
         if not is_settable(config, factor):
@@ -301,7 +316,14 @@ class Renders:
     ) -> list[pd.DataFrame] | None:
         """Render a failure along a factor, twice with different noise.
 
-        None if it was interrupted, or nothing could be rendered.
+        Args:
+            run_name: name of the runs, to which 0 and 1 are added.
+            config: settings of the sweep that the failure is from.
+            failure: values of the failure by parameter.
+            factor: the parameter that varies.
+
+        Returns:
+            The rows of both; None if it was interrupted, or nothing could be rendered.
         """
         frames = []
         for repeat in range(2):
@@ -353,8 +375,8 @@ class Renders:
     def find_clusters(self) -> FailureClusters | None:
         """Render failures of one model again, and cluster them by its features.
 
-        None if none were requested, there are none, or they could not be rendered, of
-        which there is a warning.
+        None if no clusters were requested, if there are no failures, or if they could
+        not be rendered; then a warning is added.
         """
         selected = self._select_sweeps()
         failing = self.rows[~self.rows["correct"] & self.rows["sweep"].isin(selected)]
@@ -460,6 +482,10 @@ class Renders:
     ) -> tuple[torch.Tensor, Any]:
         """Render images of a sweep of one model again.
 
+        Args:
+            sweep: the sweep.
+            numbers: numbers of the images.
+
         Returns:
             The images (n, H, W, 3) as the model sees them, and what computes its
             features.
@@ -517,10 +543,11 @@ def find_typical_failures(
 ) -> list[tuple[int, rules.RuleConditions]]:
     """Return the indices of failures, the most typical first, each with its rule.
 
-    A failure belongs to the first rule that covers it. Rules take turns in giving their
-    next typical failure; what fails under none of them takes the last turn, with no
-    conditions. The most typical failure of a rule is nearest to the mean of its
-    failures, by the ranks of the parameters.
+    A failure belongs to the first rule that covers it; failures that no rule covers
+    form a last group, without conditions. The most typical failure of a rule is the one
+    nearest to the mean of its failures, where parameters are replaced by their ranks.
+    The list has the most typical failure of each group, then the second one of each,
+    and so on.
 
     Args:
         table: the rows.
@@ -553,6 +580,6 @@ def _rank_rows(table: pd.DataFrame) -> rules.FloatArray:
     values = [
         column.cat.codes if column.dtype == "category" else column for column in columns
     ]
-    # The order of the order is the rank: where each row stands among the sorted ones.
+    # `argsort` of `argsort` is the rank: the position of each row in the sorted column.
     order = np.stack(values, axis=1).astype(np.float64).argsort(axis=0)
     return order.argsort(axis=0) / len(table)

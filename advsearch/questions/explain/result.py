@@ -225,7 +225,11 @@ MAX_LABELS = 3
 
 
 def make_explain_view(result: ExplainResult) -> ShownResult:
-    """Return the view of an explanation."""
+    """Return the view of an explanation.
+
+    Its sections are the rules, the weights of the parameters, the box in which the
+    model can be relied on, pairs of a failure and a right image, and kinds of failures.
+    """
     rule_sentences = [
         f"{number}. {describe_rule_row(number, rule)}"
         for number, rule in enumerate(result.rules, start=1)
@@ -419,8 +423,12 @@ def make_explain_claims(result: ExplainResult) -> Iterator[views.Claim]:
 def _make_rule_claim(number: int, rule: RuleRow) -> views.Claim:
     """Return what is claimed of a rule, by its number from 1.
 
-    The counts are those of fresh renders if there are any; else of the rows that did
-    not choose it.
+    The counts are those of fresh renders if there are any; else those of the half of
+    the rows that did not choose the rule.
+
+    Args:
+        number: number of the rule, from 1.
+        rule: the rule with its counts.
     """
     counts: RightCounts = rule.confirmed or rule
     source = "rows that did not choose the rule"

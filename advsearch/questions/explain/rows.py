@@ -19,12 +19,13 @@ prediction.
 
 
 def read_predictions(sweeps: Sequence[workbench.StoredSweep]) -> pd.DataFrame:
-    """Read the rows of several sweeps as one frame; the column `sweep` has the index.
+    """Read the rows of several sweeps as one frame.
 
-    A longer sweep of the same seed repeats the images of a shorter one: an image that
-    came before is left out (`name_images`). Rows of the same draw have the same `unit`
-    (`name_draws`). Object, environment and model have the names that figures give them.
-    The values of parameters that a sweep does not have are missing.
+    The column `sweep` has the index of the sweep, and `unit` the index of the draw:
+    rows of the same draw are not independent. A longer sweep with the same seed repeats
+    the images of a shorter one; such repeats are left out. Object, environment and
+    model are shortened to the names that figures show. Parameters that a sweep does not
+    have are missing values (NaN).
     """
     frames = []
     for index, sweep in enumerate(sweeps):
@@ -68,10 +69,14 @@ def _collect_units(frames: Sequence[pd.DataFrame]) -> dict[str, str]:
 def name_draws(sweep: workbench.StoredSweep, rows: pd.DataFrame) -> list[str]:
     """Return a name of the draw of each row (n,): rows of the same draw are dependent.
 
-    Draw k of a seed is the same in all sweeps, however many draws they have, and in all
-    scenes. If nothing is drawn by chance, rows with the same values differ in noise
-    alone, and share a name. So do all rows of drives whose first frames have the same
-    values.
+    Draw k of a seed is the same in all sweeps and all scenes, so that it is named by
+    seed and number. If nothing is drawn by chance, rows with the same values differ in
+    noise alone, and share a name, which consists of these values. The rows of a drive
+    are named by the values of its first frame.
+
+    Args:
+        sweep: the sweep.
+        rows: its rows.
     """
     is_sampled = sweep.summary.sampler is not None
     if is_sampled:
@@ -95,9 +100,13 @@ def name_draws(sweep: workbench.StoredSweep, rows: pd.DataFrame) -> list[str]:
 def name_images(sweep: workbench.StoredSweep, rows: pd.DataFrame) -> list[str]:
     """Return a name of each row (n,), equal for the same prediction of the same image.
 
-    It consists of the settings that decide the image, the number of the row, the
-    values, and whether the prediction is right. Settings of how many images there are
-    (`EXTENT_SETTINGS`) decide no image.
+    The name consists of the settings that decide the image, the number of the row, the
+    values, and whether the prediction is right. `EXTENT_SETTINGS`, such as the number
+    of samples, are left out: they do not change an image.
+
+    Args:
+        sweep: the sweep.
+        rows: its rows.
     """
     deciding_settings = {
         name: value

@@ -26,20 +26,20 @@ def make_sweep_inside(
 ) -> SweepConfig:
     """Return the settings of a sweep whose configurations mostly lie under conditions.
 
-    Sampled ranges are cut to the conditions (`cut_controls`). Axes of the grid keep the
-    values, and objects, environments and models the names, that rows under the
-    conditions have. While the grid and the scenes make more than twice as many
-    configurations as wanted, every second value of the longest axis is left out. Where
-    this cannot follow a condition, configurations lie outside, which the caller has to
-    leave out.
+    Sampled ranges are cut to the conditions. Axes of the grid, and the lists of
+    objects, environments and models, are reduced to the values that rows under the
+    conditions have. If this makes more than twice as many configurations as requested,
+    every second value of the longest axis is left out, repeatedly. Not every condition
+    can be expressed in this way: so some configurations may lie outside, and the caller
+    has to leave these out.
 
     Args:
-        config: settings of the sweep that it is like.
-        table: the rows that the conditions are of.
-        conditions: all of which hold.
-        samples: configurations, about.
+        config: settings of the original sweep.
+        table: rows of the original sweep.
+        conditions: conditions on the factors, all of which have to hold.
+        samples: number of configurations, about.
         seed: seed of the draws.
-        arc: arc of an angle that may lie on either side, the index of the side.
+        arc: index of the arc to render, if a condition on an angle has several.
     """
     inside = table[rules.find_covered(conditions, table)]
     values_inside = {
@@ -56,7 +56,7 @@ def make_sweep_inside(
     grid = thin_grid(full_grid, max_points=2 * samples / n_scenes)
     n_configurations = count_grid_points(grid) * n_scenes
     controls = cut_controls(config, table, conditions, arc)
-    # of each point of the grid in each scene, if anything is sampled
+    # draws at each point of the grid in each scene, if anything is sampled
     draws = math.ceil(samples / n_configurations) if controls else None
     return make_minimal_config(
         config, grid=grid, controls=controls, samples=draws, seed=seed, **scene_settings
@@ -112,19 +112,20 @@ def cut_controls(
 ) -> dict[str, dict[str, Any]]:
     """Return the controls of a sweep with their sampled ranges cut to conditions.
 
-    A range is cut to the bounds of its condition, but is not wider than the values of
-    the rows. A condition on an angle may be two arcs of the circle, of which the range
-    becomes one; an arc that passes 360 degrees is skipped, and the range stays.
+    A range is cut to the bounds of its condition, and to the values that rows have. A
+    condition on an angle may be two arcs of the circle; the range becomes one of them.
+    An arc that passes 360 degrees cannot be set, so that the range stays as it was.
 
-    A control without ranges samples all of its parameters, but one with a range for a
-    parameter samples that one alone. So if such a control gets a range, its other
-    parameters get the ranges that the rows have.
+    A control without any range samples all of its parameters; as soon as one has a
+    range, only parameters with a range are sampled. So if a control without ranges gets
+    its first one here, its other parameters get the ranges that rows have.
 
     Args:
         config: settings of the sweep.
         table: its rows.
-        conditions: those of names, and of what was not sampled, are skipped.
-        arc: index of the arc of an angle.
+        conditions: conditions on the factors; those on names, and on factors that were
+            not sampled, are skipped.
+        arc: index of the arc, for conditions on angles.
     """
     controls = {name: dict(options) for name, options in config.controls.items()}
     for condition in conditions:
@@ -155,7 +156,17 @@ def observed_ranges(
     instance: str,
     declared: Mapping[str, Parameter],
 ) -> dict[str, Any]:
-    """Return the ranges that the rows have of the sampled parameters of a control."""
+    """Return the range that rows have of each sampled parameter of a control.
+
+    Args:
+        config: settings of the sweep.
+        table: its rows.
+        instance: name of the control.
+        declared: parameters of the control by name.
+
+    Returns:
+        [lowest, highest] of numbers, or the choices, by the name of the parameter.
+    """
     ranges: dict[str, Any] = {}
     for name, parameter in declared.items():
         column = table.get(f"{instance}.{name}")
@@ -181,10 +192,10 @@ def make_sweep_along(
     spaced numbers. Every other parameter is an axis of one value, that of the row.
 
     Args:
-        config: settings of the sweep that it is like.
-        row: the values of the row.
-        factor: which varies.
-        table: the rows, whose values the factor has.
+        config: settings of the original sweep.
+        row: the values of the row, by parameter.
+        factor: the parameter that varies.
+        table: rows of the original sweep, which decide the range of the factor.
         seed: seed of the noise.
     """
     values = list_values_along(table[factor], row[factor])
@@ -204,6 +215,7 @@ def make_sweep_along(
     else:
         grid[factor] = values
 
+    # a parameter must not be set and be an axis at the same time
     set_values = {
         name: value for name, value in config.set_.items() if name not in grid
     }
@@ -243,6 +255,10 @@ def select_choices(
 
     A choice is a setting of a control that is no parameter, such as the kind of a
     light. Such a control samples nothing, but its choices still decide the images.
+
+    Args:
+        config: settings of the original sweep.
+        grid: axes of the new sweep, by parameter.
     """
     controls = {}
     for instance, options in config.controls.items():

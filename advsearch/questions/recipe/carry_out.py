@@ -92,6 +92,11 @@ ANY_PARAMETER = "*"
 def run_recipe(context: RunContext[RecipeConfig]) -> RecipeResult:
     """Run a recipe, except for the parts that are already finished.
 
+    After an interrupt there are no figures.
+
+    Args:
+        context: settings, run directory and progress of the run.
+
     Raises:
         InputError: before anything is written, if the recipe or its settings are wrong.
     """
@@ -152,7 +157,15 @@ def _make_result(
     warnings: Sequence[str],
     context: RunContext[RecipeConfig],
 ) -> RecipeResult:
-    """Make the result of a recipe; a resumed run adds the seconds it took before."""
+    """Make the result of a recipe; a resumed run adds the seconds it took before.
+
+    Args:
+        recipe: the recipe.
+        done: the finished runs with their results.
+        recipe_figures: content of the figures.
+        warnings: warnings of all runs.
+        context: context of the recipe's run.
+    """
     config = context.config
     names = _list_scene_names(recipe, config)
     controls = [name for run, _ in done for name in run.config.controls]
@@ -208,6 +221,10 @@ def _list_scene_names(recipe: Recipe, config: RecipeConfig) -> dict[str, list[st
 def check_recipe(recipe: Recipe, config: RecipeConfig) -> None:
     """Check the photographs and figures of a recipe before anything is rendered.
 
+    Args:
+        recipe: the recipe.
+        config: settings of the command.
+
     Raises:
         InputError: if something that the recipe describes cannot work.
     """
@@ -236,8 +253,8 @@ def check_recipe(recipe: Recipe, config: RecipeConfig) -> None:
 def check_runs(runs: Sequence[PlannedRun]) -> dict[str, set[str]]:
     """Load everything that the runs name, and return the parameters of each part.
 
-    A wrong name would otherwise end hours of rendering. Runs whose settings differ in
-    seed and workers alone are loaded once.
+    Without this check, a wrong name might be found only after hours of rendering. Runs
+    whose settings differ in nothing but seed and workers are loaded once.
 
     Returns:
         For each part the names of its parameters, which are columns of its rows.
@@ -265,9 +282,9 @@ def check_runs(runs: Sequence[PlannedRun]) -> dict[str, set[str]]:
 def _check_run(config: SceneConfig, search: SceneConfig | None) -> set[str]:
     """Check a run by loading what it names, and return the parameters of its rows.
 
-    The rows of a sweep have what its scenes describe. A run that samples around the
-    result of a search is not loaded, since its ranges follow from the result; its rows
-    have the parameters of the search's controls.
+    The parameters of a sweep are those that its scenes describe. A run that samples
+    around the result of a search cannot be loaded yet, since its ranges follow from
+    that result; its parameters are those of the search's controls.
 
     Args:
         config: the settings of the run.
@@ -279,7 +296,7 @@ def _check_run(config: SceneConfig, search: SceneConfig | None) -> set[str]:
     columns = set[str]()
     if not samples_around:
         columns.add(TRIAL_COLUMN)  # rows of an attack are its trials
-        assert isinstance(config, AttackConfig)
+        assert isinstance(config, AttackConfig)  # sweeps have returned above
         workbench.check_from_config(config)
     source = search or config  # the settings with the controls
     for name in (*source.controls, *getattr(source, "over", {})):
@@ -339,7 +356,14 @@ def check_figures(
 def _check_option_parts(
     recipe: Recipe, options: Options, baseline: str | None, location: str
 ) -> None:
-    """Raise an error if an option of a figure names a part that does not exist."""
+    """Raise an error if an option of a figure names a part that does not exist.
+
+    Args:
+        recipe: the recipe with its parts.
+        options: options of the figure, with the parts `of`.
+        baseline: the part that all others are compared with; None without one.
+        location: location of the figure, for messages.
+    """
     option_parts = [("of", part) for part in options.of]
     if baseline:
         option_parts.append(("beside", baseline))
@@ -376,6 +400,7 @@ def _check_column(
     if name in known:
         return
     # a control that does not declare its parameters may have this one
+    # ("mitsuba.*" stands for any parameter of the control "mitsuba")
     matching = {name, f"{name.partition('.')[0]}.{ANY_PARAMETER}"}
     lacking = [
         part
@@ -403,8 +428,9 @@ def _select_photographed(
 ) -> list[PlannedRun]:
     """Select the runs that photographs are compared with.
 
-    They are sweeps with configurations of their own that store all images, with which
-    photographs can be aligned.
+    They are sweeps that store all images, since a photograph is aligned with the image
+    of its configuration. Sweeps that repeat the configurations of another part
+    (`drawn_as`) are left out.
     """
     selected = []
     for run in runs:
@@ -421,8 +447,12 @@ def _run_parts(
 ) -> tuple[list[DoneRun], list[str]]:
     """Run what is not finished, until a run is interrupted.
 
-    A run around a search samples from what the search found. If that has no
-    distribution, the run is left out.
+    A run may sample around the result of a search, that is from the distribution that
+    the search found. If the search found none, the run is left out.
+
+    Args:
+        runs: all runs, a search before the runs around it.
+        context: context of the recipe's run.
 
     Returns:
         The runs with their results, and a sentence for each run that was left out.
@@ -460,9 +490,9 @@ def sample_around(
 ) -> SceneConfig:
     """Return settings that sample uniformly around the distribution a search found.
 
-    Mean and standard deviation are the same: a uniform distribution of deviation s is
-    sqrt(12) s wide. Its range is clipped to that of the search. Angles whose range is
-    the full circle are not clipped, but span one turn at most.
+    The uniform distribution has the same mean and standard deviation s, so that it is
+    sqrt(12) s wide. Its range is clipped to that of the search. The range of an angle
+    that was searched over the full circle is not clipped, but spans at most one turn.
 
     Args:
         config: settings of the run that samples.
@@ -493,8 +523,9 @@ def _range_around(
 ) -> list[float]:
     """Return the range of the uniform distribution with some mean and deviation.
 
-    It is cut to the range of the search, except for an angle over a full turn, which is
-    cut to one turn. On a logarithmic parameter, the logarithm is uniform.
+    The range is cut to that of the search. If the search went over a full turn of an
+    angle, it is cut to one turn instead. For a logarithmic parameter, the logarithm is
+    uniform.
 
     Args:
         mean: mean of the distribution.
@@ -558,7 +589,14 @@ def _write_figures(
     done: Sequence[DoneRun],
     recipe_run: RunDirectory,
 ) -> Iterator[RecipeFigure]:
-    """Write the images of all figures of a recipe, and yield their content."""
+    """Write the images of all figures of a recipe, and yield their content.
+
+    Args:
+        recipe: the recipe.
+        config: settings of the command.
+        done: the finished runs with their results.
+        recipe_run: run directory of the recipe, which gets the images.
+    """
     rows = _read_frame(recipe, done, recipe_run)
     number = 0
     # all options are read before the first figure is made
@@ -578,9 +616,14 @@ def _read_frame(
 ) -> Rows:
     """Read the rows of all runs into one frame.
 
-    The rows of a run have the name of its part. Photographs that a sweep was compared
-    with have rows, too, of the part `PHOTOGRAPHS`. The rows of a sweep that sets
-    `workers` have a column of that.
+    The column of the part has the name of the run's part. Photographs that a sweep was
+    compared with have rows, too, with the part `PHOTOGRAPHS`. Rows of a sweep with the
+    setting `workers` have it as a column.
+
+    Args:
+        recipe: the recipe.
+        done: the finished runs with their results.
+        recipe_run: run directory of the recipe.
     """
     rows = list[dict[str, Any]]()
     units = dict[str, str]()
@@ -624,6 +667,10 @@ def read_figure_options(
 ) -> tuple[str, Options]:
     """Return the kind of a figure and its options.
 
+    Args:
+        figure_entry: entry of the recipe: the kind as `figure`, and options by name.
+        where: the recipe's file or name, for messages.
+
     Raises:
         InputError: if the kind or an option does not exist, or a value is wrong.
     """
@@ -644,7 +691,13 @@ def read_figure_options(
 def make_figures(rows: Rows, kind: str, options: Options) -> Iterator[FigureContent]:
     """Yield a figure, or one for each model if the kind does not compare models.
 
-    It has the rows of the parts that it requires, or else all but photographs.
+    A figure shows the rows of the parts that its options require. If they require none,
+    it shows all rows but photographs.
+
+    Args:
+        rows: rows of all runs.
+        kind: kind of the figure, such as "rates".
+        options: options of the figure.
 
     Raises:
         InputError: if the rows lack what the figure needs.

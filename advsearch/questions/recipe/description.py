@@ -216,7 +216,11 @@ def is_file_name(name: str) -> bool:
 
 
 def parse_recipe(data: Mapping[str, object], where: str) -> Recipe:
-    """Parse the content of a recipe's file; `where` names the file in messages.
+    """Parse the content of a recipe's file.
+
+    Args:
+        data: content of the file, as YAML states it.
+        where: name of the file, for messages.
 
     Raises:
         FileFormatError: if it describes no recipe.
@@ -265,11 +269,15 @@ class PlannedRun:
 def plan_runs(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
     """Plan the runs of a recipe in the order in which they run.
 
-    A part is a run for each object; if it is a search, for each object, environment and
-    model. The directory of a run is named after the part, the number of the run in it,
-    the object, and what else tells it from the others. A part may sample around the
-    results of another one: then each run samples around that with the same number and
-    names.
+    A part has a run for each object; a search has one for each combination of object,
+    environment and model. The directory of a run is named after the part, the number of
+    the run in it, the object, and the environment and model if they differ between
+    runs: "search-00-mug". A part may sample around the results of another part: then
+    each run samples around the run of that part with the same number and names.
+
+    Args:
+        recipe: the recipe.
+        config: settings of the command, which replace those of the recipe.
 
     Raises:
         InputError: if a part has a setting that its command lacks, or there are too
@@ -327,10 +335,20 @@ def _make_run_config(
     value_of_axis: Mapping[str, str],
     config: RecipeConfig,
 ) -> SceneConfig:
-    """Make the settings of the run `index` of the part `name`.
+    """Make the settings of one run of a part.
 
-    Those of the part go over those of the recipe. The seed follows from that of the
-    recipe; a part that repeats another has its seeds. Errors name the part.
+    Settings of the part replace those of the recipe. The seed follows from that of the
+    recipe. A part that repeats another one (`drawn_as`) has the seeds of that part.
+
+    Args:
+        recipe: the recipe.
+        name: name of the part.
+        index: index of the run in the part.
+        value_of_axis: object of the run; of a search also environment and model.
+        config: settings of the command.
+
+    Raises:
+        SettingsError, InputError: the settings are wrong; the message names the part.
     """
     part = recipe.parts[name]
     # different in each run, so that no two runs draw the same samples
@@ -355,7 +373,7 @@ def _make_run_config(
     except settings.SettingsError as error:
         raise settings.SettingsError(error.problems, where) from None
     except errors.UnknownNameError:
-        raise  # an InputError too, which lists the known names
+        raise  # it is an InputError, too, but lists the known names: keep it
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
 
@@ -390,6 +408,10 @@ def check_powers(recipe: Recipe, runs: Iterable[PlannedRun], name: str) -> None:
 
 def apply_command_settings(recipe: Recipe, config: RecipeConfig) -> Recipe:
     """Return the recipe with the settings of the command, and of `quick` if it is set.
+
+    Args:
+        recipe: the recipe.
+        config: settings of the command; those that are None stay as in the recipe.
 
     Raises:
         InputError: if neither names an object.

@@ -40,7 +40,12 @@ class PredictionsOptions(Options):
 
 
 def make_predictions_figure(rows: Rows, options: PredictionsOptions) -> FigureContent:
-    """Make a figure of the most frequent predictions by the values of a column."""
+    """Make a figure of the most frequent predictions by the values of a column.
+
+    Args:
+        rows: rows of the parts that the figure shows.
+        options: the column, and how many predictions each value has.
+    """
     groups = dict[str, list[PredictionCount]]()
     for value, group_rows in rates.split_rows(rows, options.by).items():
         groups[value] = []
@@ -83,7 +88,7 @@ def _describe_predictions(
 ) -> list[str]:
     """Describe for how many groups the most frequent prediction is mostly right.
 
-    Those for which it is not are described each.
+    Each group for which it is mostly wrong has a sentence of its own.
 
     Args:
         groups: for each group the predictions, the most frequent first, each with its
@@ -191,10 +196,16 @@ class CuesOptions(Options):
 def make_cues_figure(rows: Rows, options: CuesOptions) -> FigureContent:
     """Make a figure of how often the prediction is the object or its texture.
 
-    Its sentences also say which of both cues predicts the predictions better.
+    Its sentences also state whether the predictions depend more on the shape or on the
+    texture.
+
+    Args:
+        rows: rows with object and texture.
+        options: the columns of both, and the classes that name each texture.
     """
-    # All three are by texture: which predictions about it name the texture, and how
-    # many name the object and the texture.
+    # The three mappings are by the name of the texture. `names_texture` has a flag for
+    # each row: whether its prediction names the texture. The others count the rows
+    # whose prediction names the object, and those whose prediction names the texture.
     names_texture = dict[str, Any]()
     by_shape = dict[str, ClusteredFraction]()
     by_texture = dict[str, ClusteredFraction]()
@@ -257,9 +268,10 @@ def _describe_named(
 
 
 def _names_class(predictions: Any, classes: Sequence[str]) -> Any:
-    """Return which predictions (n,) name one of the classes.
+    """Return a flag for each prediction (n,): whether it names one of the classes.
 
-    A label may be a list of synonyms, as in "cup, mug": it matches in full, or by one.
+    A label may be a list of synonyms, such as "cup, mug". It matches if the full label
+    is a class, or if one of the synonyms is.
     """
     names = predictions.map(
         lambda label: {label.strip(), *map(str.strip, label.split(","))}
@@ -272,7 +284,13 @@ def _draw_cues(
     by_shape: Mapping[str, ClusteredFraction],
     by_texture: Mapping[str, ClusteredFraction],
 ) -> None:
-    """Draw for each texture the fractions of predictions by shape and by texture."""
+    """Draw for each texture the fractions of predictions by shape and by texture.
+
+    Args:
+        figure: figure of matplotlib.
+        by_shape: for each texture, how often the prediction names the object.
+        by_texture: for each texture, how often the prediction names the texture.
+    """
     axes = figure.subplots()
     ordered = sorted(by_shape, key=lambda name: by_shape[name].fraction or 0.0)
     shape_shares = [by_shape[name].fraction or 0.0 for name in ordered]
@@ -305,11 +323,11 @@ def _draw_cues(
 def count_predicted(rows: Rows, options: CuesOptions) -> list[tuple[int, int, int]]:
     """Count how many predictions the shape and the texture predict, by pair of both.
 
-    To predict what a model says about a pair, a cue takes its most frequent prediction
-    about the same object with other textures, or about the same texture on other
-    objects. Both sets are sampled to the size of the smaller, and neither has the
-    pair's own predictions, so that a model that goes by neither cue is predicted
-    equally well by both.
+    The shape predicts, for a pair of object and texture, the model's most frequent
+    label for the same object with other textures. The texture predicts the most
+    frequent label for the same texture on other objects. Both sets of labels are
+    sampled to the size of the smaller one, and neither has the pair's own labels: so a
+    model that uses neither cue is predicted equally well by both.
 
     Args:
         rows: predictions with object and texture.
@@ -375,9 +393,12 @@ def _most_frequent_of_sample(
 def _compare_cues(pairs: Sequence[tuple[int, int, int]]) -> str:
     """Describe by how many percentage points the shape predicts better.
 
-    Predictions about one pair of object and texture are dependent: the interval is a
-    percentile bootstrap over pairs. `pairs` are counts as `count_predicted` returns
-    them.
+    The predictions about one pair of object and texture are not independent. Therefore
+    the interval is a percentile bootstrap over pairs.
+
+    Args:
+        pairs: for each pair the number of predictions, those that the shape predicts,
+            and those that the texture predicts.
     """
     if len(pairs) < MIN_PAIRS:
         return (
@@ -447,7 +468,13 @@ class TernaryOptions(Options):
 def make_ternary_figure(rows: Rows, options: TernaryOptions) -> FigureContent:
     """Make a figure of where in a mixture each prediction is frequent.
 
-    If all predictions are the same, it shows the margin of the right label instead.
+    A mixture has three ingredients, whose fractions add up to 1. It is a point in a
+    triangle, which is cut into small triangles. If all predictions are the same, the
+    figure shows the margin of the right label instead.
+
+    Args:
+        rows: rows of one mixture each.
+        options: the columns of the ingredients, and how the figure is drawn.
     """
     mixtures = _read_mixtures(rows, options)
     names = [rates.strip_control(name) for name in options.shares]
@@ -458,7 +485,7 @@ def make_ternary_figure(rows: Rows, options: TernaryOptions) -> FigureContent:
     ranking = rates.rank_predictions(rows[rates.PREDICTION_COLUMN])
     margins = _margins_by_ingredient(rows, names, main_ingredient)
     has_single_prediction = len(ranking) == 1
-    # a mean margin has an interval from two values on
+    # The margins are compared by intervals, for which each ingredient needs two values.
     by_margin = has_single_prediction and min(map(len, margins.values())) >= 2
     ranking = ranking[: options.most]
     if by_margin:
@@ -503,8 +530,8 @@ def _make_panels(
 ) -> dict[str, list[float | None]]:
     """Return what the diagram of each prediction shows: a value for each triangle.
 
-    That is the fraction of the mixtures inside for which the prediction is given, or
-    with `by_margin` the mean margin; None where no mixture lies.
+    The value is the fraction of the mixtures in the triangle that have this prediction;
+    with `by_margin` it is their mean margin. It is None if no mixture lies there.
 
     Args:
         rows: rows of one mixture each.
@@ -553,7 +580,16 @@ def _read_mixtures(rows: Rows, options: TernaryOptions) -> Float64Array:
 def _margins_by_ingredient(
     rows: Rows, names: Sequence[str], main_ingredient: npt.NDArray[np.intp]
 ) -> dict[str, Float64Array]:
-    """Return the known margins of the mixtures in which each ingredient is largest."""
+    """Return the known margins of the mixtures in which each ingredient is largest.
+
+    Args:
+        rows: rows of one mixture each.
+        names: names of the ingredients.
+        main_ingredient: (n,) index of the largest ingredient in each row.
+
+    Returns:
+        The margins by the name of the ingredient.
+    """
     margin = rows["margin"].astype(float).to_numpy()
     is_known = ~np.isnan(margin)
     return {
@@ -659,6 +695,8 @@ def _draw_panels(
 ) -> None:
     """Draw a ternary diagram for each prediction, with one or several color bars.
 
+    All diagrams share a color bar, unless each is normalised to its own values.
+
     Args:
         figure: figure of matplotlib.
         panels: the value of each triangle, by prediction.
@@ -700,8 +738,9 @@ def find_triangle(mixture: Sequence[float], side: int) -> Triangle:
         side: number of triangles along a side of the diagram.
     """
     a, b, c = (int(fraction * side) for fraction in mixture)
-    # The sum is `side` at a corner, which several triangles share. It counts for one of
-    # those that have no larger value of its largest fraction.
+    # Inside a triangle the sum of the rounded numbers is `side - 1` or `side - 2`. At a
+    # corner, which several triangles share, nothing is rounded and it is `side`: 1 is
+    # taken from the largest number, so that the corner belongs to one triangle.
     while a + b + c >= side:
         if a >= max(b, c):
             a -= 1
@@ -709,8 +748,8 @@ def find_triangle(mixture: Sequence[float], side: int) -> Triangle:
             b -= 1
         else:
             c -= 1
-    # The three numbers add up to `side` before they are rounded down, which takes 1 from
-    # the sum in a triangle that points up, and 2 in one that points down.
+    # Before rounding down, the three numbers add up to `side`. Rounding takes 1 in
+    # total from the sum in a triangle that points up, and 2 in one that points down.
     points_down = a + b + c < side - 1
     return a, b, points_down
 
@@ -718,10 +757,10 @@ def find_triangle(mixture: Sequence[float], side: int) -> Triangle:
 def list_triangles(side: int) -> dict[Triangle, tuple[Mixture, Mixture, Mixture]]:
     """Return the triangles of a ternary diagram with the mixtures at their corners.
 
-    The key of a triangle is (a, b, points_down): the first two fractions inside it,
-    times `side` and rounded down, and whether it points down. Two triangles have the
-    same a and b, and share an edge; at the side of the diagram where the third fraction
-    is small, there is only the one that points up.
+    The key of a triangle is (a, b, points_down): the first two fractions of a mixture
+    in it, times `side` and rounded down, and whether it points down. For each a and b
+    there are two triangles that share an edge, except at the side of the diagram where
+    the third fraction is near 0: there is only the one that points up.
 
     Args:
         side: number of triangles along a side of the diagram.
@@ -747,9 +786,9 @@ def list_triangles(side: int) -> dict[Triangle, tuple[Mixture, Mixture, Mixture]
 def _compare_margins(margins: Mapping[str, Float64Array]) -> str:
     """Describe for which ingredient the mean margin is smallest, and for which largest.
 
-    The margin is by how much the right label leads the next. Whether the two differ is
-    decided by intervals that are widened, since they were chosen for being extreme
-    among all ingredients (Bonferroni).
+    The margin is by how much the right label leads the next one. The two ingredients
+    were selected as extremes among all, so that their intervals are widened
+    (Bonferroni) before they are compared.
 
     Args:
         margins: margins of the mixtures in which each ingredient is the largest, by its
@@ -802,9 +841,9 @@ def _choose_color_range(
 ) -> tuple[float, float]:
     """Return the values of the first and the last color of a ternary diagram.
 
-    Fractions have colors from 0 to 1, or if normalised to the largest of them. Margins
-    have colors up to the largest: from 0, or from the smallest if it is below 0 or if
-    they are normalised.
+    The colors of fractions go from 0 to 1; if normalised, from 0 to the largest value.
+    The colors of margins go to the largest value. They begin at 0, or at the smallest
+    value if it is below 0 or if they are normalised.
 
     Args:
         values: values of the triangles.
@@ -829,8 +868,15 @@ def _draw_panel(
 ) -> Any:
     """Draw a ternary diagram, and return its colored triangles for a color bar.
 
-    The first ingredient is at the left corner, the third at the top. Triangles without
-    a value are hatched.
+    The first ingredient is at the left corner, the second at the right one, the third
+    at the top. Triangles without a value are hatched.
+
+    Args:
+        axes: axes of matplotlib.
+        label: the prediction, which becomes the title.
+        values: value of each triangle; None where no mixture lies.
+        corners: the mixtures at the corners of each triangle.
+        names: names of the three ingredients.
     """
     from matplotlib.collections import PolyCollection  # matplotlib takes half a second
 

@@ -75,6 +75,9 @@ def read_rows(
         seed: seed of the run.
         kinds: kinds of stored rows to read.
         **more: further columns, equal in all rows.
+
+    Returns:
+        The rows as mappings from column to value, and the unit of each parameter.
     """
     rows = list[dict[str, Any]]()
     units = dict[str, str]()
@@ -86,6 +89,7 @@ def read_rows(
         for row in store.rows():
             if row.kind not in kinds:
                 continue
+            # An image without the object says nothing about its recognition.
             if row.kind == "sweep" and row.is_out_of_view:
                 continue
             units |= {name: stored["unit"] for name, stored in row.values.items()}
@@ -216,6 +220,13 @@ class ClusteredFraction:
     def __init__(
         self, name: str, unit_counts: Float64Array, unit_sizes: Float64Array
     ) -> None:
+        """Compute the totals and the fraction from the counts of each unit.
+
+        Args:
+            name: name of what the rows are of, such as an environment.
+            unit_counts: (n,) rows that are counted in each unit.
+            unit_sizes: (n,) rows of each unit.
+        """
         self.name = name
         self.unit_counts = unit_counts
         self.unit_sizes = unit_sizes
@@ -440,6 +451,10 @@ class RatesOptions(Options):
 def make_rates_figure(rows: Rows, options: RatesOptions) -> FigureContent:
     """Make a figure of the fractions of right or wrong predictions.
 
+    Args:
+        rows: rows of the parts that the figure shows.
+        options: columns that the rates are split by, and how they are drawn.
+
     Raises:
         InputError: if there are no rows, or the columns don't suit the options.
     """
@@ -506,6 +521,11 @@ def _count_cells(
 
     Bars of names are sorted by the fraction of the first series, the highest first.
 
+    Args:
+        rows: rows without those of the baseline.
+        series_values: values of the column `options.series`; a single "" without it.
+        options: options of the figure.
+
     Returns:
         For each group by its name a tally for each series; and the centers of bins,
         None if the groups are single values.
@@ -528,8 +548,15 @@ def _count_series(
 ) -> list[ClusteredFraction]:
     """Count the right predictions in each series; with `options.wrong` the wrong ones.
 
-    The tallies are in the order of `series_values`; a series without rows has an empty
-    one.
+    Args:
+        name: name of the tallies.
+        rows: the rows, of all series.
+        series_values: values of the column `options.series`; a single "" without it.
+        options: options of the figure.
+
+    Returns:
+        A tally for each series, in the order of `series_values`; a series without rows
+        has an empty one.
     """
     rows_of_series = {"": rows}
     if options.series and len(rows):
@@ -588,7 +615,13 @@ def _describe_cells(
 def _describe_map_cells(
     cells: Cells, series: Sequence[str], options: RatesOptions
 ) -> list[str]:
-    """Describe the lowest and the highest cell of all rows and series of a map."""
+    """Describe the lowest and the highest cell of all rows and series of a map.
+
+    Args:
+        cells: for each row by its name, a tally for each series.
+        series: names of the series.
+        options: options of the figure.
+    """
     pairs = []
     for row_name, tallies in cells.items():
         names = _name_series(series, options)
@@ -611,9 +644,9 @@ def _describe_series(
 ) -> list[str]:
     """Compare the series over all rows.
 
-    Where they are models and errors are counted, each but the first also has the mean
-    over rows of its error relative to that of the first model: the mCE of Hendrycks and
-    Dietterich (2019).
+    If the series are models and errors are counted, there is also a sentence for each
+    model but the first: the mean over rows of its error relative to that of the first
+    model, as the mCE (mean corruption error) of Hendrycks and Dietterich (2019).
 
     Args:
         cells: for each row a tally for each series.
@@ -700,7 +733,14 @@ def _tabulate_rates(
     series: Sequence[str],
     options: RatesOptions,
 ) -> list[list[Cell]]:
-    """Return the table of a rates figure; with series, their totals come last."""
+    """Return the table of a rates figure; with series, their totals come last.
+
+    Args:
+        cells: for each row by its name, a tally for each series.
+        totals: totals of each series over all rows.
+        series: names of the series.
+        options: options of the figure.
+    """
     tallies_of_row = dict(cells)
     if options.series:
         tallies_of_row["all"] = totals
@@ -733,7 +773,15 @@ def _draw_rates(
     series: Sequence[str],
     options: RatesOptions,
 ) -> None:
-    """Draw a map of the cells, or bars; only bars have the baseline."""
+    """Draw a map of the cells, or bars; only bars have the baseline.
+
+    Args:
+        figure: figure of matplotlib.
+        bars: for each row a tally for each series, with the baseline first, if any.
+        cells: the same without the baseline.
+        series: names of the series.
+        options: options of the figure.
+    """
     axes = figure.subplots()
     label = f"{'wrong' if options.wrong else 'right'}, share"
     if options.form == "map":
@@ -758,7 +806,16 @@ def _draw_rate_lines(
     unit: str,
     options: RatesOptions,
 ) -> None:
-    """Draw a line for each series over the bins of a parameter."""
+    """Draw a line for each series over the bins of a parameter.
+
+    Args:
+        figure: figure of matplotlib.
+        cells: for each bin a tally for each series.
+        series: names of the series.
+        positions: center of each bin, or its index if the rows are not binned.
+        unit: unit of the parameter; empty without one.
+        options: options of the figure.
+    """
     axes = figure.subplots()
     _draw_lines(axes, cells, series, positions)
     label = f"{'wrong' if options.wrong else 'right'}, share"
@@ -775,6 +832,10 @@ def _group_rows(
 
     Without `bins`, and unless lines are drawn, each value is a group. Rows outside of
     the `range` are in no bin.
+
+    Args:
+        rows: the rows.
+        options: the column, and the number and range of its bins.
 
     Returns:
         The rows by the name of the value or bin; and the centers of the bins, None
@@ -804,7 +865,16 @@ def _group_rows(
 
 
 def _find_bins(values: Any, lower: float, upper: float, n_bins: int) -> Any:
-    """Return the bin of each value, NaN outside of the range, whose ends belong to it."""
+    """Return the index of the bin of each value; NaN outside of the range.
+
+    Both ends belong to the range.
+
+    Args:
+        values: column of numbers.
+        lower: lower end of the range.
+        upper: upper end of the range.
+        n_bins: number of bins of equal width.
+    """
     position = (values - lower) / (upper - lower) * n_bins
     in_range = values.between(lower, upper)
     # The upper end is in the last bin.
@@ -812,7 +882,11 @@ def _find_bins(values: Any, lower: float, upper: float, n_bins: int) -> Any:
 
 
 def _read_binned_values(rows: Rows, options: RatesOptions) -> Any:
-    """Return the column that is binned, or its distances from a value."""
+    """Return the column that is binned, or its distances from `options.away_from`.
+
+    If the values repeat after `options.turn`, such as 360 degrees, the distance is the
+    shorter way around the circle.
+    """
     values = get_numeric_column(rows, options.by)
     if options.away_from is None:
         return values
@@ -943,9 +1017,13 @@ AGREEMENT_HEADS = [
 def make_agreement_figure(rows: Rows, options: AgreementOptions) -> FigureContent:
     """Compare predictions about renderings with those about other images of the same.
 
-    A pair agrees if the model is right about both or wrong about both. The other images
-    are photographs, and those of the other parts; without photographs a sentence says
-    so.
+    The other images are photographs, and the images of other parts. A pair agrees if
+    the model is right about both images, or wrong about both. If there are no
+    photographs, a sentence states it.
+
+    Args:
+        rows: rows of the parts and of the photographs.
+        options: the part with the renderings, and the parts to compare them with.
 
     Raises:
         InputError: if a part has no rows or other configurations.
@@ -1042,9 +1120,10 @@ def _draw_agreement(figure: Any, bars: Cells, series: Sequence[str]) -> None:
 def _pair_rows(part_rows: Rows, renderings: Rows) -> Rows:
     """Join the rows of a part with the renderings of the same configuration.
 
-    A configuration is all columns of the renderings but those of a single row, such as
-    the prediction. Rows of the part may have further parameters. Columns of a single
-    row come twice: those of the rendering end in `` rendered``.
+    Two rows have the same configuration if they agree in all columns of the renderings
+    except for the results, such as the prediction. Rows of the part may have further
+    parameters. A pair has the results of both rows: the columns of the rendering's
+    results end in `` rendered``.
     """
     columns_of_row = {
         PREDICTION_COLUMN,
@@ -1116,10 +1195,11 @@ def _describe_photographs(n_pairs: int, n_unpaired: int) -> list[str]:
 
 
 def _describe_where(right: bool, pairs: Rows) -> str:
-    """Describe how often the second prediction of a pair is like the first.
+    """Describe how often the model is right (wrong) about both images of a pair.
 
-    The first is about a rendering, the second about another image. The sentence before
-    speaks of the model, which is "it" here.
+    Among the pairs in which it is right (wrong) about the rendering, this counts those
+    in which it is so about the other image, too. The sentence calls the model "it",
+    since it follows one that names the model.
 
     Args:
         right: selects the pairs in which the model is right about the rendering, or
@@ -1138,6 +1218,10 @@ def _describe_where(right: bool, pairs: Rows) -> str:
 
 def make_scaling_figure(rows: Rows, options: Options) -> FigureContent:
     """Make a figure of the throughput of sweeps, images per second, by worker count.
+
+    Args:
+        rows: rows of sweeps, with the times when they were stored.
+        options: options of the figure.
 
     Raises:
         InputError: if no sweep sets `workers`, or a run is too short.
@@ -1194,6 +1278,9 @@ def _compute_gains(run_rates: Any, rates_by_count: Mapping[int, Any]) -> Any:
 def _describe_scaling(rates_by_count: Mapping[int, Any]) -> list[str]:
     """Describe the throughput of each worker count, relative to the fewest workers.
 
+    Each count has several runs, one of each object: the sentences have their median and
+    range.
+
     Args:
         rates_by_count: throughput of several runs, by ascending worker count.
     """
@@ -1230,7 +1317,13 @@ def _describe_scaling(rates_by_count: Mapping[int, Any]) -> list[str]:
 def _draw_scaling(
     figure: Any, rates_by_count: Mapping[int, Any], max_rate: float
 ) -> None:
-    """Draw median and range of the throughput by worker count, and linear scaling."""
+    """Draw median and range of the throughput by worker count, and linear scaling.
+
+    Args:
+        figure: figure of matplotlib.
+        rates_by_count: images per second of several runs, by ascending worker count.
+        max_rate: the largest of all rates.
+    """
     axes = figure.subplots()
     counts = list(rates_by_count)
     fewest, slowest = next(iter(rates_by_count.items()))
@@ -1309,6 +1402,12 @@ def _list_surface_cells(surface_table: Any) -> list[Cell]:
 
 def make_surface_figure(rows: Rows, options: Options) -> FigureContent:
     """Make a figure of the surface parts that are visible when predictions are wrong.
+
+    It puts the images that the sweeps have written below each other.
+
+    Args:
+        rows: rows of the runs; their `attrs` have the summaries of the surfaces.
+        options: options of the figure.
 
     Raises:
         InputError: if no sweep has `surface: true`.

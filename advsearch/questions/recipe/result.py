@@ -289,8 +289,8 @@ def _format_cell(column: str, value: Cell) -> str:
 def omit_repeated_sentences(figures: Sequence[RecipeFigure]) -> list[list[str]]:
     """Return the sentences of each figure, less those that an earlier figure has.
 
-    Only sentences with a count, as in "3 of 5", are left out. If nothing is left, or
-    the text is that of the figure before, a sentence says so.
+    Only sentences with a count, as in "3 of 5", are left out. If no sentence remains,
+    or the text is equal to that of the previous figure, a sentence states it.
     """
     reported = set[str]()
     remaining = list[list[str]]()

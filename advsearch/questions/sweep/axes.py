@@ -123,16 +123,20 @@ def parse_axes(
 
 
 def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axis:
-    """Parse one axis; see `parse_axes`.
+    """Parse one axis of a grid, such as ``pose.yaw=0:360:24``.
 
     Args:
-        name: name of the parameter, as the user wrote it.
-        values: values of the parameter.
+        name: name of the parameter, as the user wrote it: KIND.PARAMETER,
+            INSTANCE.PARAMETER, KIND:INSTANCE.PARAMETER, or mitsuba:KEY.
+        values: values of the parameter, a string or a list.
         instances: the sampled controls by name.
+
+    Raises:
+        InputError, UnknownNameError: the name or the values cannot be used.
     """
     where = f"`grid` {name}"
     # An instance may stand on either side: KIND:INSTANCE.PARAMETER, or
-    # KIND.PARAMETER:INSTANCE.
+    # KIND.PARAMETER:INSTANCE. `rest` is what follows the first dot.
     control_name, _, rest = name.partition(".")
     kind, first_colon, first_instance = control_name.partition(":")
     parameter_name, last_colon, last_instance = rest.partition(":")
@@ -179,8 +183,14 @@ def _find_control(
 ) -> Any:
     """Return the class of a control: that of the instance, else that of the kind.
 
+    Args:
+        instances: the sampled controls by name.
+        kind: kind of the control, such as "light".
+        instance: name of the control, such as "key".
+        where: the axis, as messages name it.
+
     Raises:
-        UnknownNameError: there is neither.
+        UnknownNameError: no control has this name or kind.
     """
     control: Any = CONTROLS.get(kind)
     if instance in instances:
@@ -208,8 +218,8 @@ def _find_parameters(
         instances: the sampled controls by name.
         control: the class of the control.
         parameter_name: parameter name of the axis.
-        instance: name of the control; a sampled one adds the parameters that it alone
-            has.
+        instance: name of the control. If it is one of `instances`, it may have
+            parameters besides those of its class; these are returned, too.
     """
     declared = [*control.declare_parameters({parameter_name: values})]
     if instance in instances:
@@ -220,7 +230,12 @@ def _find_parameters(
 def _parse_key_axis(name: str, values: Any, control: Any) -> Axis:
     """Parse an axis over one of Mitsuba's own parameters.
 
-    The scene declares the parameter, and is checked for it later.
+    Whether the scene has such a parameter is checked later, when the scene is loaded.
+
+    Args:
+        name: name of the axis, such as ``mitsuba:mug.bsdf.reflectance``.
+        values: values of the parameter, a string or a list.
+        control: class of the control for Mitsuba's parameters.
     """
     where = f"`grid` {name}"
     key = name.partition(":")[2]
@@ -241,7 +256,18 @@ def _parse_key_axis(name: str, values: Any, control: Any) -> Axis:
 def _check_scalar(
     where: str, control: Any, parameter: Parameter, instance: str
 ) -> None:
-    """Check that a parameter is a single value, as an axis needs it."""
+    """Check that a parameter is a single value, as an axis needs it.
+
+    Args:
+        where: the axis, as messages name it.
+        control: class of the control. A control with an image among its parameters (a
+            texture) has no axes at all.
+        parameter: the parameter of the axis.
+        instance: name of the control, for the message.
+
+    Raises:
+        InputError: the parameter has several numbers.
+    """
     has_images = any(len(declared.shape) > 1 for declared in control.parameters)
     if has_images or parameter.shape != ():
         raise InputError(
@@ -256,9 +282,9 @@ def parse_axis_values(
 ) -> tuple[ParameterValue, ...]:
     """Parse and check the values of an axis.
 
-    ``"FIRST:LAST:COUNT"`` is COUNT values evenly spaced from FIRST to LAST, both
-    included; of a periodic parameter over a full turn, LAST would repeat FIRST and is
-    left out.
+    ``"FIRST:LAST:COUNT"`` stands for COUNT evenly spaced values from FIRST to LAST,
+    both included. If it is a full turn of an angle, such as 0:360:24, LAST would repeat
+    FIRST, and is left out.
 
     Args:
         where: how messages name the axis.
@@ -297,12 +323,22 @@ def parse_axis_values(
 def _check_different(
     where: str, values: Sequence[ParameterValue], is_angle: bool
 ) -> None:
-    """Check that no value comes twice, and no angle in two forms, such as 0 and 360."""
+    """Check that no value comes twice, and no angle in two forms, such as 0 and 360.
+
+    Args:
+        where: the axis, as messages name it.
+        values: values of the axis.
+        is_angle: whether they are angles in degrees, which repeat after a full turn.
+
+    Raises:
+        InputError: two values are the same.
+    """
     value_of_key: dict[ParameterValue, ParameterValue] = {}
     for value in values:
         key = value
         if is_angle and not isinstance(value, str):
-            # Rounding may give a full turn, which is 0 as well.
+            # 9 decimals: angles that differ by float64 rounding alone are the same.
+            # Rounding may give 360, which is the angle 0: so the second `%`.
             key = round(value % FULL_TURN, 9) % FULL_TURN
         if key not in value_of_key:
             value_of_key[key] = value
@@ -335,7 +371,17 @@ def _format_value(value: ParameterValue) -> str:
 
 
 def _parse_range(where: str, text: str, is_angle: bool) -> list[float]:
-    """Return the values of ``FIRST:LAST:COUNT``; see `parse_axis_values`."""
+    """Return the values of a range ``FIRST:LAST:COUNT``, evenly spaced.
+
+    Args:
+        where: the axis, as messages name it.
+        text: the range, such as "0:360:24".
+        is_angle: whether the values are angles in degrees. Then a range over a full
+            turn leaves LAST out, since it would repeat FIRST.
+
+    Raises:
+        InputError: the text is no such range.
+    """
     expected = (
         f"{where}: expected FIRST:LAST:COUNT such as 0:360:24, or values "
         f"separated by commas, got {text!r}"
@@ -359,7 +405,6 @@ def _parse_range(where: str, text: str, is_angle: bool) -> list[float]:
         )
     _check_count(where, count)
     _check_bounds(where, text, first, last, count, is_angle=is_angle)
-    # After a full turn the last value would be the first one again: it is left out.
     is_full_turn = is_angle and last - first == FULL_TURN
     values = np.linspace(first, last, count, endpoint=not is_full_turn)
     return [float(value) for value in values]
@@ -411,10 +456,11 @@ def _check_count(where: str, count: int) -> None:
 def add_grid_axes(
     controls: Sequence[Control], axes: Sequence[Axis], scene: SceneDescription
 ) -> tuple[Control, ...]:
-    """Return the controls with the axes among their parameters as discrete choices.
+    """Return the controls, where parameters on an axis are choices among its values.
 
-    The other parameters of a sampled control stay sampled; those of a control that is
-    only in the grid stay as the scene has them.
+    A control may be sampled and also have a parameter on an axis: then its other
+    parameters stay sampled. If a control is only in the grid, its other parameters keep
+    the values of the scene.
 
     Args:
         controls: controls that are sampled.
@@ -440,8 +486,10 @@ def add_grid_axes(
 def _sampled_settings(control: Control, scene: SceneDescription) -> dict[str, object]:
     """Return the settings of a sampled control, with its default ranges stated.
 
-    A control without any range samples all its parameters in their default ranges. With
-    a range for one of them, which an axis of the grid is, only stated ranges count.
+    A control without any range samples all its parameters in their default ranges. As
+    soon as one parameter has a range, only stated ranges count. An axis of the grid is
+    such a range: so the default ranges of the other parameters are stated here, or
+    these would stop to vary.
     """
     # Kind and name are no parameters: the class and the instance state them.
     settings = {
@@ -534,7 +582,7 @@ class _SampledBlock(NamedTuple):
 
     block: Block
     coordinates: slice
-    columns: slice
+    columns: slice  # a ball needs one more, for the length
 
 
 class _GridCoordinate(NamedTuple):
@@ -590,6 +638,7 @@ class Points:
         n_scenes: int = 1,
         n_photographs: int = 1,
     ) -> None:
+        """Assign every coordinate to an axis or to draws; arguments: see the class."""
         self.grid = ProductIndex(tuple(len(axis.values) for axis in axes))
         self.samples = samples
         self.count = self.grid.count * samples
@@ -666,14 +715,17 @@ class Points:
     def _assign_blocks(self, domain: Domain) -> Iterator[SampledNumber]:
         """Decide for each block of coordinates where its values come from.
 
-        A block is the coordinates of one parameter. If an axis of the grid has the
-        parameter, its values come from there, else from columns of the draws: a column
-        for each coordinate, and in a ball one more for the length. This fills the lists
-        of grid coordinates and of sampled blocks.
+        A block is the coordinates of one parameter. If the parameter is an axis of the
+        grid, its values come from the axis. Otherwise they come from columns of the
+        draws: one for each coordinate, and for a ball (L2 norm) one more for the
+        length. This fills `_grid_coordinates`, `_small_blocks` and `_large_blocks`.
+
+        Args:
+            domain: the blocks of all controls, with their norms and budgets.
 
         Yields:
-            The sampled numbers that tables show: those of short blocks, of controls
-            that know their ranges.
+            The sampled numbers that tables show. These have few components, and a
+            control that knows their ranges.
         """
         controls = {control.name: control for control in self.space.controls}
         for group, (block, coordinates) in zip(
@@ -688,6 +740,7 @@ class Points:
             is_small = block.size <= MAX_SOBOL_SIZE
             blocks = self._small_blocks if is_small else self._large_blocks
             first_column = _count_columns(blocks)  # the first that is free
+            # A draw in a ball needs one number more than a draw in a box: its length.
             is_ball = block.norm == "l2"
             n_columns = block.size + 1 if is_ball else block.size
             columns = slice(first_column, first_column + n_columns)
@@ -712,7 +765,7 @@ class Points:
             control: bound to the scene.
             name: name of its parameter.
             coordinates: coordinates of the parameter in a configuration.
-            first_column: index of its first number among the draws.
+            first_column: index of its first column among the draws.
         """
         parameter, spec = _find_spec(control, name)
         full_name = f"{control.name}.{name}"
@@ -774,9 +827,11 @@ class Points:
             (count, k) indices among `parts` of each of `sampled_numbers`.
         """
         draws = self._sample(self._small_draws, first, count)
+        # [0, 1] is cut into equal shares for each number: find the share of each draw.
         shares = (draws[:, self._columns] * self._n_shares).astype(np.int64)
         shares = np.minimum(shares, self._n_shares - 1)  # a draw of 1 is in the last
-        # A part has one share, unless it is an option among others with weights.
+        # Usually share and part are the same. An option with a weight has several
+        # shares: there the part of each share is looked up.
         parts = shares
         for column, number in enumerate(self.sampled_numbers):
             if number.part_of_share:
@@ -784,9 +839,10 @@ class Points:
         return parts
 
     def noise_number(self, number: int) -> int:
-        """Return which noise an image has, by its number in the sweep.
+        """Return the index of the noise seed of an image, by its number in the sweep.
 
-        Images whose draws repeat those of others have the same noise as these.
+        In a comparison, the images with the adversarial scene repeat the draws of those
+        without it. They have the same noise, too, so that only the scene differs.
         """
         images_until_repeat = self.units.again  # 0 for never
         return number % images_until_repeat if images_until_repeat else number
@@ -851,9 +907,10 @@ class Points:
     def _transform(self, sampled: _SampledBlock, uniform: Float64Array) -> Float64Array:
         """Return coordinates inside the budget of a block from uniform numbers.
 
-        They are uniform in the box, or in the ball around the start (Muller 1959): a
-        direction from k normal numbers, and a length. An option of a choice stands for
-        an equal part of [0, 1]; its coordinate is the center of that part.
+        The coordinates are uniform in the box, or in the ball around the start. In a
+        ball they are a direction from k normal numbers, times a length (Muller 1959). A
+        choice of n options cuts [0, 1] into n equal parts; the coordinate of an option
+        is the center of its part.
 
         Args:
             sampled: the block, of k coordinates.
@@ -893,8 +950,8 @@ class Points:
     def describe_images(self, u: Tensor, first_image: int) -> list[dict[str, Value]]:
         """Return the stored values of neighbouring images: parameter to value and unit.
 
-        As `Space.describe` returns them, except that a parameter of the grid has the
-        value that was listed, not its rounding to single precision.
+        They are what `Space.describe` returns, with one exception: a parameter of the
+        grid has the value that the user listed, not its float32 rounding.
 
         Args:
             u: (n, d) configurations.
@@ -921,7 +978,14 @@ class Points:
     def _find_axis_points(
         self, control: Control, indices: Sequence[NDArray[np.intp]], image: int
     ) -> list[tuple[Axis, int]]:
-        """Return the axes of a control, with the index of the value in an image."""
+        """Return the axes of a control, with the index of the value in an image.
+
+        Args:
+            control: the control.
+            indices: for each axis of the grid, the (n,) indices of the values of n
+                images.
+            image: index of the image among these.
+        """
         return [
             (axis, int(indices[axis_index][image]))
             for axis_index, axis in self._axes.values()
@@ -940,9 +1004,9 @@ class Points:
         They are cached where all parameters of the control are in the grid.
 
         Args:
-            control: which describes itself.
-            u: (d,) the configuration.
-            control_u: (k,) its coordinates of the control.
+            control: the control, with a `describe` of its own.
+            u: (d,) the full configuration.
+            control_u: (k,) the coordinates of the control in `u`.
             axis_points: the axes of the control, with the index of the value of each.
         """
         key = (control.name, *(index for _, index in axis_points))
@@ -971,13 +1035,13 @@ class Points:
     ) -> Iterator[tuple[str, str, list[Any]]]:
         """Yield name, unit and values (n,) of each parameter of a control.
 
-        The values are those of `describe` of each configuration, but all n
-        configurations are converted at once.
+        The values are the same that `Control.describe` returns for each configuration,
+        but all n configurations are converted at once.
 
         Args:
-            control: which describes itself as `Control` does.
-            coordinates: (n, k) of the control.
-            indices: indices from `_axis_indices`.
+            control: a control that does not override `Control.describe`.
+            coordinates: (n, k) coordinates of the control.
+            indices: for each axis of the grid, the (n,) indices of the values.
         """
         begin = 0
         for group in control.groups:

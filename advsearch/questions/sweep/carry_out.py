@@ -130,8 +130,8 @@ def sweep(
         scene: scene from `load_scene`, or what that takes; or several. None takes that
             of `adversarial_of`.
         model: model from `load_model`, or what that takes; or several, which are shown
-            the same pictures. None takes that of `adversarial_of`, and the reference
-            model without.
+            the same pictures. None takes that of `adversarial_of`; without an attack it
+            takes the reference model.
         task: what judges the models' outputs: a name, a mapping with a `name` and
             options, an instance, or a function (output, truth) that says how wrong it
             is, over 0 where it is wrong (docs/tasks.md).
@@ -139,16 +139,17 @@ def sweep(
         samples: draws of `controls` at each point of the grid; by default 1, or 100
             without a grid.
         controls: what is drawn by chance, as for `attack`.
-        adversarial_of: an attack that was kept, or its folder, whose adversarial scene
-            is swept beside the clean scene, under the same draws; `summary.beside`
-            compares the two. Where neither `grid` nor `controls` is given, what the
-            attack was over varies.
+        adversarial_of: an attack that was kept, or its folder. Its adversarial scene
+            is swept besides the clean scene, under the same draws; `summary.beside`
+            compares the two. If neither `grid` nor `controls` is passed, the conditions
+            over which the attack was made robust (its `over`) vary.
         metrics: columns of the rows, by name: functions of (image (H, W, 3) sRGB in [0,
             1], output of that picture, truth: the index of the right class) that return
             a number or a dict. `workers` need functions of a module.
-        tracker: makes, for each drive, what is called with boxes (n, 4) of a frame, x0,
-            y0, x1, y1 in pixels, and their scores (n,), and returns the tracks in it: a
-            number and a box each (docs/drives.md). None takes
+        tracker: called without arguments for each drive; returns a function that is
+            called once a frame with the detected boxes (n, 4), x0, y0, x1, y1 in
+            pixels, and their scores (n,). This function returns the tracks in the
+            frame, each as a number and a box (docs/drives.md). None takes
             `advsearch.questions.sweep.tracks.ConstantVelocity`.
         run: folder to keep the run in; None keeps it in memory, which then grows with
             every configuration.
@@ -158,7 +159,7 @@ def sweep(
             "grid: expected a mapping from parameters to values, got "
             f"{type(grid).__name__}"
         )
-    # What the caller does not pass is as in the attack, if there is one.
+    # Settings that the caller does not pass are taken from the attack, if there is one.
     attack_run = _find_attack_run(adversarial_of)
     defaults = _load_defaults(attack_run, scene, grid, controls)
     scenes = _as_list(defaults["object"] if scene is None else scene)
@@ -263,6 +264,13 @@ def _load_defaults(
 ) -> dict[str, Any]:
     """Return the settings that a sweep takes from the run of an attack.
 
+    Args:
+        attack_run: the run directory of the attack; None without one.
+        scene: the scene that the caller passed, or None. If there is one, the settings
+            of the attack's scene are left out.
+        grid: the grid that the caller passed, or None.
+        controls: the controls that the caller passed.
+
     Raises:
         InputError: there is neither a scene nor a run.
     """
@@ -285,10 +293,13 @@ def _load_defaults(
 
 
 def _name_loaded(scenes: Sequence[Any]) -> tuple[NamedScene, ...]:
-    """Return the scenes that are loaded: all of them or none.
+    """Return the scenes that the caller has loaded: all of them, or none.
+
+    Args:
+        scenes: scenes as the caller passed them: `Scene`s, or names of objects.
 
     Raises:
-        InputError: there are some of each.
+        InputError: some are loaded, and others are names.
     """
     loaded = tuple(
         NamedScene(
@@ -315,6 +326,7 @@ def _describe_scenes(
         loaded: the loaded ones: all of them or none.
     """
     if not loaded:
+        # A name may itself be a list with commas, as in a YAML file.
         names = [
             ",".join(split_names(scene)) if isinstance(scene, str) else str(scene)
             for scene in scenes
@@ -341,6 +353,14 @@ def _find_python_only(
     """Return what exists in this session only, so that no command can repeat it.
 
     That may be models, the scene, the task, metrics, the tracker and controls.
+
+    Args:
+        config: the settings.
+        models: models as the caller passed them; a name or a file can be loaded again.
+        scenes: scenes that the caller has loaded.
+        task: task as the caller passed it.
+        tracker: makes the tracker of a drive; None for the default one.
+        controls: controls as the caller passed them.
     """
     parts = [
         PythonOnly("model", get_model_name(model))
@@ -404,7 +424,12 @@ def _run_config(
     Args:
         config: the settings.
         scenes: loaded scenes; empty to load the ones that the settings name.
-        models: models as the caller passed them; so are all others.
+        models: models as the caller passed them.
+        task: task as the caller passed it, or a name.
+        controls: the controls that are sampled.
+        metrics: functions or their names, by the name of the metric.
+        tracker: makes the tracker of a drive; None takes the default one.
+        progress: reports the progress.
     """
     resumed = _find_resumable(config)
     # The directory of a new run is created before the work. It is None without one.
@@ -433,7 +458,7 @@ def _run_config(
 def _find_resumable(config: SweepConfig) -> Path | None:
     """Return the directory of a sweep of the same settings that was stopped.
 
-    None if there is no such sweep.
+    None if there is no such sweep, or if `overwrite` requests a new one.
     """
     if config.run is None:
         return None
@@ -454,7 +479,9 @@ def sweep_from_config(
     progress: Progress | None = None,
     resumed: Path | None = None,
 ) -> SweepResult:
-    """Run the sweep that a configuration describes, in its run directory; see `sweep`.
+    """Run the sweep that a configuration describes, in its run directory.
+
+    This is what the command `advsearch sweep` calls; `sweep` is the Python form.
 
     Args:
         config: the settings.
@@ -504,7 +531,7 @@ def _add_adversarial_arm(
     fixed_controls = make_configured_controls(attack_config, attack_config.controls)
     _check_not_varied(fixed_controls, sampled, axes, directory)
     u = torch.from_numpy(read_configuration(directory))
-    arm = directory.resolve().name
+    arm = directory.resolve().name  # the arm is named after the run of the attack
     if arm == CLEAN:
         arm = f"{arm}'s"  # the two arms need different names
     clean = [
@@ -694,6 +721,15 @@ def _load_models_and_tasks(
 ) -> tuple[tuple[Model, ...], tuple[Task, ...], list[str]]:
     """Load the models, and make a task for each.
 
+    Each model has a task of its own, since a task may depend on the model's classes and
+    be calibrated with its outputs.
+
+    Args:
+        config: the settings.
+        named_scenes: all scenes of the sweep, on which tasks are calibrated.
+        models: names, files or modules.
+        task: task of all models.
+
     Returns:
         The models, the tasks, and remarks on both.
     """
@@ -730,7 +766,15 @@ def _find_scene_notes(
     controls: Sequence[Control],
     axes: Sequence[Axis],
 ) -> list[str]:
-    """Return the notes on the scenes, with the environments that controls choose."""
+    """Return the notes on the scenes, such as what an importer could not read.
+
+    A control may choose among environments; the notes on these are included.
+
+    Args:
+        named_scenes: all scenes of the sweep.
+        controls: controls that are sampled.
+        axes: axes of the grid.
+    """
     notes = list[str]()
     for named_scene in named_scenes:
         description = named_scene.scene.description
@@ -757,7 +801,9 @@ def load_scenes(config: SweepConfig) -> tuple[NamedScene, ...]:
 def _load_named_scenes(config: SweepConfig) -> list[NamedScene]:
     """Load the scenes of a configuration, each in its first photograph, if any.
 
-    See `load_scenes` for which these are.
+    They are every object in every environment. Without the setting `environment`, each
+    object has the environment of its own scene. A scene that a Python caller passed is
+    the only one.
     """
     session_scene: Scene | None = config.python_object(naming.SCENE, config.object)
     if session_scene is not None:  # passed by a Python caller
@@ -796,6 +842,10 @@ def expand_photographs(
 
     Scenes without such a folder stay as they are. So do all scenes if a control of the
     sweep or an axis of its grid chooses the photograph.
+
+    Args:
+        config: the settings, which name the controls and the axes.
+        scenes: the scenes, each in its first photograph.
     """
     control_names = [
         *config.controls,
@@ -839,7 +889,14 @@ def _check_different(names: Sequence[str]) -> None:
 def _run_in_directory(
     config: SweepConfig, job: Job, progress: Progress, resumed: Path | None
 ) -> SweepResult:
-    """Run a sweep in its run directory, or continue it in the one of before."""
+    """Run a sweep in its run directory, or continue one that was stopped.
+
+    Args:
+        config: the settings.
+        job: the loaded scenes, models and controls.
+        progress: reports the progress.
+        resumed: the run directory of the sweep to continue; None for a new one.
+    """
     with (
         RunDirectory.open(config, resumed) as run,
         open_executor(config, WORKER, progress) as executor,
@@ -848,6 +905,7 @@ def _run_in_directory(
             f"metric {name}": function for name, function in job.metrics.items()
         }
         functions["task"] = get_task_function(job.tasks[0])
+        # A sweep can only be continued with the same models and functions.
         check_digests(run, job.models, functions)
         return Sweep(job, run, progress, executor).execute()
 

@@ -75,8 +75,8 @@ MAX_LABELS_LENGTH = 50
 def figure_size(summary: SweepSummary) -> tuple[float, float] | None:
     """Return width and height of a sweep's figure in inches.
 
-    A map has room for the names of its values, with long ones below aslant. None if
-    there is neither a map nor a single axis.
+    A map is larger if the labels of its values are long; long labels below it are
+    rotated. None if there is neither a map nor a single axis to draw.
     """
     if not summary.cells:
         return (5.6, 3.6) if _only_axis(summary) else None
@@ -134,7 +134,13 @@ def _only_axis(summary: SweepSummary) -> Sequence[AxisRow]:
 
 
 def _draw_map(axes: Any, summary: SweepSummary, cells: SweepMap) -> None:
-    """Draw the map of a sweep on matplotlib axes."""
+    """Draw the map of a sweep: accuracy or mean margin over two axes.
+
+    Args:
+        axes: axes of matplotlib.
+        summary: summary of the sweep, for the title.
+        cells: the map.
+    """
     x_axis, y_axis = cells.axes
     # Cells are 1 wide and high, and their centers are whole numbers.
     extent = (-0.5, len(x_axis.values) - 0.5, -0.5, len(y_axis.values) - 0.5)
@@ -166,7 +172,13 @@ def _draw_map(axes: Any, summary: SweepSummary, cells: SweepMap) -> None:
 
 
 def _draw_accuracy(axes: Any, summary: SweepSummary, rows: Sequence[AxisRow]) -> None:
-    """Draw the accuracy at each value of an axis, with intervals."""
+    """Draw the accuracy at each value of an axis, with intervals.
+
+    Args:
+        axes: axes of matplotlib.
+        summary: summary of the sweep, for the title.
+        rows: values of the axis with their counts, at least one.
+    """
     values = [row.value for row in rows]
     # A single draw has no interval.
     intervals = [
@@ -273,7 +285,7 @@ SURFACE_COLUMNS: dict[str, Column] = {
 
 
 def make_sweep_view(summary: SweepSummary) -> ShownResult:
-    """Return the view of a sweep."""
+    """Return the view of a sweep: what a text, a page and a notebook show of it."""
     axes = _group_axes(summary)
     sections = [*_text_sections(summary, axes)]
     size = figure_size(summary)
@@ -287,6 +299,7 @@ def make_sweep_view(summary: SweepSummary) -> ShownResult:
         )
     sections += (replace(part, only="page") for part in _page_parts(summary, axes))
     run_images = f"{summary.run}/images"
+    # empty texts are left out
     has_drive_file = bool(summary.drives and summary.run)
     facts = {
         "worst": _worst_configuration(summary),
@@ -589,8 +602,9 @@ def make_sweep_claims(result: SweepSummary) -> Iterator[Claim]:
 def _describe_population(result: SweepSummary) -> tuple[str, str]:
     """Return what the rates of a sweep are over, and a caution about the interval.
 
-    A sweep has a grid, samples (then it has a `sampler`), or both; imported rows have
-    neither. Only independent random draws need no caution, which is empty then.
+    A sweep has a grid, samples (then its `sampler` is not None), or both; imported rows
+    have neither. The caution is empty for independent random draws alone, for which the
+    interval is right.
     """
     is_sampled = result.sampler is not None
     if not is_sampled and not result.grid:
@@ -749,7 +763,7 @@ def drive_rows(drive_rates: DriveRates) -> list[tuple[str, str, str, str]]:
     """
     tracks = drive_rates.tracks
     never = f", never in {drive_rates.never_seen}" if drive_rates.never_seen else ""
-    # name, values, unit and remark on the mean
+    # tuples of a name, the values, their unit, and a remark after the mean
     rates: list[tuple[str, OverDrives | None, str, str]] = [
         ("frames in which it is right", drive_rates.right, PERCENT, ""),
         (
@@ -800,6 +814,7 @@ def surface_sentences(surface: SurfaceMap) -> list[str]:
     """Return which cells of each surface go with wrong predictions, in a sentence."""
     sentences = []
     for table in surface.tables:
+        # The faces of a mesh may be counted, too; the sentence is about cells.
         if table.part != "cell":
             continue
         cells = format_count(table.compared, table.part)
@@ -901,8 +916,10 @@ def find_detection_distance(summary: SweepSummary) -> DetectionDistance | None:
 def compute_detection_distance(rows: Sequence[AxisRow]) -> DetectionDistance:
     """Compute the distance at which an object is first detected.
 
-    A line that falls with the distance is fitted to the fraction of right images; the
-    estimate is where it crosses one half. Binomial tests give its bounds.
+    A line that falls with the distance is fitted to the fractions of right images. The
+    estimate is where the line crosses one half. Its bounds come from binomial tests at
+    each distance. A dip is a distance with fewer right images than farther away, which
+    contradicts a falling line.
 
     Args:
         rows: counts by a distance, or by the bounds of a range of it.
@@ -957,9 +974,9 @@ def _bound_distance(
 ) -> tuple[float | None, float | None]:
     """Return the bounds of the detection distance; None if images do not bound it.
 
-    The lower one is the farthest distance at which significantly more than half of the
-    images are right, the upper one the nearest beyond it at which significantly fewer
-    are.
+    The lower bound is the farthest distance at which significantly more than half of
+    the images are right. The upper bound is the nearest distance beyond it at which
+    significantly fewer than half are.
 
     Args:
         distance: (m,) ascending.
@@ -969,7 +986,8 @@ def _bound_distance(
     """
     from scipy.special import bdtr, bdtrc  # takes a tenth of a second
 
-    # probabilities of at least k and of at most k right images, if half of them are
+    # Binomial tests: the probabilities of at least k and of at most k right images of n
+    # if each is right with probability one half.
     p_at_least = bdtrc(k - 1.0, n, HALF)
     p_at_most = bdtr(k * 1.0, n, HALF)
     is_above_half = p_at_least < significance
@@ -992,7 +1010,8 @@ def _find_crossing(
     crosses_half = falling[0] >= HALF > falling[-1]
     if not crosses_half:
         return None
-    # negated, since interp needs ascending abscissae
+    # Interpolate log(distance) as a function of the fraction. `interp` needs ascending
+    # abscissae, so that the falling fractions are negated.
     return float(np.exp(np.interp(-HALF, -falling, np.log(distance))))
 
 
@@ -1014,7 +1033,8 @@ def _count_loose(rows: Sequence[AxisRow]) -> tuple[int, ...]:
 def distance_sentence(estimate: DetectionDistance) -> str:
     """Return the detection distance as text: "Seen from 38 m, 31 to 44 m ...".
 
-    Dips, which contradict it, and loose boxes follow.
+    Sentences about dips (distances with fewer detections than farther away) and about
+    loose boxes follow.
     """
     unit = "m" if estimate.unit == "metres" else estimate.unit
     distance = None if estimate.distance is None else f"{estimate.distance:.3g}"
@@ -1065,7 +1085,14 @@ def _clause_beyond_dips(
 
 
 def _interval_clause(estimate: DetectionDistance, unit: str) -> str:
-    """Return the interval of the detection distance."""
+    """Return the interval of the detection distance as a clause.
+
+    An interval may have one bound only, or none if there are too few images.
+
+    Args:
+        estimate: estimate of the detection distance.
+        unit: unit of distances.
+    """
     low = None if estimate.lower is None else f"{estimate.lower:.3g}"
     high = None if estimate.upper is None else f"{estimate.upper:.3g}"
     if low and high:
@@ -1087,10 +1114,10 @@ def _interval_clause(estimate: DetectionDistance, unit: str) -> str:
 def _dips_sentences(estimate: DetectionDistance, unit: str) -> list[str]:
     """Return a sentence about dips, distances with fewer detections than farther away.
 
-    It lists all dips that are not chance. If all may be chance, it has the least likely
-    one that contradicts the estimate, if any. Such a dip has fewer than half of the
-    images right, and either the estimate says that the object is seen there, or at
-    least half of the images farther away are right.
+    It lists all significant dips. If none is significant, it has the dip with the
+    smallest p-value that contradicts the estimate, if any. A dip contradicts it if
+    fewer than half of its images are right, although the estimate says that the object
+    is seen there, or at least half of the images farther away are right.
 
     Args:
         estimate: estimate of the detection distance.
@@ -1134,9 +1161,10 @@ def _dip_clause(dip: Dip, unit: str) -> str:
 
 
 def _loose_sentence(estimate: DetectionDistance, unit: str) -> str:
-    """Return in how many images a loose box is on the object, by distance.
+    """Return in how many images only a loose box is on the object, by distance.
 
-    Empty if there is none.
+    A loose box overlaps the object, but too little to count as right. The text is empty
+    if there is none.
     """
     if not sum(estimate.loose_counts):
         return ""
@@ -1173,7 +1201,14 @@ def _add_loose_fractions(estimate: DetectionDistance) -> list[float]:
 
 
 def draw_detection_distance(estimate: DetectionDistance, axes: Any) -> None:
-    """Draw the fraction of detections over the distance on matplotlib axes."""
+    """Draw the fraction of detections over the distance.
+
+    A horizontal line marks one half, and a vertical one the detection distance.
+
+    Args:
+        estimate: estimate of the detection distance.
+        axes: axes of matplotlib.
+    """
     low, high = zip(*estimate.intervals, strict=True)
     axes.fill_between(
         estimate.distances,

@@ -60,9 +60,10 @@ def add_frames(
     """Return the controls and the grid of a sweep over the frames of a path.
 
     A control that travels along the path is added if there is none. The times of the
-    frames become the last axis of the grid, unless it has them already: from 0 to the
-    end of the path, `fps` a second, at least two. If there are several paths, all are
-    swept, unless a setting chooses among them or paths are sampled.
+    frames become the last axis of the grid, unless the grid has them already. They go
+    from 0 to the end of the path, with `fps` frames a second, at least two. If there
+    are several paths, they become an axis, too, unless a setting chooses among them or
+    they are sampled.
 
     Args:
         config: settings with a `path`.
@@ -77,7 +78,7 @@ def add_frames(
         sampled = (*sampled, travelling)
     time_name = f"{travelling.name}.time"
     path_name = f"{travelling.name}.{Control.PATH_PARAMETER}"
-    seconds = travelling.seconds
+    seconds = travelling.seconds  # from the first point of the path to its end
     grid = config.grid
     if time_name not in grid:
         # both ends have a frame
@@ -115,8 +116,9 @@ def find_time_axis(axes: Sequence[Axis]) -> int | None:
 def compute_distance_bounds(job: Job, axis: Axis) -> tuple[float, float] | None:
     """Return the nearest and the farthest distance that a drive of a sweep can have.
 
-    These are bounds from the plan: over all paths, also those that were not sampled,
-    all times of an axis, and all scenes.
+    The bounds do not depend on which drives were sampled: they are over all possible
+    paths, all times of the axis, and all scenes. So an interval of the mean distance
+    can use them.
 
     Args:
         job: the sweep.
@@ -163,11 +165,11 @@ class _CompleteDrives(NamedTuple):
 class Drives:
     """The frames of every drive of a sweep.
 
-    Private arrays have the axes (scenes, the other axes of the grid ..., samples,
-    models, frames), with frames in the order of their times: `_flags` and `_steps`, the
-    numbers of the rows. `_distance` has no axis for models, since all get the same
-    images. Further: `_path_of_step` and `_frame_of_step` have the name of the path and
-    the detected boxes of a row by its number.
+    The private arrays `_flags` (WRONG, RIGHT, ...) and `_steps` (numbers of the rows)
+    have the axes (scenes, the other axes of the grid ..., samples, models, frames),
+    with the frames in the order of their times. `_distance` has no axis for models,
+    since all get the same images. `_path_of_step` and `_frame_of_step` have the name of
+    the path and the detected boxes of a row, by the number of the row.
 
     Attributes:
         times: (frames,) of the frames, ascending, in seconds.
@@ -230,7 +232,8 @@ class Drives:
     ) -> None:
         """Fill the arrays of right predictions and of distances from rows.
 
-        Boxes, the name of the path and the unit of distances are kept, too.
+        Detected boxes, the names of paths and the unit of distances are stored in
+        attributes.
 
         Args:
             rows: rows of the sweep.
@@ -274,6 +277,10 @@ class Drives:
         """Select the drives in some scenes that have all their frames.
 
         Drives without the object in any frame are left out.
+
+        Args:
+            scenes: indices of the scenes.
+            model: index of the model whose predictions are selected.
         """
         n_frames = len(self.times)
         flags = self._flags[scenes][..., model, :].reshape(-1, n_frames)
@@ -321,9 +328,11 @@ class Drives:
         n_frames = len(self.times)
         first_distance = _first_right_distance(drives)
         drive_records = self._describe_drives(drives, first_distance)
+        # drives with any right frame: only these have a distance of first detection
         has_right = np.asarray((drives.flags == RIGHT).any(axis=1))
 
-        # Rows of one draw differ in noise alone: they are repeats of one drive.
+        # Rows of one draw differ in noise alone: they are repeats of one drive. All
+        # frames of a drive have the same draw, so that of the first one is looked up.
         first_images = drives.steps[:, 0] // len(self._job.models)
         drive = np.asarray(self._units.find_draw(first_images))  # (n,) its draw
         n_drives = len(np.unique(drive))
@@ -339,6 +348,8 @@ class Drives:
             repeats=math.ceil(len(drives.flags) / n_drives),
             frames=n_frames,
             seconds=self.seconds,
+            # `min` or `max` selects the worst drive: it has the fewest right frames,
+            # the longest gap, the smallest distance of the first detection.
             right=summarize_drives(
                 _right_fraction(drives.flags), min, drive_of_value=drive
             ),
@@ -396,6 +407,7 @@ class Drives:
         """Return how often each drive (n,) changes between right and wrong a second."""
         is_right = flags == RIGHT
         is_visible = flags != HIDDEN
+        # A frame without the object is no change: neither into it nor out of it.
         both_visible = is_visible[:, 1:] & is_visible[:, :-1]
         is_change = (is_right[:, 1:] != is_right[:, :-1]) & both_visible
         return np.asarray(is_change.sum(axis=1) / self.seconds)
@@ -418,7 +430,7 @@ class Drives:
     def _compute_track_rates(
         self, model: int, steps: npt.NDArray[np.int64], drive: npt.NDArray[np.int64]
     ) -> TrackRates | None:
-        """Compute what a tracker makes of the boxes of drives.
+        """Compute how well a tracker follows the object, from the boxes of a detector.
 
         A frame is lost if the object is visible and no track is on it. A lost frame
         counts as loose if some track overlaps the object, but too little.
@@ -513,7 +525,8 @@ def _compute_lost_loosely(
 
 def find_longest_run(flags: npt.NDArray[np.bool_]) -> int:
     """Return the length of the longest run of true flags (n,); 0 if none is true."""
-    # 0 at both ends: a run may begin with the first flag or end with the last.
+    # A 0 is added at both ends, since a run may begin with the first flag or end with
+    # the last.
     changes = np.diff(np.concatenate([[0], flags.astype(np.int8), [0]]))
     bounds = np.flatnonzero(changes)  # begin and end of each run, alternating
     return int((bounds[1::2] - bounds[::2]).max(initial=0))

@@ -197,6 +197,7 @@ class Job:
                     for model, model_size in enumerate(self.image_sizes)
                     if model_size == size
                 ]
+        # The loop above is by size; rows are by image, then by model.
         queries.sort(key=lambda query: query.index)
         return [(str(scene), None, query) for query in queries]
 
@@ -288,7 +289,8 @@ class Job:
         space = make_space(controls, description)
         if named_scene.fixed_controls:
             space = _fix_controls(named_scene, space)
-        # without the environment, which `check_scenes` has checked
+        # What the user fixed with `set` must not be sampled. The environment is left
+        # out here: `check_scenes` has checked it.
         set_by_user = named_scene.scene.description.requested - {ENVIRONMENT}
         for group in space.groups:
             if group.setting in set_by_user:
@@ -343,6 +345,7 @@ def _fix_controls(named_scene: NamedScene, space: Space) -> Space:
     Raises:
         InputError: the adversarial configuration does not fit the scene.
     """
+    # bound to the scene, unlike `named_scene.fixed_controls`
     fixed_controls = space.controls[: len(named_scene.fixed_controls)]
     start = torch.cat([control.start for control in fixed_controls])
     if named_scene.u is None:
@@ -365,6 +368,11 @@ def check_scenes(
     axes: Sequence[Axis],
 ) -> None:
     """Check that nothing varies that is fixed or chosen elsewhere.
+
+    Args:
+        named_scenes: all scenes of the sweep.
+        controls: controls that are sampled.
+        axes: axes of the grid.
 
     Raises:
         InputError: an axis varies what `set` fixes, or an axis or a control chooses the
@@ -419,8 +427,9 @@ def check_job(job: Job) -> tuple[Points, tuple[SampledNumber, ...]]:
     """Bind every scene once, so that errors come before anything is rendered.
 
     Returns:
-        The points of the first scene, and the sampled numbers that tables show: as
-        fractions of the range where it differs between scenes or sizes of image.
+        The points of the first scene, and the sampled numbers that tables show. If the
+        range of a number differs between scenes or image sizes, its parts are fractions
+        of the range instead of values.
 
     Raises:
         InputError: controls sample other numbers in one scene than in another.
@@ -486,6 +495,7 @@ class SweptScene:
     """
 
     def __init__(self, job: Job, number: int) -> None:
+        """Make renderers, problems and predictors of the scene with this number."""
         self.number = number
         self.job = job
         self.points_of_size = job.load_points(number)
@@ -553,9 +563,9 @@ class SweptScene:
     ) -> list[Evaluation]:
         """Evaluate queries of neighbouring rows.
 
-        An image is made once for each size, and a model gets all of its images at once.
-        The last evaluation also has what concerns the batch: what predicted its images,
-        and how many values were not finite.
+        An image is made once for each size, and a model gets all images of the batch
+        together. The last evaluation also has the facts about the full batch: what
+        predicted its images, and how many values were not finite.
 
         Args:
             queries: queries of this scene.
@@ -574,11 +584,12 @@ class SweptScene:
             for row_number, judgement in judgements.items()
             if not judgement.right
         }
+        # Queries are evaluated together: each states an equal part of the time.
         seconds = (time.perf_counter() - begin) / len(queries)
         evaluations = self._make_evaluations(
             queries, images, judgements, seconds, wrong_images
         )
-        # what concerns the batch
+        # What concerns the full batch stands in its last evaluation alone.
         evaluations[-1] = replace(
             evaluations[-1],
             light=[
@@ -632,7 +643,7 @@ class SweptScene:
     ) -> dict[int, Judgement]:
         """Return the judgements of all queries by their numbers.
 
-        Queries are numbered by image, then by model.
+        The number of a query is image * models + model.
 
         Args:
             queries: queries of all models.
@@ -861,10 +872,11 @@ def verify_worst(
 ) -> WorstVerified | None:
     """Render the worst configuration again, and count wrong predictions.
 
-    The samples per pixel are chosen first, from a ladder of counts: the smallest from
-    which on more samples leave the sign of the margin. Then they have converged, as
-    they have if the ladder has one count only, which the settings give. Renders that
-    the run has stored are not made again.
+    The samples per pixel are chosen first, from an ascending list of counts (the
+    ladder): the smallest count from which on more samples no longer change the sign of
+    the margin. Then the count has converged. A ladder of a single count, which the
+    settings state, always counts as converged. Renders that the run has stored are not
+    made again.
 
     Args:
         problem: problem of its scene and model.

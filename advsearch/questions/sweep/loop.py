@@ -124,6 +124,7 @@ class Sweep:
         progress: Progress,
         executor: Workers | None = None,
     ) -> None:
+        """Check the job and store what readers of the rows need; see the class."""
         self.job = job
         self.run = run
         self.stages = Stages(progress)
@@ -185,6 +186,8 @@ class Sweep:
                     missing = [range(first, self.n_rows)]
                 else:
                     missing = self._find_missing()
+                # If no row is missing, the last scene is loaded: the worst row is
+                # still verified, and the formation described.
                 first_row = missing[0].start if missing else self.n_rows - 1
                 # loaded here, so that its time counts for the stage "setup"
                 self._scenes.load(self._scene_of(first_row))
@@ -260,13 +263,15 @@ class Sweep:
             for query, evaluation in evaluated:
                 predictions.add(query.index, evaluation.required_judgement)
             self._report(len(queries), predictions)
+        # Workers may finish batches in any order.
         self.journal.rows.sort(key=lambda row: row.step)
 
     def _sweep_hint(self) -> str:
         """Return what the progress says of the work ahead.
 
-        That is the number of predictions, and how large the stored thumbnails are,
-        about: the size of a typical one, scaled by the pixels that they have.
+        That is the number of predictions, and about how much disk space the stored
+        thumbnails will take: the bytes of a typical one, scaled by the number of
+        pixels.
         """
         hint = (
             f"{self.n_rows} predictions, pictures of "
@@ -346,7 +351,12 @@ class Sweep:
             image = scene_end
 
     def _report(self, n_rows: int, predictions: Predictions) -> None:
-        """Report progress by some rows, at most every `REPORT_SECONDS`."""
+        """Report progress by some rows, at most every `REPORT_SECONDS`.
+
+        Args:
+            n_rows: rows that were evaluated since the last call.
+            predictions: predictions so far, of which the accuracy is reported.
+        """
         self._n_unreported += n_rows
         now = time.monotonic()
         if now - self._last_report < REPORT_SECONDS:
@@ -400,9 +410,9 @@ class Sweep:
     def _make_axes(self, rows: npt.NDArray[np.int64]) -> list[TableAxis]:
         """Return the axes by whose values tables count predictions.
 
-        These are object, environment, photograph, adversarial scene, model, the axes of
-        the grid and the parts of sampled numbers; of all these, those that have several
-        values.
+        These are object, environment, photograph, clean or adversarial scene, model,
+        the axes of the grid, and the sampled numbers, whose ranges are cut into parts.
+        What has a single value in this sweep is left out.
 
         Args:
             rows: (n,) numbers of the rows, ascending, whose values are looked up.
@@ -432,7 +442,11 @@ class Sweep:
         return [axis for axis in axes if len(axis.values) > 1]
 
     def _scene_axes(self, scene: npt.NDArray[np.int64]) -> Iterator[TableAxis]:
-        """Yield the axes over scenes; `scene` (n,) has the scene of each row."""
+        """Yield the axes over scenes: object, environment, photograph, arm.
+
+        Args:
+            scene: (n,) index of the scene of each row.
+        """
         for name in ("object", "environment", "backdrop", "answer"):
             scene_values = [
                 named_scene.names.get(name, "") for named_scene in self.job.scenes
@@ -461,8 +475,8 @@ class Sweep:
     def _find_parts(self, images: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
         """Return the part of each of k sampled numbers that images lie in, (n, k).
 
-        The parts of all images up to the last one are computed, in batches, since draws
-        follow from the number of the image.
+        The parts of all images up to the last one are computed, in batches: a draw
+        follows from the number of its image, and neighbouring ones are drawn together.
 
         Args:
             images: (n,) their numbers in the sweep, ascending, at least one.
@@ -481,8 +495,8 @@ class Sweep:
     ) -> WorstConfiguration | None:
         """Return the configuration with the smallest margin; None if there is none.
 
-        Its row has the margin; values, seed and right labels come from the query, which
-        is made again.
+        The stored row of the configuration has the margin. Values, seed and right
+        labels come from the query, which follows from the number of the row.
 
         Args:
             predictions: predictions of all rows.
@@ -553,7 +567,13 @@ class Sweep:
     def _finish(
         self, predictions: Predictions, ending: str, worst: WorstConfiguration | None
     ) -> SweepResult:
-        """Summarize the sweep, write its files, and return the result."""
+        """Summarize the sweep, write its files, and return the result.
+
+        Args:
+            predictions: predictions of all rows so far.
+            ending: how the sweep ended, such as "finished".
+            worst: the configuration with the smallest margin; None without one.
+        """
         summary = self._summarize(predictions, ending, worst)
         if self.run is not None:
             for suffix, data in draw_sweep(summary).items():
@@ -653,7 +673,11 @@ class Sweep:
         return self.points.environment or self.job.config.environment_name
 
     def _find_twins(self) -> TwinEvidence | None:
-        """Return how far verdicts hold for photographs, by a run of twins, if any."""
+        """Return how far results on renders hold for photographs.
+
+        The evidence is a run that compared renders with photographs of the same scenes
+        (setting `twins`). None without such a run.
+        """
         config = self.job.config
         return find_twin_evidence(
             config.twins,
@@ -667,9 +691,9 @@ class Sweep:
     def _describe_formation(self) -> tuple[Formation | None, dict[str, float]]:
         """Return how images are formed, and the gain of each scene by its names.
 
-        The formation states a gain if all scenes have the same. Of more than
-        `MAX_LISTED_GAINS` scenes there are no gains. Without a loaded scene, nothing is
-        known of either.
+        The gain is the factor of exposure on linear pixel values. The formation states
+        it if all scenes have the same. With more than `MAX_LISTED_GAINS` scenes, no
+        gains are returned. If no scene was loaded, the formation is None.
         """
         gains: dict[str, float] = {}
         if self._scenes.scene is None:
@@ -711,7 +735,8 @@ class Sweep:
         transport = [
             summary for summaries in self._transport.values() for summary in summaries
         ]
-        # A continued sweep may have no batch to evaluate: then the loaded scene is told.
+        # A continued sweep may have no batch left to evaluate: then the predictors of
+        # the loaded scene say what they would do.
         if not self._transport and self._scenes.scene is not None:
             predictors = self._scenes.scene.predictor_of_size.values()
             transport = [predictor.summarize() for predictor in predictors]
@@ -752,7 +777,7 @@ class Sweep:
     ) -> ChangeRates:
         """Return how often the predictions of a model are as claimed.
 
-        Its `row` is the first row in which the prediction is not as claimed.
+        The returned `row` is the first row in which the prediction is not as claimed.
 
         Args:
             value_of_row: the claim's metric by the number of the row, 1 where it holds.
@@ -782,7 +807,13 @@ class Sweep:
         verified: WorstVerified | None,
         changes: Sequence[ChangeRates],
     ) -> Iterator[str]:
-        """Yield sentences about what limits the result, and what stands out in it."""
+        """Yield sentences about what limits the result, and what stands out in it.
+
+        Args:
+            predictions: predictions of all rows so far.
+            verified: trials of the worst configuration; None without them.
+            changes: how often predictions about changed images are as claimed.
+        """
         yield from make_lost_remarks(self._n_lost)
         yield from self.journal.remarks
         if self.units.noise > 1 and self.units.photographs == 1:
@@ -801,7 +832,8 @@ class Sweep:
             )
         for rates in changes:
             upper_bound = rates.interval[1] if rates.interval is not None else 1.0
-            # all predictions should change, and surely less than half of them do
+            # All predictions should change when the object is hidden. If the 95 %
+            # interval lies below one half, most of them do not.
             is_blind = rates.claim == "must_change" and upper_bound < 0.5
             if is_blind:
                 n_same = rates.configurations - rates.correct
@@ -812,7 +844,11 @@ class Sweep:
                 )
 
     def _drive_remarks(self) -> Iterator[str]:
-        """Yield what few drives can show at best."""
+        """Yield what few drives can show at best.
+
+        The sentence states the lower bound of the accuracy that so few drives would
+        have even if every frame were right.
+        """
         # drives of the model that has the fewest; without any drives nothing is yielded
         n_drives = min(
             (rates.drives for rates in self._drives or ()), default=ENOUGH_DRIVES
@@ -830,7 +866,7 @@ class Sweep:
             )
 
     def _prediction_remarks(self, predictions: Predictions) -> Iterator[str]:
-        """Yield which predictions do not count, or not as right."""
+        """Yield sentences about predictions that do not count, or not as right."""
         n_hidden = int(predictions.is_hidden.sum())
         if n_hidden:
             images = format_count(int(predictions.is_known.sum()), "picture")

@@ -148,6 +148,8 @@ def make_sweep_page(
     explorer = make_element("div", id="explorer", hidden="hidden")
     if not explored:
         explorer = _too_many_rows_html(runs)
+    # An address of rows or images is fetched by the page's script, which the security
+    # policy of the page has to allow.
     needs_connection = any(
         isinstance(source.rows, str) or source.thumbnail_address for source in sources
     )
@@ -205,6 +207,10 @@ def _describe_images(
     They are in a folder beside the page, or embedded in it. A page embeds only as many
     as fit.
 
+    Args:
+        source: where the page gets its rows and images.
+        thumbnails: the thumbnails of the sweep.
+
     Returns:
         The description; and a note if some are left out, else None.
     """
@@ -246,9 +252,13 @@ def _describe_for_explorer(run: Path, summary: SweepSummary | None) -> JsonObjec
     """Return what the page's explorer of rows has to know of a sweep.
 
     That is the task, the axes of the grid, and height and width of the evaluated images
-    in pixels, in which boxes are. With several models there is no size, since they may
-    differ in it. A sweep without a summary yet has the task only, as far as its
+    in pixels, which are the units of boxes. With several models there is no size, since
+    they may differ in it. A sweep without a summary yet has the task only, if its
     settings can be read.
+
+    Args:
+        run: the run directory.
+        summary: summary of the sweep; None without one.
     """
     if summary is None:
         with suppress(AdvsearchError):
@@ -338,8 +348,8 @@ def verdict_text(summary: SweepSummary) -> str:
 def _still_html(path: Path, summary: SweepSummary) -> Html:
     """Return what a page without a script shows in the explorer's place.
 
-    These are the figure of the accuracy (of the margin where no cell has two
-    configurations) and the worst image, as far as the run has them.
+    These are the figure of the accuracy and the worst image, if the run has them. If no
+    cell of the map has two configurations, the figure shows the margin instead.
 
     Args:
         path: the run directory.

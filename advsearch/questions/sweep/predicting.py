@@ -1,10 +1,11 @@
 """Predictors of the images of a sweep.
 
-Each serves a *group* of images that have the rest in common, and follows from the group
-alone, so that a sweep that was stopped goes on with the same. Some images are traced
-for comparison; where predicted ones deviate too much, the group is rendered. Where
-light alone differs, images are combined from basis images (docs/transport.md); where
-the camera alone differs, from light on surfaces (docs/surface-light.md).
+A predictor serves a *group*: images of a sweep that differ in one respect only. Where
+they differ in light alone, they are combined from basis images (docs/transport.md);
+where they differ in the camera alone, they are made from light on surfaces
+(docs/surface-light.md). Some images are traced for comparison; where predicted ones
+deviate too much, the group is rendered. A predictor follows from its group alone, so
+that a sweep that was stopped continues with the same one.
 """
 
 from __future__ import annotations
@@ -97,6 +98,7 @@ class Groups:
         is_sampled: bool,
         frames: int | None = None,
     ) -> None:
+        """Split the axes into those within and those between groups; see the class."""
         self.grid = grid
         self.samples = samples
         # Samples are like one more axis, the last and fastest.
@@ -118,8 +120,10 @@ class Groups:
     def _count_cached_groups(self) -> int:
         """Return how many groups alternate when images come in order.
 
-        The last axis is the fastest. Groups along an axis between them alternate if it
-        comes after an axis within groups.
+        The last axis is the fastest. If an axis between groups comes after an axis
+        within groups, the sweep visits all groups along it, and then comes back to the
+        first one. Example: with axes (light 10, pose 3), where images of a group differ
+        in light, 3 groups alternate; with (pose 3, light 10) it is 1.
         """
         n_groups = 1
         was_axis_within = False
@@ -195,8 +199,8 @@ class BasisPictures:
     def find_refusal(self, make_groups: MakeGroups, spp: int) -> Refusal | None:
         """Return why images are rendered; None if they are predicted.
 
-        They are predicted if that takes at most 1 / `MIN_SAVING_FACTOR` of the samples
-        of rendering a group, and the basis images fit into memory.
+        Images are predicted if that takes at most 1 / `MIN_SAVING_FACTOR` of the
+        samples that rendering a group takes, and if the basis images fit into memory.
 
         Args:
             make_groups: makes the groups.
@@ -206,9 +210,11 @@ class BasisPictures:
         groups = make_groups(self.follows)
         if renderer.formation.denoiser != "oidn":
             return NOISE
+        # The number of lights is the same in all configurations: take the first one.
         inputs = renderer.scene.assembly(renderer.space.inputs(renderer.start))
         n_lights = len(LightBasis(renderer, self._lighting, inputs).inputs_of_light)
-        # a basis image for each light, and `N_VIEWS` comparisons with traced images
+        # A basis image for each light, and `N_VIEWS` comparisons with traced images.
+        # For each, two halves are traced to estimate the noise, and one as images are.
         basis_samples = n_lights * COLLECTED_SPP
         prediction_samples = basis_samples + N_VIEWS * (2 * CHECK_SPP + spp)
         min_images = math.ceil(MIN_SAVING_FACTOR * prediction_samples / spp)
@@ -218,7 +224,7 @@ class BasisPictures:
                 f"light alone; here {groups.group_size} do"
             )
         height, width = renderer.formation.resolution
-        # 8 bytes for each pixel of a basis image
+        # about 8 bytes for each pixel of a basis image
         n_bytes = groups.n_cached_groups * n_lights * 8 * height * width
         if n_bytes > scale_limit(MAX_BYTES):
             return Refusal(
@@ -288,6 +294,12 @@ class LightOnSurfaces:
     samples = RAYS_PER_PIXEL
 
     def __init__(self, renderer: Renderer, seed: int) -> None:
+        """Find the groups of coordinates that move nothing but the camera.
+
+        Args:
+            renderer: renderer of the images.
+            seed: seed from which the rays of all arrangements follow.
+        """
         self._renderer = renderer
         self._seed = seeds.stream(seed, "surface light")
         self._arrangements: list[SurfaceRenderer] = []
@@ -356,8 +368,9 @@ class LightOnSurfaces:
     def make_predictor(self, u: Tensor, seed: int) -> Predictor:
         """Return the predictor of the images of a group.
 
-        It uses a cached arrangement that fits. Else a new one is made and cached, for
-        which the oldest is released if there are too many.
+        An arrangement that stores what surfaces see of each other is reused if object
+        and surroundings stand the same. Else a new one is made and cached; if there are
+        too many, the oldest is released.
 
         Args:
             u: (d,) configuration of one of them.
@@ -441,8 +454,8 @@ class SweepPredictor:
 
         Returns:
             The cheapest method that pays here, and None. If none pays, a method that is
-            not used, and why not. Something that varies may be what this method could
-            predict, so that its reason concerns the user; else it is the last method.
+            not used, and why not: the first one that could follow something that
+            varies, since its reason tells the user what to change; else the last one.
         """
         refused: list[tuple[BasisPictures | LightOnSurfaces, Refusal]] = []
         for method_type in (BasisPictures, LightOnSurfaces):  # cheapest first
@@ -528,10 +541,11 @@ class SweepPredictor:
     def _load_predictor(self, group: int, number: int) -> Predictor | None:
         """Return the predictor of a group; None if its images are rendered.
 
-        A new one is compared with traced images first, and not used where it deviates
-        too much. It depends on the index of its group alone, not on the image that asks
-        for it, so that a sweep that was stopped continues with the same predictors. If
-        too many are cached, the oldest is released.
+        A new predictor is compared with traced images first. If it deviates too much,
+        the images of its group are rendered. A predictor depends on the index of its
+        group alone, not on the image that needs it first, so that a sweep that was
+        stopped continues with the same predictors. If too many are cached, the oldest
+        is released.
 
         Args:
             group: index of the group.
@@ -544,6 +558,7 @@ class SweepPredictor:
             self._predictors.pop(oldest)
         begin = time.perf_counter()
         seed = seeds.stream(self.seed, "light", self.images_before + group)
+        # Always from member 0 of the group, whichever of its images comes first.
         predictor = self.method.make_predictor(self._configuration(number, 0), seed)
         deviation = self._compare(predictor, number, seed)
         self.deviations.append(deviation)
@@ -557,7 +572,8 @@ class SweepPredictor:
     def _compare(self, predictor: Predictor, number: int, seed: int) -> Deviation:
         """Compare predicted images of a group with traced ones.
 
-        The images and the noise of the traced ones follow from `seed`.
+        The compared images are random members of the group. They and the noise of the
+        traced images follow from `seed`.
 
         Args:
             predictor: predictor of the group.
@@ -602,9 +618,10 @@ class SweepPredictor:
         )
 
     def summarize(self) -> LinearTransport | None:
-        """Return what a result holds of the predictions.
+        """Return what a result states about predicted images.
 
-        None if nothing moves that any method follows.
+        It is their worst deviation, the memory and the time, or why images are
+        rendered. None if nothing varies that any method could predict.
         """
         if self.refusal is NOTHING_MOVES:
             return None
@@ -630,7 +647,7 @@ class SweepPredictor:
             used=True,
             way=self.method.name,
             reason=reason,
-            entries=0,
+            entries=0,  # of a matrix, which sweeps do not use
             bytes=self.method.bytes + predictor_bytes,
             seconds=self.seconds,
             renewed=0,
@@ -658,7 +675,7 @@ def combine_transport(
     reasons = [summary.reason for summary in used if summary.reason]
     errors = [summary.error for summary in used if summary.error]
     update = {
-        "reason": reasons[0] if reasons else None,
+        "reason": reasons[0] if reasons else None,  # as an example for all
         "bytes": max(summary.bytes or 0 for summary in used),
         "seconds": math.fsum(summary.seconds or 0.0 for summary in used),
         "error": max(errors, key=lambda error: error.levels or 0.0, default=None),
@@ -671,8 +688,9 @@ def prepare_surface_light(
 ) -> None:
     """Prepare light on surfaces for trials, if that is cheaper than rendering them.
 
-    The trials vary some numbers around a configuration. The verifier's findings then
-    have the light as `predictor`. If cameras move, but it is not used, they have the
+    The trials vary some numbers around a configuration. If light on surfaces can follow
+    these numbers, accurately enough and at less cost, the verifier's state has it as
+    `predictor`. If the camera moves, but the light is not used, the state has the
     reason as `predictor_refusal`.
 
     Args:
@@ -708,6 +726,7 @@ def prepare_surface_light(
         "transport", title, N_LIGHTS, hint="`specialise=false` leaves it out"
     )
     light = SurfaceLight(problem, 0, light_u=at, moving_coordinates=coordinates)
+    # `prepare` compares predicted images with traced ones, and may refuse.
     light.prepare(verifier.stages.progress.advance)
     findings.predictor_refusal = light.accuracy_refusal
     is_accurate = light.accuracy_refusal is None

@@ -65,13 +65,15 @@ def count_by_unit(
 ) -> CountedPredictions:
     """Count predictions, with their accuracy and its 95 % interval.
 
-    The accuracy is the mean over units of the fraction of right predictions in each.
-    One unit with several predictions has no interval.
+    The accuracy is the mean over units of the fraction of right predictions in each. A
+    single unit with several predictions gives no interval.
 
     Args:
         right: (n,) whether each prediction is right.
-        units: (n,) the unit of each; predictions of one are not independent.
-        outcome: (n,) indices among `OUTCOMES`; those of wrong predictions are counted.
+        units: (n,) the unit of each, such as the drive of a frame; predictions of one
+            unit are not independent.
+        outcome: (n,) kinds of outcome, such as a missed box, as indices among
+            `OUTCOMES`; those of wrong predictions are counted.
     """
     right = np.asarray(right)
     if not len(right):
@@ -144,19 +146,26 @@ class Predictions:
     """
 
     def __init__(self, n_rows: int) -> None:
+        """Make empty arrays for `n_rows` rows."""
         self.is_known: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
         self.is_right: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
         self.is_hidden: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
-        # apart from `is_right`: a prediction that is not a number is neither
+        # Not the inverse of `is_right`: a prediction whose margin is NaN is neither.
         self._wrong: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
         self.margin = np.full(n_rows, np.nan)
         self.outcome = np.full(n_rows, UNKNOWN_OUTCOME, np.uint8)
-        # of each row, the index of its label in the order of `_index_by_label`
+        # The label of each row, as its index in the order of `_index_by_label`: an
+        # integer takes less memory than a string.
         self._label_index = np.zeros(n_rows, np.uint32)
         self._index_by_label = dict[str, int]()
 
     def add(self, row: int, judgement: Judgement) -> None:
-        """Add the judgement of a row; one that was there before is replaced."""
+        """Add the judgement of a row; one that was there before is replaced.
+
+        Args:
+            row: number of the row.
+            judgement: what the task says of the prediction.
+        """
         label = judgement.prediction.label
         self.is_known[row] = True
         self.is_right[row] = judgement.right
@@ -210,7 +219,8 @@ class Predictions:
         """Compare the predictions without and with an adversarial configuration.
 
         The rows are two arms: the second half repeats the first with the adversarial
-        configuration. Pairs are counted only if both predictions are.
+        configuration. A pair is the same image in both arms. It is counted only if both
+        predictions are, that is if the object is visible in both.
 
         Args:
             models: names of the models.
@@ -255,7 +265,7 @@ def _compare_pairs(
     """
     clean, adversarial = right
     clean_outcome, adversarial_outcome = outcome
-    # without the p-value
+    # the p-value is not shown
     difference, interval, _ = compare_paired(clean, adversarial, draws)
     return PairedRates(
         model=model,
@@ -320,11 +330,11 @@ def make_map(
     right: npt.NDArray[np.bool_],
     margin: npt.NDArray[np.float64],
 ) -> SweepMap | None:
-    """Count predictions, and average margins, over every pair of values of two axes.
+    """Count predictions, and average margins, for every pair of values of two axes.
 
-    The two are the first axes of the grid. If it has fewer than two, axes outside of
-    the scene follow, such as the model, the last one first. If there are neither, they
-    are the first two sampled numbers.
+    The two axes are the first ones of the grid. If the grid has fewer than two, axes
+    outside of the scene, such as the model, take their place, the last one first. If
+    there are neither, they are the first two sampled numbers.
 
     Args:
         axes: all of the tables.
@@ -492,6 +502,8 @@ def import_threedb(
 def _summarize_threedb(rows: pd.DataFrame, run: Path, folder: Path) -> SweepSummary:
     """Return the summary of a sweep that 3DB made.
 
+    Fields that the log of 3DB says nothing about are None, 0 or empty.
+
     Args:
         rows: rows of the sweep.
         run: the run directory.
@@ -501,7 +513,8 @@ def _summarize_threedb(rows: pd.DataFrame, run: Path, folder: Path) -> SweepSumm
     tables = list[AxisRow]()
     for name in rows.attrs["units"]:
         values, indices = np.unique(rows[name].astype(object), return_inverse=True)
-        # A single value varies nothing; very many make no table.
+        # A parameter with a single value did not vary; one with very many would make
+        # an unreadable table.
         if 1 < len(values) <= MAX_LISTED_VALUES:
             axis = TableAxis(name, "", values.tolist(), indices)
             tables += axis.make_rows(right, rows["unit"])

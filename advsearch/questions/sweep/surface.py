@@ -74,6 +74,16 @@ class PartCounts:
         seed: int,
         permuted_failures: npt.NDArray[np.uint8] | None = None,
     ) -> None:
+        """Begin with counts of 0.
+
+        Args:
+            n_parts: parts of the surface.
+            n_images: images that will be added.
+            n_failures: those of them whose prediction is wrong.
+            seed: seed of the permutations.
+            permuted_failures: permutations from `permute_draws`, packed as bits; None
+                permutes single images while they are added.
+        """
         self.permuted_failures = permuted_failures
         self.n_images = n_images
         self.n_failures = n_failures
@@ -88,9 +98,9 @@ class PartCounts:
     def add(self, parts: Int64Array, failed: bool) -> None:
         """Count an image, and decide in which permutations it is a failure.
 
-        A permutation deals the failures out to the images anew: what it counts is what
-        could be counted if predictions had nothing to do with the parts. Images are
-        added in the order of `permuted_failures`, `n_images` in all.
+        A permutation deals the failures out to the images anew, at random: its counts
+        are what chance alone could give if predictions had nothing to do with the
+        parts. Images are added in the order of `permuted_failures`, `n_images` in all.
 
         Args:
             parts: indices of the parts that it shows, each once.
@@ -99,7 +109,7 @@ class PartCounts:
         self.visible_counts[parts] += 1
         self.wrong_counts[parts] += failed
         if self.permuted_failures is not None:
-            # given, as a bit for each permutation
+            # one bit for each permutation, in the column of this image
             image = self.n_images - self._images_left
             bits = np.unpackbits(self.permuted_failures[:, image], count=N_PERMUTATIONS)
             permuted_failure = bits.astype(bool)
@@ -145,7 +155,8 @@ def compare_parts(
     if is_compared.any():
         columns = _compute_comparison(counts, part_indices[is_compared])
         parts.loc[is_compared, list(nan_columns)] = columns
-    # above 0 if both bounds are on the same side of 0
+    # Positive if both bounds are on the same side of 0: then either `low` or `-high` is
+    # positive, and it is the distance from 0.
     nearer_bound = np.where(
         parts.low.isna(), parts.difference.abs(), np.maximum(parts.low, -parts.high)
     )
@@ -171,7 +182,7 @@ def _compute_comparison(counts: PartCounts, parts: Int64Array) -> Float64Array:
     difference, low, high = _newcombe(
         k, n, other_k=counts.n_failures - k, other_n=counts.n_images - n
     )
-    if counts.permuted_failures is not None:
+    if counts.permuted_failures is not None:  # images share draws
         low = np.full(len(n), np.nan)
         high = low
     p_value = _permutation_p_value(counts, k, n, parts)
@@ -183,8 +194,9 @@ def _permutation_p_value(
 ) -> Float64Array:
     """Compute how likely it is that any part stands out as far as each by chance.
 
-    That is the fraction of the permutations in which the largest statistic of all parts
-    reaches that of the part; the data themselves count as one more permutation.
+    The p-value of a part is the fraction of permutations in which the largest statistic
+    of all parts is at least the statistic of this part. The data themselves count as
+    one more permutation, so that p is never 0.
 
     Args:
         counts: counts with the permuted failures of all parts.
@@ -215,11 +227,18 @@ def _permutation_p_value(
 def _likelihood_ratio(
     k: Int64Array, n: Int64Array, n_failures: int, n_images: int
 ) -> Float64Array:
-    """Compute the likelihood ratio statistic of two failure rates against one.
+    """Compute the likelihood ratio statistic of two failure rates against one (G-test).
 
-    Twice the log of how much likelier k failures of n images, and the rest of the
-    failures in the other images, are with a rate each than with a common rate; at
-    least 0. The shapes of `k` and `n` are broadcast.
+    The images that show a part may have one failure rate, and the others another; or
+    all have the same. The statistic is 2 log(likelihood with two rates / likelihood
+    with one rate), at least 0. With the cells c, the row and column sums m and the
+    total N of the table of counts it is 2 (N log N + sum c log c - sum m log m).
+
+    Args:
+        k: failures among the images that show the part.
+        n: images that show the part; broadcast with `k`.
+        n_failures: failures in all.
+        n_images: images in all.
     """
     # the table of images by whether they show the part, and by whether they fail
     visible_failing = k
@@ -227,7 +246,7 @@ def _likelihood_ratio(
     hidden_failing = n_failures - k
     hidden_passing = n_images - n - n_failures + k
     cells = (visible_failing, visible_passing, hidden_failing, hidden_passing)
-    # its sums by row and by column
+    # the sums of the rows and of the columns of this table
     margins = (n, n_images - n, np.array(n_failures), np.array(n_images - n_failures))
     log_ratio = (
         xlogy(n_images, n_images)
@@ -242,8 +261,11 @@ def _newcombe(
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Compute the difference k/n - other_k/other_n with its 95 % interval.
 
-    Newcombe (1998), method 10, from the Wilson intervals of both rates. Returns the
-    difference and the bounds.
+    Newcombe (1998), method 10, from the Wilson intervals (l, u) of both rates p:
+    low = d - sqrt((p1 - l1)² + (u2 - p2)²), high = d + sqrt((u1 - p1)² + (p2 - l2)²).
+
+    Returns:
+        The difference d, and the lower and the upper bound.
     """
     rate_1 = k / n
     rate_2 = other_k / other_n
@@ -327,8 +349,8 @@ class SurfaceCounts:
     ) -> SurfaceTable:
         """Return how a model's predictions go with the parts of one kind.
 
-        `strongest` lists the most significant parts, none close to another: those that
-        go with wrong predictions, and then with right ones.
+        `strongest` of the table lists the most significant parts, no two close to each
+        other: first those that go with wrong predictions, then with right ones.
 
         Args:
             object_name: name of the object.
@@ -463,7 +485,7 @@ def _make_counts(
     for object_index, (name, asset) in enumerate(assets.items()):
         parts = SurfaceParts(asset.mesh)
         has_object = [named_scene.object == name for named_scene in job.scenes]
-        # each object and model has permutations of its own
+        # Each pair of an object and a model has a seed, so permutations, of its own.
         model_seeds = [
             seeds.stream(job.config.seed, "surface", object_index * n_models + model)
             for model in range(n_models)
@@ -537,6 +559,7 @@ def _count_scene(
                 len(batch),
                 before=scene * n_images,
             )
+            # at least `MIN_RAYS` rays along the shorter side of the image
             rays_per_pixel = ceil(MIN_RAYS / min(size))
             renderer = swept_scene.renderer_of_size[size]
             for number, u in zip(batch, configurations, strict=True):
@@ -548,16 +571,22 @@ def _count_scene(
 def _select_known(
     wrong: npt.NDArray[np.int8], models: Sequence[int]
 ) -> dict[int, bool]:
-    """Return which of some models are wrong, from (models,), if that is known."""
+    """Return whether each model is wrong, by its index, where that is known.
+
+    Args:
+        wrong: (all models,) 1, 0 or UNKNOWN.
+        models: indices of the models to select.
+    """
     return {model: bool(wrong[model]) for model in models if wrong[model] != UNKNOWN}
 
 
 def permute_draws(
     wrong: npt.NDArray[np.int8], draws: Int64Array, seed: int
 ) -> npt.NDArray[np.uint8] | None:
-    """Permute the predictions of whole draws among the draws, N_PERMUTATIONS times.
+    """Permute predictions among the draws, `N_PERMUTATIONS` times.
 
-    Images of one draw are not independent, so that they stay together.
+    Images of one draw are not independent. Therefore all predictions of a draw move
+    together to another draw.
 
     Args:
         wrong: (n,) whether each prediction is wrong, or UNKNOWN; every draw has as many
@@ -570,12 +599,12 @@ def permute_draws(
         `PartCounts` takes them; None if each image has a draw of its own.
     """
     is_known = wrong != UNKNOWN
-    draw_sizes = np.unique(draws, return_counts=True)[1]
+    draw_sizes = np.unique(draws, return_counts=True)[1]  # images of each draw
     n_draws = len(draw_sizes)
     if draw_sizes.max(initial=1) == 1:
         return None
     is_wrong = wrong == 1
-    # (draws, images of a draw)
+    # (draws, images of a draw): row k has the indices of the images of draw k
     images_of_draw = np.argsort(draws, kind="stable").reshape(n_draws, -1)
     generator = np.random.default_rng(seed)
     permuted = np.zeros((N_PERMUTATIONS, len(wrong)), bool)
@@ -802,7 +831,13 @@ class Panel(NamedTuple):
 
 
 def _render_views(asset: ObjectAsset, parts: SurfaceParts) -> Iterator[MapView]:
-    """Yield the object by itself from the cameras in `VIEW_ANGLES`."""
+    """Yield the views of the object by itself from the cameras in `VIEW_ANGLES`.
+
+    Args:
+        asset: the object.
+        parts: parts of its surface, whose cells the pixels of a view are looked up in.
+    """
+    # without a ground, which would hide the object from below
     scene_of_object = load_scene(asset, settings={"ground.size": 0.0})
     description = fit_camera(scene_of_object.description, VIEW_SIZE)
     scene = MitsubaScene(description, (VIEW_SIZE, VIEW_SIZE))
@@ -823,7 +858,9 @@ def _render_views(asset: ObjectAsset, parts: SurfaceParts) -> Iterator[MapView]:
 
 
 def _draw(panels: Sequence[Panel], figure: Any) -> None:
-    """Draw a row per panel, at one scale: the map, and the object from some sides.
+    """Draw a row for each panel: the map of the surface, and the object from six sides.
+
+    All panels have the same scale of colors, which is symmetric around 0.
 
     Args:
         panels: panels from the first row on.
@@ -868,7 +905,8 @@ def _find_scale_limit(panels: Sequence[Panel]) -> float:
         (float(np.nanmax(np.abs(panel.difference), initial=0.0)) for panel in panels),
         default=0.0,
     )
-    # 1e-9: a multiple of 10 % may be larger by rounding.
+    # - 1e-9: rounding may have made a multiple of 10 % a little larger. At least 10 %,
+    # so that the scale has a width even without any significant difference.
     return max(ceil(10.0 * max_difference - 1e-9) / 10.0, 0.1)
 
 
@@ -888,7 +926,8 @@ def _draw_views(axes: Any, views: Sequence[MapView], cell_colors: Float64Array) 
         top = row * VIEW_SIZE
         left = column * VIEW_SIZE
         is_object = view.cells[..., None] >= 0
-        # Where the object is not, -1 is looked up as cell 0, and then made white.
+        # Pixels without the object have -1. They are looked up as cell 0 here, and made
+        # white below.
         shaded = cell_colors[np.maximum(view.cells, 0)] * view.shade[..., None]
         image = np.where(is_object, shaded, 1.0)
         mosaic[top : top + VIEW_SIZE, left : left + VIEW_SIZE] = image

@@ -91,6 +91,14 @@ class ConstantVelocity:
     def __init__(
         self, sure: float = 0.5, overlap: float = 0.3, patience: int = 3
     ) -> None:
+        """Begin without tracks.
+
+        Args:
+            sure: score in [0, 1] from which on a box may begin a track.
+            overlap: intersection over union with the predicted box, at least, for a box
+                to continue a track.
+            patience: frames in a row that a track may be without a box before it ends.
+        """
         self.sure = sure
         self.overlap = overlap
         self.patience = patience
@@ -140,8 +148,8 @@ class ConstantVelocity:
         for track_index, box_index in box_of_track.items():
             track = tracks[track_index]
             box = boxes[box_index]
-            # The box that was detected last, `missed` frames ago: at least 1, since a
-            # track counts as missed in this frame until now.
+            # The last detected box, `missed` frames ago. `missed` is at least 1, since
+            # `__call__` counts every track as missed before boxes are assigned.
             last_box = track.box - track.speed * track.missed
             speed = (box - last_box) / track.missed
             assigned.append(_Track(track.number, box, speed))
@@ -199,10 +207,10 @@ def track_drive(
 ) -> DriveTracking:
     """Track the boxes of a drive, and compare the tracks with the true boxes.
 
-    A frame in which the object is visible is lost if no track is on it. The object is
-    followed by one track, at first the one that overlaps it most. In a frame in which
-    other tracks are on it, but not this one, the one of these that overlaps most
-    follows it from then on: its identity has switched.
+    A frame in which the object is visible is lost if no track is on it. One track
+    follows the object: at first the track that overlaps it most. If in a later frame
+    only other tracks are on the object, the one of these that overlaps most follows it
+    from then on: this is an identity switch.
 
     Args:
         frames: frames of the drive, in their order.

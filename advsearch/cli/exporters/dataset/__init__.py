@@ -16,7 +16,17 @@ class _Dataset(Exporter):
     def write(
         self, run: str, out: Path, options: Mapping[str, Any], progress: Progress
     ) -> Exported:
-        """See `Exporter.write`."""
+        """Write the images of a run as a dataset of boxes.
+
+        Args:
+            run: name or folder of the run.
+            out: the folder, which is made, or empty.
+            options: `all` is set to write also images that models are right about.
+            progress: reports the rows.
+
+        Raises:
+            InputError: there are no images to write.
+        """
         from advsearch.cli.exporters.dataset.files import write_dataset  # takes seconds
 
         count, notes = write_dataset(

@@ -78,7 +78,14 @@ class Categories:
 
 
 def _find_object_category(image: Any) -> tuple[tuple[str, ...], int]:
-    """Return the labels of the categories, and the index of the object's category."""
+    """Return the labels of the categories, and the index of the object's category.
+
+    The labels are those of the model. If it has none, the object's name is the only
+    one.
+
+    Args:
+        image: the rendered image, with its task and the facts about its scene.
+    """
     task = image.task
     facts = image.facts
     # an ensemble has a task for each model; the classes are those of the first
@@ -107,7 +114,8 @@ def write_dataset(
 ) -> tuple[int, list[str]]:
     """Write the pictures of a run as a dataset, with what is true of them.
 
-    It is written whole or not at all; where there are no pictures, nothing is written.
+    The dataset is written in full or not at all. If there are no pictures, nothing is
+    written.
 
     Args:
         run: run of `sweep` or `attack`, or with such parts (a suite, a study).
@@ -222,8 +230,14 @@ def write_coco_index(
 ) -> None:
     """Write the JSON of a COCO dataset.
 
-    A label that names nothing, such as a background, is no category; the others keep
-    their indices as ids.
+    A label that names nothing, such as a background, is no category. The ids of all
+    other categories are their indices among the labels.
+
+    Args:
+        folder: folder of the dataset.
+        categories: the categories of the images.
+        images: entries of the images.
+        annotations: entries of the things in all images.
     """
     category_entries = [
         {"id": index, "name": name, "supercategory": ""}
@@ -244,8 +258,12 @@ def write_coco_index(
 
 
 def make_notes(categories: Categories, n_changed: int) -> list[str]:
-    """Return sentences about things without a category, and about pictures that the
-    model judges in another way than when the run was made.
+    """Return sentences about what a reader of the dataset has to know.
+
+    Args:
+        categories: the categories, with the names of things that have none.
+        n_changed: number of images about which the model predicts something else than
+            the run has stored.
     """
     notes = []
     if categories.unnamed:
@@ -264,8 +282,12 @@ def make_notes(categories: Categories, n_changed: int) -> list[str]:
 def make_image(image_id: int, image: Any) -> dict[str, Any]:
     """Return the entry of a picture in COCO's JSON.
 
-    Under "advsearch", which is not COCO's, it has the predictions of all models and the
-    values of the parameters.
+    Its field "advsearch", which is not part of COCO, has the predictions of all models
+    and the values of the parameters.
+
+    Args:
+        image_id: id of the picture.
+        image: the rendered image, with the rows that store its predictions.
     """
     height, width = image.picture.shape[:2]
     predictions = [_describe_prediction(row) for row in image.rows]
@@ -359,7 +381,7 @@ def find_runs(mask: NDArray[np.bool_]) -> list[int]:
     inside of the mask alternate, and the first is outside: it has length 0 if the first
     pixel is inside.
     """
-    flat = mask.ravel(order="F")
+    flat = mask.ravel(order="F")  # column by column
     bounds = [0, *(np.flatnonzero(np.diff(flat)) + 1).tolist(), flat.size]
     lengths = np.diff(bounds).tolist()
     begins_inside = bool(flat[0])

@@ -56,6 +56,10 @@ def write_projection(run: str | Path, out: Path) -> list[str]:
     with numbered crosses to project first, `seen.png` with these crosses as the run's
     camera sees them, and `README.txt`.
 
+    Args:
+        run: name or folder of the run.
+        out: the folder, which must not exist.
+
     Returns:
         Sentences about what to set.
 
@@ -129,12 +133,18 @@ def write_projector(
 
 
 def describe_settings(control: Any, values: dict[str, Tensor]) -> list[str]:
-    """Return what to set at a projector and around it, a sentence each."""
+    """Return what to set at a projector and around it, a sentence each.
+
+    Args:
+        control: the projector.
+        values: its values by name; only single numbers are read.
+    """
     number = {name: float(value) for name, value in values.items() if value.ndim == 0}
     unit = "m" if control.scene.object.size_in_metres is not None else "object sizes"
     fov = control.part.fov
     white = control.measured(values, {})["white"]["value"]
-    # half the width of the picture at distance 1; the throw ratio is distance by width
+    # Half the width of the picture at distance 1. The throw ratio of a projector is
+    # distance / width, which is 1 / (2 half_width).
     half_width = math.tan(math.radians(fov) / 2.0)
     return [
         f"{number['lumens']:g} lumens for a white picture, "
@@ -159,12 +169,12 @@ def describe_marks(control: Any, marked_texels: Sequence[MarkedTexel]) -> list[s
         control: the projector.
         marked_texels: the texels with a mark.
     """
-    # of the picture, at distance 1
+    # half the width of the picture at distance 1
     half_width = math.tan(math.radians(control.part.fov) / 2.0)
     lines = []
     for index, texel in enumerate(marked_texels, 1):
-        # from the middle of the picture, from -1 to 1; times the half width or height
-        # they are tangents of the angles
+        # Position in the picture, from -1 to 1 around its middle. Multiplied by the
+        # half width or the half height, it is the tangent of the angle.
         right_of_middle = 2 * texel.x - 1
         above_middle = 1 - 2 * texel.y
         right = math.degrees(math.atan(right_of_middle * half_width))

@@ -20,8 +20,10 @@ XML = ".xml"
 
 
 def write_mitsuba(run: str | Path, out: Path) -> list[str]:
-    """Write the adversarial scene of a run as XML, with its meshes and pictures in
-    files beside it whose names begin with that of the XML.
+    """Write the adversarial scene of a run as XML for Mitsuba.
+
+    Its meshes and pictures are files in the same folder, whose names begin with the
+    name of the XML file.
 
     Args:
         run: a name or a folder.
@@ -39,7 +41,8 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
     check_free(path, out)
     adversarial = exports.AdversarialRun.load(run)
     renderer = adversarial.problem.renderer
-    # those of the scene that Mitsuba renders, and those of the finished picture
+    # `inputs` are those of the scene that Mitsuba renders; `on_picture` are those of
+    # steps after rendering, such as the exposure.
     inputs, on_picture = adversarial.split_inputs()
     backdrop = on_picture.get("backdrop.color")
     hazy = has_haze(renderer, inputs)
@@ -163,7 +166,12 @@ def describe_formation(renderer: Any, gain: float, backdrop: Any) -> list[str]:
 
 
 def describe_omissions(adversarial: Any, *, hazy: bool) -> list[str]:
-    """Return sentences about how the files differ from the scene of the run."""
+    """Return sentences about how the files differ from the scene of the run.
+
+    Args:
+        adversarial: the adversarial scene of the run.
+        hazy: whether there is haze in the scene.
+    """
     notes = []
     if hazy:
         notes.append(
@@ -183,8 +191,9 @@ def describe_omissions(adversarial: Any, *, hazy: bool) -> list[str]:
 
 
 def write_gltf(run: str | Path, out: Path) -> list[str]:
-    """Write the object of a run's adversarial scene as binary glTF: displaced, in its
-    pose, with its texture.
+    """Write the object of a run's adversarial scene as binary glTF.
+
+    It has the geometry, the pose and the texture of the adversarial scene.
 
     Args:
         run: a name or a folder.
