@@ -83,18 +83,18 @@ def find_candidate_pixels(
 def find_read_texels(corners: Float64Array, shape: tuple[int, int]) -> BoolArray:
     """Return the texels (h, w) that bilinear look-ups in triangles read.
 
-    A look-up at a point reads the four texels around it: with its row and its column
-    rounded down, and the next ones. The square between these four is a cell here, and
-    has the index of the first. So the cells that a triangle touches are found, and then
-    their texels. Beyond the border the texture repeats.
+    A look-up at a point reads the four texels around it: those at its row and column
+    rounded down, and the next ones. The square between the centers of these four is
+    called a cell here, and has the index of the first. First the cells that a triangle
+    touches are found, then the four texels of each. The texture repeats at its border.
 
     Args:
-        corners: (F, 3, 2) as for `rasterize_triangles`, at most half a texel outside of
-            the texture.
+        corners: (F, 3, 2) column and row of each corner, whole at texel centers, and at
+            most half a texel outside of the texture.
         shape: height and width of the texture.
     """
-    # The first cell begins at texel -1, which is the last one again. All is shifted by
-    # 1, so that the indices of cells begin at 0.
+    # The first cell begins at texel -1, which is the last texel again, since the texture
+    # repeats. A shift by 1 lets the indices of cells begin at 0.
     shifted = corners + 1.0
     lowest_row = np.floor(shifted[..., 1].min(axis=1) - PIXEL_TOLERANCE)
     highest_row = np.floor(shifted[..., 1].max(axis=1) + PIXEL_TOLERANCE)
@@ -121,9 +121,9 @@ def _find_column_span(
 ) -> tuple[Float64Array, Float64Array]:
     """Return the smallest and largest column of triangles between two rows.
 
-    Each triangle (N, 3, 2) is cut to the strip from its row (N,) to the next. What is
-    left of it reaches farthest at one of its corners inside the strip, or where an edge
-    crosses one of the two rows.
+    Each triangle (N, 3, 2) is cut to the strip between its row (N,) and the next. The
+    smallest and the largest column of the part that remains are at a corner inside the
+    strip, or where an edge crosses one of the two rows.
 
     Returns:
         (N,) smallest and (N,) largest column; (inf, -inf) where nothing is left.
@@ -134,7 +134,8 @@ def _find_column_span(
     left = np.where(is_between, corners[..., 0], np.inf).min(axis=1)
     right = np.where(is_between, corners[..., 0], -np.inf).max(axis=1)
     for offset in (0, 1):
-        # no crossing is an empty range, the first column above the last
+        # A triangle that does not cross the row has an empty range: its first column is
+        # larger than its last.
         first_column, last_column = _cross_rows(corners, row + offset, PIXEL_TOLERANCE)
         left = np.where(
             first_column <= last_column, np.minimum(left, first_column), left
@@ -204,9 +205,10 @@ def _cross_rows(
 ) -> tuple[Float64Array, Float64Array]:
     """Return the first and last column (N,) of triangles (N, 3, 2) on rows (N,).
 
-    They are where the triangle's edges cross its row. An edge that ends up to
-    `tolerance` before the row crosses it at that end. Level edges do not count. Where
-    no edge crosses, the range is empty: 0 to -1.
+    They are where the triangle's edges cross its row. An edge that ends less than
+    `tolerance` before the row counts as crossing it at that end. Level edges are left
+    out, since the other two edges end where they do. If no edge crosses the row, the
+    range is empty: the first column is 0 and the last -1.
     """
     left = np.full(len(row), np.inf)
     right = np.full(len(row), -np.inf)
@@ -320,8 +322,8 @@ def find_exclusive_texels(
 def rasterize_charts(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
     """Find the face and the barycentric weights of every texel of a texture.
 
-    Where charts overlap, the last of their faces wins. A texel in no chart has the
-    values of the nearest one that is.
+    Where charts overlap, the last of their faces wins. A texel outside of all charts
+    has the values of the nearest texel inside one.
 
     Args:
         mesh: mesh with texture coordinates.
@@ -381,9 +383,9 @@ def look_up_texture(
     """Look a repeating texture up with bilinear interpolation.
 
     Args:
-        texels: (H, W, C).
-        x, y: columns and rows (...), integers at texel centers; they may be any number
-            of textures away.
+        texels: (H, W, C) the texture.
+        x: columns (...), whole at texel centers; outside of the texture it repeats.
+        y: rows (...), likewise.
 
     Returns:
         (..., C) float32.
@@ -422,14 +424,15 @@ class MeshSurface:
     def __init__(self, mesh: Mesh) -> None:
         """Compute boxes and normals of the faces, and which faces are neighbours.
 
-        Neighbours have an edge in common, by the positions of its ends: across a UV
-        seam too, where the vertices are not the same.
+        Faces are neighbours if they share an edge. Edges are compared by the positions
+        of their ends: at a UV seam the faces on both sides have different vertices at
+        the same positions.
         """
         self._corners = mesh.vertices[mesh.faces].astype(np.float64)
         self.normals = _compute_face_normals(mesh)
         self._lower = self._corners.min(axis=1)
         self._upper = self._corners.max(axis=1)
-        # (F, 3) the same index for vertices at one position
+        # (F, 3) corners of the faces, with one index for all vertices at one position
         corners = weld_vertices(mesh)[0][mesh.faces]
         # (3 F, 2) edges in three blocks, each with one edge of all faces
         edges = np.concatenate(

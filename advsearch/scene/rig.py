@@ -85,22 +85,23 @@ class Mount:
     ) -> dict[str, Tensor]:
         """Return the scene inputs of this camera, given those of the first camera.
 
-        The first camera's pose, times the mount's, is turned about the vertical through
-        the object by the mount's azimuth. A field of view or a lens of its own replaces
-        the first's.
+        The mount's pose is relative to the first camera's. The result is turned about
+        the vertical through the object's center by the mount's azimuth. If the mount
+        has a field of view or a lens, it replaces the first camera's.
 
         Args:
             inputs: scene inputs of the first camera.
-            first_pose: (4, 4) its pose, if the inputs have none.
+            first_pose: (4, 4) pose of the first camera, used if the inputs have none.
             center: (3,) center of the object.
-            unit_metres: length of a unit of the scene.
+            unit_metres: length of a unit of the scene, in metres.
         """
-        # the mount's axes are OpenCV's, the scene's are Mitsuba's
+        # The mount's axes are OpenCV's (x right, y down), the scene's are Mitsuba's (x
+        # left, y up): `AXES` converts both sides.
         mount_pose = torch.from_numpy(AXES @ self.pose @ AXES).float()
         mount_pose[:3, 3] /= unit_metres
         orbit_rotation = torch.eye(4)
         orbit_rotation[:3, :3] = torch.from_numpy(make_rotation(self.azimuth, 0.0, 0.0))
-        # the center stays where it is
+        # The shift by which the rotation leaves the center where it is: c - R c.
         orbit_rotation[:3, 3] = center - orbit_rotation[:3, :3] @ center
         camera_inputs = {
             **inputs,
@@ -121,13 +122,14 @@ def read_rig(spec: str) -> tuple[Mount, ...]:
     """Read the cameras of a rig.
 
     Args:
-        spec: the file. Of a transforms.json, frames are named by index, the first one
-            first: ``transforms.json#0,4,8``. Of an images.txt, all images are cameras,
-            or those named by IMAGE_ID: ``images.txt#3,7``.
+        spec: the file. Frames of a transforms.json are named by index, and the first
+            name is the rig's first camera: ``transforms.json#0,4,8``. All images of an
+            images.txt are cameras, or only those named by IMAGE_ID:
+            ``images.txt#3,7``.
 
     Returns:
-        The cameras; empty if the file has one camera, or one of its cameras is named
-        (``#cam1``).
+        The cameras. It is empty if this is no rig: the file has one camera, or one of
+        its cameras is named (``#cam1``).
 
     Raises:
         FileFormatError: there are more than `MAX_CAMERAS`, numbers that no camera has,
@@ -303,8 +305,16 @@ def _check_mounts(spec: str, mounts: Sequence[Mount]) -> None:
 def _read_entry(spec: str, index: int, entry: Any) -> Mount:
     """Return the camera of an entry of our own format.
 
-    Each of `ENTRY_KEYS` may be missing: it stands where the first camera does, looks
-    the same way and has its lens. `index` counts from 0, for a name and errors.
+    Any of `ENTRY_KEYS` may be missing. A camera without a pose stands where the first
+    camera does and looks the same way; one without a lens has that of the first.
+
+    Args:
+        spec: the file, for messages.
+        index: index of the camera from 0, for messages and a default name.
+        entry: the entry, a dictionary if the file is right.
+
+    Raises:
+        FileFormatError: the entry has other keys, or values that no camera has.
     """
     where = f"{spec}: camera {index + 1}"
     if not isinstance(entry, dict) or not set(entry) <= set(ENTRY_KEYS):
@@ -360,16 +370,14 @@ def _read_entry_pose(where: str, entry: Mapping[str, Any]) -> Float64Array:
 def _parse_numbers(
     where: str, key: str, value: Any, count: int, limit: float
 ) -> list[float]:
-    """Return an entry as a list of `count` finite numbers, none larger than a limit.
-
-    The limit is that of their absolute values.
+    """Return an entry as a list of `count` finite numbers within a limit.
 
     Args:
         where: file and camera, for messages.
         key: name of the entry, for messages.
         value: the entry.
         count: how many numbers it has to have.
-        limit: the limit.
+        limit: largest absolute value of each number.
 
     Raises:
         FileFormatError: it is no such list.

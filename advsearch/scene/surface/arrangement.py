@@ -80,26 +80,34 @@ class SurfaceView:
 
         Its rows are the pixels, its columns the cells of the fine grid. Each ray that
         hits the surface adds four entries to its pixel's row: the weights of a bilinear
-        look-up times the ray's own. Arguments are those of the class.
+        look-up times the ray's own.
+
+        Args:
+            samples: rays of all cameras of one launch that hit the object.
+            camera_index: index of this view's camera in that launch.
+            shape: rows and columns of the fine grid.
+            sides: number of sides of the surface that have light of their own, 1 or 2.
         """
         self.base_radiance = samples.radiance[camera_index]
         self.coverage = samples.coverage[camera_index]
         height, width = self.base_radiance.shape[:2]
         n_cells = shape[0] * shape[1]
-        # The rays of all cameras are counted on, and those of the samples rise: the
-        # camera's are between the first ray of it and of the next one.
+        # Rays are numbered through from one camera to the next, and `samples.sample`
+        # is the ascending number of each sample's ray. So the samples of this camera
+        # are those between its own first ray and that of the next camera.
         n_rays = height * width * RAYS_PER_PIXEL
         first_rays = torch.tensor([camera_index, camera_index + 1]) * n_rays
         start, end = torch.searchsorted(samples.sample, first_rays).tolist()
         ray = samples.sample[start:end] - camera_index * n_rays
         pixel = ray // RAYS_PER_PIXEL
-        # (n, 4) cells and weights of the bilinear look-ups; with two sides those on the
-        # back are in the second half of the columns
+        # Cells and weights (n, 4) of the bilinear look-ups. If the surface has two
+        # sides, the second half of the columns is its back.
         columns, fractions = find_bilinear_weights(samples.uv[start:end].numpy(), shape)
         is_back = samples.is_back[start:end].numpy()
         columns += np.int32(n_cells) * is_back[:, None]
         weights = fractions * samples.weight[start:end].numpy()[:, None]
-        # samples are in the order of pixels, with four entries each
+        # The samples are in the order of pixels, and each has four entries: so row
+        # pointers of the compressed matrix need no sorting.
         row_starts = np.searchsorted(pixel.numpy(), np.arange(height * width + 1)) * 4
         self.matrix = scipy.sparse.csr_matrix(
             (weights.ravel(), columns.ravel(), row_starts.astype(np.int32)),
@@ -212,7 +220,12 @@ class Arrangement:
     ) -> None:
         """Lay texels over all surfaces, trace what they see, and measure how they look.
 
-        Arguments are those of the class.
+        Args:
+            renderer: renderer of the scene.
+            inputs: scene inputs, which fix where everything stands. Those that change
+                only the finished image are ignored.
+            texture: rows and columns of the texture whose color is searched.
+            seed: seed of the rays.
         """
         scene = renderer.scene
         self._scene = scene
@@ -228,7 +241,7 @@ class Arrangement:
         surfaces = self._make_object_texels(charts, vertices, normals)
         self.n_sides = len(surfaces)
         self._has_ground = description.get_number("ground.size") > 0.0
-        # from which a photographed ground was taken; None of any other ground
+        # height of the camera that photographed the ground; None for another ground
         self._capture_height = (
             None if description.photograph is None else description.capture_height
         )
@@ -242,7 +255,8 @@ class Arrangement:
         self._view_matrices = texels.make_view_matrices(
             met_cells, self.texels.texel_of_cell, len(self.texels.positions)
         )
-        # for each side, from the light on the object's texels to the fine grid
+        # for each side of the object: the matrix that takes the light on its texels to
+        # the fine grid. The back has the same texels, but the opposite normals.
         self._to_fine = [
             texels.make_lookup_matrix(
                 surfaces[side],
@@ -378,8 +392,8 @@ class Arrangement:
     def _measure_object(self) -> Lobes:
         """Measure how the object reflects, at one texel that stands for all.
 
-        With cut-outs it is one of the most opaque texels: where the surface is cut out
-        there is nothing to measure.
+        If the object has an opacity map, one of its most opaque texels is measured:
+        where the surface is cut out there is nothing to measure.
         """
         front = self.texels.select_grid(0)
         opacity = self._scene.definition[0].meshes[OBJECT].opacity
@@ -391,6 +405,7 @@ class Arrangement:
             opacity_column = column * opacity.shape[1] // n_columns
             texel_opacity = opacity[opacity_row, opacity_column]
             candidates = candidates[texel_opacity >= texel_opacity.max()]
+        # any of them would do: the gloss is the same all over the object
         texel = candidates[len(candidates) // 2]
         return measure_lobes(
             self._scene,
@@ -403,8 +418,12 @@ class Arrangement:
     def _find_ground_below(self, center: Float32Array) -> tuple[Tensor, Tensor]:
         """Find where the ground is in the blurred maps, seen from the object's center.
 
-        A photographed ground has the color of the map in the direction in which the
-        camera that took the photograph sees the same point.
+        A photographed ground takes its color from the environment's map. The color of a
+        point is that in its direction from the camera that took the photograph, which
+        is not its direction from the object.
+
+        Args:
+            center: (3,) center of the object in world space.
 
         Returns:
             (h, w) whether the ground is seen in each direction; and (h, w, 3) that
@@ -415,8 +434,8 @@ class Arrangement:
         world_directions = directions @ self.world_to_map
         if not self._has_ground:
             return torch.zeros(texels.BLURRED_SHAPE, dtype=torch.bool), directions
-        # for directions that do not go down the point means nothing: they are left out
-        # below
+        # The ray from the center meets the ground at this distance. For a direction that
+        # does not go down the point means nothing, and the last line leaves it out.
         distance = float(center[2]) / (-world_directions[..., 2]).clamp_min(1e-6)
         points = (
             torch.from_numpy(center).float() + world_directions * distance[..., None]
@@ -466,8 +485,9 @@ class Arrangement:
         reflects to the camera is left to `ArrangementLight.compute_reflected`.
 
         Args:
-            padded: (H, W + 2, 3) map of the environment.
-            color: (h, w, 3).
+            padded: (H, W + 2, 3) radiance map of the environment, with one more column
+                at each end, so that interpolation has no seam.
+            color: (h, w, 3) base color of the object, linear.
         """
         with torch.no_grad():
             sky = texels.prepare_sky(padded)
@@ -479,9 +499,10 @@ class Arrangement:
                 reflectance,
                 BOUNCES,
             )
+            # radiance of a diffuse surface
             leaving = reflectance * irradiance / math.pi
             surroundings = sky.map
-            # without a ground it is read, but does not count
+            # Without a ground this is only a filler: no ray looks it up.
             far_ground = torch.ones(1, 3)
             if self._has_ground:
                 ground = self.texels.select_grid(self.n_sides)

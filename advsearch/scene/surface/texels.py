@@ -130,16 +130,18 @@ def make_ground_texels(
     """Return the texels over a level plane, small under the object and large far off.
 
     Along each axis of the grid, the position p from -1 to 1 lies at the distance
-    `scale * sinh(rate * p)` from the center.
+    `scale * sinh(rate * p)` from the center: texels are narrowest at the center, and
+    grow with the distance from it.
 
     Args:
         name: name of the ground.
-        height: height of the plane.
-        reach: half its width, cut to `MAX_GROUND_REACH`.
+        height: height of the plane, in object sizes.
+        reach: half the plane's width; what is beyond `MAX_GROUND_REACH` gets no texels.
         center: x and y of the object's center.
     """
     reach = min(reach, MAX_GROUND_REACH)
-    # by how much even texels would be wider than `MIN_TEXEL_WIDTH`, that at the center
+    # The ratio is that of the width of equal texels to `MIN_TEXEL_WIDTH`, the width
+    # that the texel at the center shall have.
     rate = _find_warp_rate(reach / (MIN_TEXEL_WIDTH * GROUND_TEXELS / 2.0))
     scale = reach / math.sinh(rate)
     axis_position = (np.arange(GROUND_TEXELS) + 0.5) * 2.0 / GROUND_TEXELS - 1.0
@@ -191,6 +193,9 @@ def _weigh_neighbours(
 ) -> tuple[IntArray, Float64Array]:
     """Return the texels around points and their weights in a joint bilateral filter.
 
+    A texel's weight is the product of three: one falls with the distance in the grid,
+    one with the distance in space, and one with the angle between the normals.
+
     Args:
         texels: texels of the mesh.
         charts: charts of the mesh.
@@ -205,8 +210,8 @@ def _weigh_neighbours(
     """
     y, x = grid_position
     n_rows, n_columns = charts.is_covered.shape
-    # (rows, columns) index of the texel in each cell, -1 outside of the charts: covered
-    # cells are counted row by row
+    # The index of the texel in each cell of the grid; -1 outside of the charts. Texels
+    # are the covered cells, numbered row by row.
     texel_at = np.cumsum(charts.is_covered.ravel()).reshape(n_rows, n_columns) - 1
     texel_at = np.where(charts.is_covered, texel_at, -1)
 
@@ -283,7 +288,8 @@ def make_lookup_matrix(
         Sparse, (cells of the finer grid, texels of the first surface).
     """
     if buried.all():
-        buried = np.zeros_like(buried)  # then none counts as such
+        # With no texel left there would be no light at all: so all of them count.
+        buried = np.zeros_like(buried)
     fine_charts = rasterize_charts(charts.mesh, shape)
     position, normal = _interpolate(fine_charts, vertices, normals)
     rows, columns = np.nonzero(fine_charts.distance <= BORDER_TEXELS)
@@ -383,7 +389,8 @@ def make_smoothing_matrix(ground: LitTexels, sees_sky: BoolArray) -> Tensor:
     axis_weights = scipy.sparse.diags_array(
         BINOMIAL, offsets=range(-2, 3), shape=(width, width), dtype=np.float64
     )
-    # along both; columns of texels that are not used are 0, and rows add up to 1
+    # The Kronecker product weighs along both axes. Columns of texels that are not used
+    # become 0, and then each row is divided by its sum.
     weights = scipy.sparse.csr_array(
         scipy.sparse.kron(axis_weights, axis_weights)
         @ scipy.sparse.diags_array(is_used.ravel().astype(float))
@@ -465,20 +472,22 @@ class SkyLight:
 def prepare_sky(padded: Tensor) -> SkyLight:
     """Prepare an environment's map (H, W + 2, 3) for look-ups.
 
-    What is brighter than `HOT_FACTOR` times the mean is hot: that excess gets rays of
-    its own, and the rest stays in the cells. If it has no more than `MIN_HOT_FRACTION`
-    of the light, nothing is hot. The map for gloss has all light.
+    A texel's light above `HOT_FACTOR` times the mean, such as that of the sun, is hot.
+    It gets rays of its own, since the coarse cells of the sky would blur its shadows;
+    the rest stays in the cells. If no more than `MIN_HOT_FRACTION` of all light is hot,
+    nothing is treated so. `SkyLight.map`, which gloss reflects, has all light.
     """
     radiance = padded[:, 1:-1].detach()
     n_rows, n_columns = radiance.shape[:2]
     polar = torch.linspace(0.0, math.pi, n_rows)
-    # The solid angle of a texel goes by this, and is 1 at the horizon. The texels at
-    # the poles reach half a texel from it: they take the sine in the middle of that.
+    # The solid angle of a texel is proportional to the sine, which is 1 at the horizon.
+    # At a pole the sine is 0, but the texel there reaches half a texel from the pole:
+    # it takes the sine at a quarter of a texel, the middle of that.
     sine = polar.sin().clamp_min(math.sin(0.25 * math.pi / n_rows))
     sine = sine[:, None].expand(n_rows, n_columns)
     luminance = radiance @ LUMINANCE_WEIGHTS
     mean_luminance = float((luminance * sine).sum() / sine.sum())
-    # the part of each texel's light that is above the limit
+    # the fraction of each texel's light that is above the limit
     hot_fraction = (
         1.0 - HOT_FACTOR * mean_luminance / luminance.clamp_min(1e-12)
     ).clamp_min(0.0)
@@ -500,10 +509,10 @@ def prepare_sky(padded: Tensor) -> SkyLight:
 def _sample_hot(radiance: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
     """Sample directions towards hot light, and the light that comes from each.
 
-    Hot texels get rays in proportion to their power. The map is interpolated between
-    its texels, so that a texel shines over a tent of two texels' width: its rays are
-    spread over the tent by a lattice (`HOT_LATTICE`), and even a sun of one texel has a
-    soft shadow.
+    Hot texels get rays in proportion to their power. The map is interpolated linearly
+    between its texels, so that the light of one texel covers two texels' width, with a
+    weight that falls linearly to 0 (a tent). Its rays are spread over the tent by a
+    lattice (`HOT_LATTICE`); so even a sun of one texel has a soft shadow.
 
     Args:
         radiance: (H, W, 3) of what is hot.
@@ -527,7 +536,7 @@ def _sample_hot(radiance: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
     column_offset = _to_tent((index * HOT_LATTICE[1] % HOT_RAYS + 0.5) / HOT_RAYS)
     polar = ((row + row_offset) * (math.pi / (n_rows - 1))).clamp(0.0, math.pi)
     azimuth = (column + 0.5 + column_offset) * (2.0 * math.pi / n_columns)
-    # of a texel at the horizon
+    # solid angle of a texel at the horizon, in steradians
     solid_angle = math.pi / (n_rows - 1) * 2.0 * math.pi / n_columns
     power_per_ray = float(power.sum()) * solid_angle / HOT_RAYS
     color = _normalize_luminance(radiance[row, column])
@@ -573,12 +582,12 @@ def _average_cells(radiance: Tensor, sine: Tensor, size: tuple[int, int]) -> Ten
 def blur_map(radiance: Tensor) -> Tensor:
     """Blur a map (h, w, 3) by each of `BLUR_WIDTHS`.
 
-    A width is the root mean square angle over both directions, hence each direction has
-    it divided by the square root of 2. Columns are blurred first, by a Gaussian over
-    the polar angle; then rows, by a Gaussian over the angle along them.
+    A width is the root mean square angle over both directions, in radians: so the
+    Gaussian of each direction has a sigma of the width / sqrt(2). Columns are blurred
+    first, over the polar angle; then rows, over the angle along them.
 
     Returns:
-        (widths, h, w, 3).
+        (n_widths, h, w, 3) one blurred map for each width.
     """
     n_rows, n_columns = radiance.shape[:2]
     polar = (torch.arange(n_rows) + 0.5) * math.pi / n_rows
@@ -590,8 +599,9 @@ def blur_map(radiance: Tensor) -> Tensor:
         # rows near the poles have less solid angle, and count less
         column_kernel = torch.exp(-exponent) * polar.sin()[None, :]
         column_kernel = column_kernel / column_kernel.sum(dim=1, keepdim=True)
-        # A row goes round, and is blurred in the frequency domain, by a Gaussian too:
-        # over more columns towards the poles, where a row is short.
+        # A row is periodic, and so is blurred in the frequency domain, where a Gaussian
+        # is a Gaussian too. Towards the poles a row spans a shorter angle, and the same
+        # blur takes more columns.
         row_filter = torch.exp(
             -0.5 * (frequency[None, :] * sigma / polar.sin()[:, None]).square()
         )
@@ -619,11 +629,14 @@ def compute_irradiance(
     reflectance: Tensor,
     bounces: int,
 ) -> Tensor:
-    """Return the irradiance (n, 3) of texels.
+    """Return the irradiance (n, 3) of texels, with light between them.
+
+    Each bounce adds the light that diffuse texels with the irradiance so far reflect,
+    `reflectance * irradiance / pi`, to the light of the sky.
 
     Args:
-        view_matrices: sparse, from radiance to irradiance: of the sky's cells (n,
-            cells), and of the texels on each other (n, n).
+        view_matrices: two sparse matrices from radiance to irradiance: one from the
+            sky's cells (n, cells), one from the texels to each other (n, n).
         sky: the environment.
         direct: (n, k) cosines towards hot light where it is visible; None if nothing is
             hot.
@@ -645,15 +658,15 @@ def make_view_matrices(
 ) -> tuple[Tensor, Tensor]:
     """Return the matrices from radiance to irradiance, by what the rays of texels met.
 
-    They are sparse: from the sky's cells (n, cells), and from texels (n, n_texels). A
-    texel's rays have the density of the cosine, so that its irradiance is pi times the
-    mean radiance of what they meet.
+    They are sparse: from the sky's cells (n, cells), and from texels (n, n_texels). The
+    density of a texel's rays is proportional to the cosine at its normal, so that its
+    irradiance is pi times the mean radiance of what they meet.
 
     Args:
-        met_cells: (n, rays) of `trace_texel_rays`: a cell of the grids, from
-            `len(texel_of_cell)` on a cell of the sky, or negative for nothing that
-            shines.
-        texel_of_cell: index of the texel of each cell, see `LitTexels`.
+        met_cells: (n, rays) what each ray met. Below `len(texel_of_cell)` it is a cell
+            of the grids; from there on a cell of the sky; and a negative value is
+            something that does not shine.
+        texel_of_cell: index of the texel that gives each cell its light.
         n_texels: number of texels of all grids.
     """
     count, n_rays = met_cells.shape

@@ -102,14 +102,16 @@ class Lighting:
 def find_lighting(renderer: Renderer) -> Lighting:
     """Find the groups of coordinates that change only light and the finished image.
 
-    Each group is varied alone, and the scene inputs are compared: so it holds for
-    whatever sets them.
+    Each group is varied alone, and the scene inputs are compared. So the result does
+    not depend on which kind of control sets them.
 
     Some lights of a Mitsuba scene are no inputs. They cannot be switched off, and would
-    count again in the image of each light that is traced by itself; with such lights
-    only the groups are returned that change nothing but the finished image.
+    be counted again in the image of every light that is traced by itself. In a scene
+    with such lights, only groups that change nothing but the finished image are
+    returned.
     """
-    # other groups stay half way between the start and the center of the unit cube
+    # Other groups stay half way between the start and the center of the unit cube: there
+    # a value is rarely at a border, where a change may have no effect.
     reference = 0.5 * renderer.start + 0.25
     groups = {}
     harmonic_groups = set()
@@ -146,8 +148,9 @@ def _measure_effect(
     """Return what a group of coordinates changes; None if that is more than light.
 
     Several configurations, which differ from `reference` in this group alone, are
-    compared with `base_inputs`, the scene inputs at `reference`. The brightest one has
-    the environment with most light.
+    compared with `base_inputs`, the scene inputs at `reference`. The effect names the
+    inputs that change; its brightest configuration is that whose environment has most
+    light.
     """
     changed: set[str] = set()
     is_harmonic = False
@@ -209,10 +212,16 @@ def _find_change(
 ) -> _Change:
     """Return in which way a group of coordinates changes one input.
 
-    `before` and `after` are the input's values. An environment may become a multiple of
-    itself (POWER), or one with spherical harmonics added (HARMONICS); any other input
-    may only be the light of a lamp or belong to the finished image (POWER). All else is
-    OTHER.
+    Args:
+        name: name of the input.
+        before: its value at the reference configuration; None if it has none.
+        after: its value once the group is changed.
+        n_coordinates: number of coordinates of the group.
+
+    Returns:
+        POWER: a lamp's light or an input of the finished image changed, or the
+        environment was multiplied by a factor. HARMONICS: spherical harmonics were
+        added to the environment. NONE: it is the same. OTHER: anything else.
     """
     if before is None or after is None:
         return _Change.OTHER
@@ -224,10 +233,12 @@ def _find_change(
         return _Change.OTHER
     if _is_explained(before[None], after):
         return _Change.POWER
-    if n_coordinates == 1:  # harmonics are added by several numbers
+    # A control that adds harmonics has a coordinate for each coefficient.
+    if n_coordinates == 1:
         return _Change.OTHER
     harmonic_basis = torch.cat([before[None], _make_harmonic_maps(before)])
-    # rejects most other changes in a tenth of the time
+    # The fit to every `COARSE_STEP`th pixel rejects most other changes in a tenth of
+    # the time.
     if not _is_explained(
         harmonic_basis[:, ::COARSE_STEP, ::COARSE_STEP],
         after[::COARSE_STEP, ::COARSE_STEP],
@@ -340,7 +351,13 @@ class LightBasis:
     def __init__(self, renderer: Renderer, lighting: Lighting, inputs: Inputs) -> None:
         """Split the light of scene inputs into lights of which each has its own image.
 
-        Arguments and what is set are those of the class.
+        Radiance is the sum over lights, so that an image under any mixture of them is
+        the sum of their images, each times its brightness.
+
+        Args:
+            renderer: renderer of the scene.
+            lighting: groups of coordinates that change light.
+            inputs: scene inputs whose light is split.
         """
         patterns = {
             name for name in renderer.scene.input_names if name.endswith(PATTERN_SUFFIX)
@@ -352,7 +369,7 @@ class LightBasis:
             else renderer.scene.get_base_value(name)
             for name in sorted(names)
         }
-        # In the inputs of a light all others are dark.
+        # The inputs of one light are this, with its own value put in: all others dark.
         dark = {name: torch.zeros_like(value) for name, value in values.items()}
         changed_names = lighting.changed_inputs
         # The patterns of projectors are in the first light, whether they change or not.
@@ -365,7 +382,8 @@ class LightBasis:
         self._lamps = sorted(changed_names & names - {ENVIRONMENT_INPUT})
         changes_environment = ENVIRONMENT_INPUT in changed_names
         is_unlit = not (fixed_values or self._lamps or changes_environment)
-        # without any light at all there is one, which is dark
+        # A scene without any light still gets one, which is dark: so that there is an
+        # image.
         self._has_fixed_light = bool(fixed_values) or is_unlit
         self.inputs_of_light = list[Inputs]()
         if self._has_fixed_light:
@@ -433,13 +451,18 @@ class BasisRenderer(Predictor):
     ) -> None:
         """Trace an image for each light, and the matrices of base colors under it.
 
-        `changing` is the result of `find_lighting`, which is called if it is None;
-        other arguments as for `LinearRenderer`.
+        Args:
+            traced: renderer that traces the paths.
+            u: (d,) configuration at which the images are traced.
+            seed: seed of the samples.
+            tick: called as the passes are done, with the progress.
+            changing: result of `find_lighting`, which is called if this is None.
         """
         super().__init__(traced)
         with torch.no_grad():
             changing = changing or find_lighting(traced)
-            # the basis map of the environment is the brightest that there can be
+            # The environment is traced at its brightest: other environments are
+            # predicted by scaling its image, which fails if a channel of it is black.
             brightest = u.detach().clone()
             for coordinates, values in changing.brightest_values:
                 brightest[coordinates] = values
@@ -508,9 +531,10 @@ def find_refusal(renderer: Renderer, varying: Collection[str] = ()) -> Refusal |
     """Return why images of a space cannot be predicted; None if they can.
 
     A group that is searched may change the finished image, haze, light (if nothing
-    varies), or inputs to which radiance is linear, for which it needs the adjoint; and
-    at least one has to need a render. Haze and a missing denoiser are reasons only
-    where nothing else is.
+    varies), or inputs to which radiance is linear, such as base colors. The last need
+    the adjoint estimator. At least one group has to need a render, as otherwise a
+    prediction would save nothing. Haze and a missing denoiser are named only if there
+    is no other reason.
 
     Args:
         renderer: renderer of the space.
