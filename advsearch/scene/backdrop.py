@@ -99,7 +99,8 @@ def read_backdrop(spec: str | Path) -> BackdropPhotograph:
     """Read a photograph that a scene is to be rendered into.
 
     Args:
-        spec: a picture file; with the part to use behind it, ``#X,Y,WIDTH,HEIGHT``.
+        spec: path of a picture. A part of it is named behind the path, in pixels from
+            the top left corner: ``photo.jpg#X,Y,WIDTH,HEIGHT``.
 
     Raises:
         FileFormatError: the file is missing, no picture, too large, corrupt, too small
@@ -200,14 +201,21 @@ def make_image_inputs(
 ) -> dict[str, Tensor]:
     """Return the inputs by which a rendered image becomes a part of its photograph.
 
-    Empty for a scene that is rendered into none.
+    The result is empty if the scene is not rendered into a photograph.
 
     Returns:
-        ``backdrop.color`` (H, W, 3) the photograph; and if there is any
-        ``backdrop.plane`` (3,), see `compute_plane_radiance`; ``backdrop.front`` (H, W,
-        1) what is before the object; ``backdrop.depth`` (H S, W S) of the photograph,
-        object sizes; ``backdrop.noise`` (H, W, 3) display-referred noise, and
-        ``backdrop.blur`` (1,) in pixels, of what is rendered.
+        Tensors by name. ``backdrop.color`` (H, W, 3) is the photograph, display-linear.
+        The others are there only where they apply:
+
+        - ``backdrop.plane`` (3,): radiance of the plane without the object;
+        - ``backdrop.front`` (H, W, 1): fraction of each pixel that something before the
+          object covers;
+        - ``backdrop.depth`` (H S, W S): depth of the photograph in object sizes, at S x
+          S points of each pixel;
+        - ``backdrop.noise`` (H, W, 3): noise that is added to what is rendered,
+          display-referred;
+        - ``backdrop.blur`` (1,): standard deviation in pixels by which what is rendered
+          is blurred.
 
     Raises:
         InputError: there is depth, and the object's size in metres is not known.
@@ -241,17 +249,19 @@ def make_image_inputs(
 def compose(rendered: Tensor, behind: Tensor, inputs: Mapping[str, Tensor]) -> Tensor:
     """Lay rendered radiance over a photograph.
 
-    The photograph shows where the coverage is below 1, darker or brighter by what the
-    object takes from the plane's light or adds to it, and where something is before
-    the object or the plane.
+    The photograph is visible where the object does not cover the pixel, and where
+    something is in front of the object. On the plane it is darkened by the object's
+    shadow, and brightened by light that the object reflects.
 
     Args:
-        rendered: (H, W, 4, 7 or 13), the object's radiance times its coverage, its
-            coverage, the change of the plane's radiance, that of what its coat
-            reflects, and the environment in the coat without the object.
+        rendered: (H, W, C). Channels 0 to 2 are the object's radiance times its
+            coverage, and 3 is the coverage. With a plane, 4 to 6 are the change of its
+            radiance by the object. With a glossy plane, 7 to 9 are the change of what
+            its coat reflects, and 10 to 12 the environment in the coat without the
+            object. So C is 4, 7 or 13.
         behind: (H, W, 3) radiance of the photograph.
-        inputs: as by `make_image_inputs`; the last channel of ``backdrop.front`` is
-            what is before the plane.
+        inputs: result of `make_image_inputs`. The first channel of ``backdrop.front``
+            is the fraction of the object that is hidden, the last that of the plane.
 
     Returns:
         Radiance (H, W, 3).
@@ -273,7 +283,8 @@ def compose(rendered: Tensor, behind: Tensor, inputs: Mapping[str, Tensor]) -> T
         uncovered = shade
         shade = (shade + change).clamp_min(0.0)
         if reflection.shape[-1]:
-            # what the photograph shows of the environment in the coat takes no shadow
+            # A shadow takes light from the plane's color, but not from the reflection of
+            # the environment in its coat: that part of the photograph is added again.
             coat = rendered[..., 10:] / (1.0 - rendered[..., 3:4]).clamp_min(1e-3)
             unshaded = (uncovered - shade) * torch.minimum(coat, behind)
             return radiance + (shade * behind + unshaded + reflection).clamp_min(0.0)
@@ -285,18 +296,19 @@ def compute_front(
 ) -> Tensor:
     """Return the fractions of object and ground that the photograph's depth hides.
 
-    A point is hidden where the photograph is nearer by more than `DEPTH_TOLERANCE`. A
-    pixel with no point of the object takes the fraction around it, for the faint edges
-    of a smooth or blurred outline; so does one with no point of the ground.
+    A point is hidden if the photograph there is nearer than the point by more than
+    `DEPTH_TOLERANCE`. If none of a pixel's points is on the object, the fraction is
+    that of the pixels around it, since a blurred outline may reach into the pixel. The
+    same holds for the ground.
 
     Args:
-        surfaces: what is seen first at n x n points of each pixel.
+        surfaces: surface that is seen first at n x n points of each pixel.
         photograph_depth: (H n, W n) at the same points, in the unit of `surfaces`.
         n_points: n.
         radius: radius of the surroundings, pixels.
 
     Returns:
-        (H, W, 2) float32 in [0, 1].
+        (H, W, 2) float32 in [0, 1]: fraction of the object, and of the ground.
     """
     is_hidden = photograph_depth < surfaces.z_depth * (1.0 - DEPTH_TOLERANCE)
     is_ground = torch.zeros_like(is_hidden)
@@ -445,9 +457,9 @@ def measure_plane_color(
 ) -> dict[str, float]:
     """Return the settings of the plane's color, sRGB, measured around the object.
 
-    The albedo is the median of the photograph there, divided by what a white plane
-    would show. Empty if the user stated a color, the scene has no plane, or the
-    photograph shows none of it.
+    The albedo is the median color of the photograph around the object, divided by the
+    color that a white plane would have there. The result is empty if the user has set
+    the color, the scene has no plane, or the photograph shows none of it.
 
     Args:
         description: the scene, with the camera of the full photograph.
@@ -522,7 +534,7 @@ def make_matrix_camera(
         size: height and width in pixels of the photographs that it is for.
 
     Raises:
-        InputError: it is no such matrix.
+        InputError: it is not of the form [[fx, skew, cx], [0, fy, cy], [0, 0, 1]].
     """
     matrix = np.asarray(camera_matrix, np.float64)
     is_camera_matrix = (
@@ -631,7 +643,8 @@ def _check_film(photograph: BackdropPhotograph, resolution: tuple[int, int]) -> 
     """
     height, width = photograph.size
     film_height, film_width = resolution
-    # pixels of the photograph in one of the film: what rounding to whole pixels explains
+    # A pixel of the film has that many pixels of the photograph: by so much the width
+    # may differ if the film's sides were rounded.
     rounding = max(width / film_width, height / film_height)
     if abs(film_width / film_height * height - width) <= rounding:
         return
@@ -723,7 +736,7 @@ def compute_view_settings(
     mesh_to_camera = _check_and_map(asset, object_to_camera)
     vertices = asset.mesh.vertices.astype(np.float64)
     middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
-    # of the object, in the camera's coordinates: its z is the depth
+    # center of the object in the camera's coordinates; its z is the depth
     center = mesh_to_camera[:3, :3] @ middle + mesh_to_camera[:3, 3]
     distance = float(center[2])
     if distance <= 0.0:
@@ -741,7 +754,7 @@ def compute_view_settings(
         **_decompose_rotation(rotation),
         "pose.x": float(offset[0]),
         "pose.y": float(offset[1]),
-        # from where its lowest vertex would be at the height 0
+        # Without a shift the object stands with its lowest vertex at the height 0.
         "pose.z": float(offset[2] + middle[2]) + lowest,
         "ground.level": float(offset[2] + middle[2]) + lowest,
     }
@@ -783,8 +796,9 @@ def _compute_orbit(world_axes: Float64Array) -> dict[str, float]:
     """Return the settings of a camera on an orbit, by world axes (3, 3).
 
     The rows are the axes x, y and z of the world in the camera's coordinates (x right,
-    y down, z ahead). Angles in degrees. Raises InputError: it looks straight up or
-    down.
+    y down, z ahead). The angles are in degrees.
+
+    Raises InputError: the camera looks straight up or down.
     """
     # from the object to the camera, in the axes of the world: the camera looks along
     # its own z
@@ -796,7 +810,7 @@ def _compute_orbit(world_axes: Float64Array) -> dict[str, float]:
             f"{MAX_ELEVATION:g} degrees from level, which no camera does that orbits "
             "the object; give another `up`"
         )
-    # to the left and up of a camera without roll
+    # directions to the left and up of a camera without roll, in the world's axes
     level_left = np.array([outwards[1], -outwards[0], 0.0])
     level_left /= np.linalg.norm(level_left)
     upright = np.cross(-outwards, level_left)

@@ -158,14 +158,16 @@ class SceneDescription(SceneData):
     ) -> SceneDescription:
         """Return the scene as it is rendered into a photograph.
 
-        The camera of the scene is the one that took it. It hides the environment, which
-        keeps lighting the object, and the ground is a plane that takes the shadow.
+        The camera of the scene is the one that took the photograph. The photograph is
+        seen in place of the environment, which still lights the object, and the ground
+        is a plane of which only the shadow on it is seen.
 
         Args:
             photograph: a picture file; with the part to use behind its name,
                 ``photo.jpg#X,Y,WIDTH,HEIGHT`` in pixels from the top left corner.
-            occluder: a mask of the photograph's size, white where it shows what is
-                before the object; or its depth (`advsearch.scene.depth_pictures`).
+            occluder: a mask of the photograph's size, white where something is in front
+                of the object; or a picture of the photograph's depth
+                (`advsearch.scene.depth_pictures`).
 
         Raises:
             FileFormatError: the file can not be used.
@@ -220,19 +222,23 @@ class SceneDescription(SceneData):
         object_to_camera: npt.ArrayLike,
         up: npt.ArrayLike | None = None,
     ) -> SceneDescription:
-        """Return the scene as the camera of its photograph was measured to see it.
+        """Return the scene with a measured camera and pose of the object.
 
-        Where the photograph shows the object itself, its shadow is in it already: leave
-        the plane out (``ground.size`` 0).
+        They are those of the photograph that the scene is rendered into. If it shows
+        the object itself, the object's shadow is in it already: then set
+        ``ground.size`` to 0, which leaves the plane out.
 
         Args:
             camera_matrix: intrinsics (3, 3) of the full photograph, in pixels, as
                 OpenCV has them.
-            object_to_camera, up: as for `backdrop.compute_view_settings`.
+            object_to_camera: rigid (4, 4) from coordinates of the object's file to
+                those of the camera: x right, y down, z ahead, in the file's unit.
+            up: (3,) direction in the camera's coordinates that is up in the world;
+                None: the object stands upright.
 
         Raises:
-            InputError: it is rendered into no photograph; or as for
-                `backdrop.compute_view_settings`.
+            InputError: the scene has no photograph; the object's file or size is not
+                known; or the pose is not rigid or puts the object behind the camera.
         """
         if self.backdrop_photograph is None:
             raise InputError(
@@ -254,8 +260,8 @@ class SceneDescription(SceneData):
     ) -> SceneDescription:
         """Return the scene as the camera of one of many photographs sees it.
 
-        The world of the camera file, with z up and in metres, is that of the scene: the
-        object stands at its origin until its pose is set.
+        The world of the camera file (z up, in metres) becomes that of the scene, with
+        the object at its origin until its pose is set.
 
         Args:
             photograph_cameras: cameras of many photographs.
@@ -278,8 +284,8 @@ class SceneDescription(SceneData):
         to_world = pose @ AXES
         to_world[:3, 3] /= self.object.size_in_metres
         model.check_no_fov(self.requested)
-        # of half the width and half the height; the larger one is that of the larger
-        # side
+        # Focal lengths are in widths and heights of the image, so that half a side's
+        # angle has the tangent 0.5 / focal. The field of view is along the larger side.
         tangents = (0.5 / model.values["fx"], 0.5 / model.values["fy"])
         fov = 2.0 * math.degrees(math.atan(max(tangents)))
         cameras = {**self.cameras, spec: PosedCamera(to_world, fov)}
@@ -298,9 +304,9 @@ class SceneDescription(SceneData):
         """Return the scene as one of its cameras sees it, or through another lens.
 
         Args:
-            camera: name of a camera of the scene, or of a mounted one; or, for the
-                camera around the object, the path of a camera file or the name of a
-                bundled camera model.
+            camera: name of a camera of the scene, or of a preset of a mounted camera.
+                Or a lens for the camera around the object: the path of a camera file,
+                or the name of a bundled camera model.
 
         Raises:
             InputError: a setting of the camera around the object was given, and another
@@ -328,7 +334,8 @@ class SceneDescription(SceneData):
     def _with_lens(self, camera: str) -> SceneDescription:
         """Return the scene with the lens of a camera file or a bundled camera model.
 
-        A file with several cameras makes it a rig, whose first camera is the scene's.
+        A file with several cameras makes the scene a rig, whose first camera becomes
+        that of the scene.
 
         Args:
             camera: path of the file, or name of the model.
@@ -367,9 +374,10 @@ class SceneDescription(SceneData):
     def _with_mounted_camera(self, name: str) -> SceneDescription:
         """Return the scene as a mounted camera sees it, by its name in `PRESETS`.
 
-        Its height counts from the floor: that of the place, or the floor that a table
-        with a small object stands on. Settings that were requested stay. The camera
-        stands at the preset's distance, or farther if the object would not fit.
+        A preset is a usual way to mount a camera, with its height in metres above the
+        floor. The floor is that of the place, or the one on which the table of a small
+        object stands. Settings that the user requested stay. The camera stands at the
+        preset's distance, or farther away if the object would not fit into the image.
 
         Raises InputError: the object's size in metres is not known.
         """
@@ -476,8 +484,10 @@ class SceneDescription(SceneData):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a user should know of how the scene was read, and remarks of
-        controls.
+        """Notes for the user: how files were read, and what is doubtful in the scene.
+
+        Each is a sentence. They come from the object's file, its front and size, the
+        environment, the camera, the traffic, and from controls.
         """
         light_notes = () if self.environment is None else self.environment.warnings
         camera_notes = () if self.camera_model is None else self.camera_model.notes
@@ -624,20 +634,26 @@ def load_description(
 ) -> SceneDescription:
     """Find and read an object and an environment, bundled or from a file.
 
-    What stands around a node of a glTF scene or a shape of a Mitsuba scene stays there,
-    without the ground plane, and without a map if it has lights of its own. Arguments
-    and errors that are not listed are as of `advsearch.load_scene`.
+    The object may be one node of a glTF scene, or one shape of a Mitsuba scene. Then
+    the rest of that scene stays around it. There is no ground plane then, and no
+    environment map if the scene has lights of its own.
 
     Args:
         object_spec: name or file of the object; with `plugins` the id of a shape.
-        environment_spec: `NO_ENVIRONMENT` is no map at all.
-        setting_values: settings of the scene by name.
-        up: the up axis of a mesh file.
+        environment_spec: name or file of the environment; None chooses one, and
+            `NO_ENVIRONMENT` is no map at all.
+        setting_values: settings of the scene by name, such as "camera.fov".
+        up: the axis of a mesh file that points up, such as "z".
         facing: the axis of a mesh file that is its front.
         size: longest side of the object, metres.
-        unit: unit of the object's file.
-        plugins: a Mitsuba scene as its loader takes it.
-        things: what stands beside the object.
+        unit: unit of the object's file, such as "cm"; not together with `size`.
+        plugins: a Mitsuba scene as a dictionary, as `mitsuba.load_dict` takes it.
+        things: what stands beside the object, such as "car@12,3.5,heading=180".
+
+    Raises:
+        FileFormatError: a file cannot be used.
+        InputError: arguments or settings are out of range or contradict each other.
+        UnknownNameError: there is no object, environment or setting of such a name.
     """
     setting_values = setting_values or {}
     values = settings.resolve_settings(setting_values)

@@ -256,8 +256,8 @@ class TextureTransport:
         Args:
             image_shape: (height, width) of the image, whose pixels are the rows.
             texture_shape: (height, width) of the texture.
-            small: store the finished matrices in 16 bits, which takes half the memory,
-                and unpack them for each product.
+            small: store the finished matrices in 16 bits to save memory, and unpack
+                them for each product.
         """
         self._image_shape = image_shape
         self._texture_shape = texture_shape
