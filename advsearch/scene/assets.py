@@ -595,13 +595,13 @@ def describe_size_doubts(
     the file's extent tell which unit would fit: a "car" of extent 450 is in
     centimetres. A size that the user has given is never doubted.
 
-    Returns:
-        One remark, or none.
-
     Args:
         asset: the object.
         has_user_size: whether the user has given its size.
         needs_metres: whether something in the scene is in metres, such as the road.
+
+    Returns:
+        One remark, or none.
     """
     kind = _find_usual_kind(asset.name)
     usual_sizes = PLAUSIBLE_SIZES if kind is None else USUAL_SIZES[kind]

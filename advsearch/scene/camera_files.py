@@ -192,14 +192,16 @@ def read_camera(spec: str) -> CameraModel:
 
 
 def make_camera(spec: str, entries: Mapping[str, Any]) -> CameraModel:
-    """Return the camera's model that the entries of a file describe.
+    """Return the camera model that the entries of a file describe.
 
     Args:
-        spec: as for `read_camera`; the file is not read.
-        entries: what is in the file, by name.
+        spec: path of the file, with the name of one of its cameras behind a #:
+            ``calib.yaml#cam1``. It is used for messages and names; nothing is read.
+        entries: contents of the file, by name.
 
     Raises:
-        FileFormatError: as for `read_camera`.
+        FileFormatError: the projection is another one, numbers are missing or those of
+            no camera, or the camera that is named is not there.
     """
     path, _, camera_name = spec.partition("#")
     data = {name: value for name, value in entries.items() if name not in VIEW_KEYS}
@@ -306,8 +308,11 @@ def _parse_file(path: str, text: str) -> dict[str, Any]:
 def _parse_xml(path: str, text: str) -> dict[str, Any]:
     """Parse a camera of OpenCV or Metashape in XML.
 
-    A matrix becomes the list of its words, an element with others in it a dictionary,
-    and any other its text. Raises FileFormatError for other XML.
+    An element with `data` is a matrix, and becomes the list of its words. Another element
+    with elements in it becomes a dictionary, and any other its text.
+
+    Raises FileFormatError: it is no XML of these two, or declares entities, by which a
+    small file could become very large.
     """
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise FileFormatError(
@@ -340,8 +345,14 @@ def _read_colmap(
 ) -> CameraModel:
     """Return the model of a camera of COLMAP's cameras.txt.
 
-    A line has CAMERA_ID, MODEL, WIDTH, HEIGHT and the model's parameters; one focal
-    length stands for both.
+    A line has CAMERA_ID, MODEL, WIDTH, HEIGHT and the model's parameters. Some models
+    have one focal length f for both axes.
+
+    Args:
+        spec: the file, and perhaps the camera in it.
+        path: the file, for messages.
+        camera_name: its CAMERA_ID; "" if the user has not named one.
+        lines: the lines of the file without comments.
     """
     words_by_id = {line.split()[0]: line.split() for line in lines if line.split()}
     if len(words_by_id) < len(lines):
@@ -380,8 +391,13 @@ def _read_nerfstudio(
 ) -> CameraModel:
     """Return the model of a transforms.json, or of one of its frames.
 
-    Entries of the frame win over those of all; the principal point is the center by
-    default.
+    An entry of the frame replaces the entry of the same name that holds for all frames.
+    A principal point that is missing is the center of the image.
+
+    Args:
+        spec: the file, and perhaps the frame in it.
+        camera_name: name of the frame; "" if the user has not named one.
+        data: all entries of the file.
     """
     path = spec.partition("#")[0]
     frames = _list_frames(data)
@@ -448,14 +464,14 @@ def _read_focal_lengths(
 ) -> dict[str, float]:
     """Return fx and fy in pixels, from lengths or from angles of view.
 
-    A length wins over an angle. fy is fx where the file has neither for y.
+    If the file has both, the length counts. If it has neither for y, fy is fx.
 
     Args:
         path: the file, for messages.
         data: all entries of the file, which may have the angles, radians.
-        entries: those of the camera, which may have the lengths.
+        entries: entries of the camera, which may have the lengths.
         width: width of the image in pixels.
-        height: likewise.
+        height: height of the image in pixels.
 
     Raises:
         FileFormatError: length and angle along x contradict each other, or both are
@@ -598,8 +614,8 @@ def _find_opencv_kind(path: str, entries: Entries) -> str:
 def _read_camera_matrix(path: str, entries: Entries) -> list[float]:
     """Return the camera matrix, nine numbers row by row.
 
-    It is made of fx, fy, cx and cy if only these are there. One that is written column
-    by column, with cx and cy in its last row, is transposed.
+    If the file has only fx, fy, cx and cy, the matrix is made of them. Some tools write
+    it column by column, with cx and cy in the last row: then it is transposed.
 
     Raises:
         FileFormatError: it is missing, all zeros, or no camera matrix.
@@ -617,7 +633,7 @@ def _read_camera_matrix(path: str, entries: Entries) -> list[float]:
             "as ROS says of one that is not calibrated; calibrate it, and give the "
             "file that this writes"
         )
-    # skew, cx and cy are 0, and the last row is not
+    # Written by columns, the skew, cx and cy are where a camera matrix has zeros.
     is_by_columns = not any(matrix[index] for index in (1, 2, 5)) and any(matrix[6:8])
     if is_by_columns:  # as Open3D and ARKit write it
         matrix = [matrix[3 * column + row] for row in range(3) for column in range(3)]
@@ -641,9 +657,13 @@ def _read_distortion(
     """Return the distortion coefficients, from a list or from single entries.
 
     Args:
-        entries: those of the camera.
-        names: the coefficients in the order of the list.
+        entries: entries of the camera.
+        names: names of the coefficients, in the order of the list.
         counts: the lengths that the list may have.
+
+    Raises:
+        FileFormatError: the list has another length, or there are coefficients though
+            the model is "none".
     """
     distortion = entries.get(*DISTORTION_KEYS)
     # a matrix (a mapping) is a list even if it is all zeros

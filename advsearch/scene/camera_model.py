@@ -233,9 +233,9 @@ class CameraModel:
     def _invert_radial(self, target: Tensor, max_value: float) -> tuple[Tensor, Tensor]:
         """Solve radial(x) = target for x within [0, max_value], where radial grows.
 
-        By Newton's method. Each solution has a bracket, two bounds between which it
-        lies, and which every step narrows; a step that would leave the bracket is
-        replaced by its middle.
+        The method is Newton's, guarded by bisection. Two bounds enclose each solution,
+        and every step narrows them. A step that would leave the bounds goes to their
+        middle instead.
 
         Args:
             target: (N,) distorted radii.
@@ -262,7 +262,8 @@ class CameraModel:
             is_within = (newton_radius > lower) & (newton_radius < upper)
             radius = torch.where(is_within, newton_radius, (lower + upper) / 2.0)
         residual = (self._distort_radius(radius) - target).abs()
-        # 1e3: a solution whose bracket was narrow has a larger residual
+        # A solution may also have been accepted because its bounds were close to each
+        # other. Its residual may be larger, hence the factor of 1e3.
         return radius, residual <= 1e3 * TOLERANCE * (1.0 + target)
 
     def _find_upper_bound(self, target: Tensor, max_value: float) -> float:
@@ -286,12 +287,12 @@ class CameraModel:
     ) -> tuple[Tensor, Tensor]:
         """Solve distort(x) = distorted for points x by Newton's method.
 
-        A step that leaves the circle of `max_radius` ends at its border, and one that
+        A step that leaves the circle of `max_radius` is cut at the circle, and one that
         is not finite is not taken.
 
         Args:
-            undistorted: (N, 2) where it starts.
-            distorted: (N, 2).
+            undistorted: (N, 2) points at which the iteration starts.
+            distorted: (N, 2) distorted points to which solutions are searched.
             max_radius: largest radius of a solution.
 
         Returns:
@@ -302,7 +303,8 @@ class CameraModel:
             values, jacobian_rows = _evaluate_with_jacobian(self._distort, undistorted)
             residual = values - distorted
             step, determinant = _solve_two_by_two(jacobian_rows, residual)
-            # the determinant of the distortion's derivative is 0 where the lens folds
+            # Where the determinant of the distortion's derivative is 0 the lens folds:
+            # beyond, two points have the same image. Such solutions do not count.
             is_inside = (determinant > 0.0) & (undistorted.norm(dim=-1) < max_radius)
             converged = is_inside & (
                 residual.norm(dim=-1) <= TOLERANCE * (1.0 + distorted.norm(dim=-1))
@@ -401,11 +403,12 @@ class CameraModel:
 
     @cached_property
     def visible_tangents(self) -> tuple[float, float]:
-        """Half the sides, as tangents, of a rectangle around the axis inside the image.
+        """Half width and half height, as tangents, of a rectangle inside the image.
 
-        It is the rectangle of `_compute_edge_tangents`, shrunk in steps of 2 % until
-        all of its border is visible and in the image; if it never is, 2 % of it. A lens
-        bends the border, so that the corners may be outside at first.
+        The rectangle is centered on the optical axis. It reaches the image's edges, and
+        is then shrunk in steps of 2 % until all of its border is in the image: a lens
+        bends the border, so that the corners may be outside. If no step suffices, 2 %
+        of the size remain.
         """
         edges = self._compute_edge_tangents()
         # 17 points on each side of the rectangle

@@ -337,8 +337,8 @@ def _compute_distant_light(
     # For directions that point up it means nothing, and they are left out below.
     distance = center[2] / np.maximum(-directions[:, 2:], 1e-9)
     offset = np.abs(center[:2] + directions[:, :2] * distance)
-    # A photographed or paved ground is a part of the map, whose lower half then has the
-    # light from below already.
+    # Over a photographed or paved ground, the lower half of the map has the light from
+    # below already.
     has_plain_ground = scene.photograph is None and not is_paved(scene)
     in_reach = (offset <= scene.get_number("ground.size") / 2.0).all(axis=1)
     hits = has_plain_ground & ~is_up & in_reach

@@ -307,10 +307,12 @@ def _reach_of_area(area: Box | float, azimuth: float) -> float:
 def find_surroundings(scene: SceneData) -> Surroundings | None:
     """Return what is known of the place that a scene's environment is a picture of.
 
-    In metres. None if nothing of the picture has to fit a ground.
+    A picture looks right only from near the point where it was taken. The result has
+    the height from which that was, the distance of the nearest things in it, and where
+    the ground ends, in metres. It is None if no ground has to fit the picture.
     """
     environment = scene.environment
-    # what encloses the object is geometry, true from everywhere
+    # An enclosing place is geometry, which looks right from everywhere.
     if environment is None or scene.backdrop or is_enclosed(scene):
         return None
     place = find_place(scene)
@@ -321,7 +323,8 @@ def find_surroundings(scene: SceneData) -> Surroundings | None:
         environment.place if bundled is None else load_bundled_place(*bundled)
     )
     picture = None if captured_site is None else captured_site.file.picture
-    # the place stands around as geometry too: the limits of its picture hold
+    # The near part of the place is geometry, and the far part a picture, whose limits the
+    # place's file states.
     if place is not None and picture is not None:
         return Surroundings(
             height=picture.height,
@@ -329,8 +332,8 @@ def find_surroundings(scene: SceneData) -> Surroundings | None:
             ground_extent=extent,
             rotation=scene.get_number("environment.rotation"),
         )
-    # a photograph over a ground, with the limits of its camera's height and of the
-    # empty floor around it
+    # A photographed map over a ground: the limits are the height of its camera, and the
+    # radius of the empty floor around it.
     if environment.photographed and (is_paved(scene) or scene.photograph is not None):
         height = scene.capture_height * scene.size_in_metres
         radius = scene.values.get("ground.radius")
@@ -339,7 +342,7 @@ def find_surroundings(scene: SceneData) -> Surroundings | None:
         return Surroundings(height, radius, extent)
     if not is_paved(scene):
         return None
-    # only the end of the ground counts
+    # Any other map is taken for infinitely far: only the end of the ground counts.
     return Surroundings(math.inf, math.inf, extent)
 
 
@@ -358,10 +361,9 @@ def make_camera_view(
     to_world: Float64Array | None = None,
     fov: float | None = None,
 ) -> CameraView:
-    """Return how a scene is looked at, in metres.
+    """Return where a camera is, in metres, and in which direction it looks.
 
-    That is by its own camera, or by one with another pose. A camera that looks straight
-    down counts as looking to the object.
+    A camera that looks straight down counts as looking towards the object.
 
     Args:
         scene: the scene.
@@ -374,7 +376,8 @@ def make_camera_view(
     if fov is None:
         fov = scene.get_number("camera.fov")
     half_fov = math.radians(fov) / 2.0
-    # the height of an image is its larger side, or smaller than that by the aspect
+    # The field of view is along the larger side: that is the height, or else the height
+    # is smaller by the aspect.
     half_height_angle = math.degrees(
         math.atan(math.tan(half_fov) * min(1.0, 1.0 / scene.aspect))
     )
@@ -420,16 +423,15 @@ def _describe_views_beyond(n_beyond: int, n_views: int) -> str:
 def list_view_remarks(
     scene: SceneData, views: Sequence[CameraView], *, rotates_map: bool = False
 ) -> tuple[str, ...]:
-    """Return remarks where views go past what an environment's picture is valid for.
+    """Return a remark if views go beyond what an environment's picture is valid for.
 
-    A remark on views outside of the place wins; the next is that the map is rotated
-    against the road; the last that views are too far or too high. At most one is
-    returned.
+    At most one remark is returned, the first of these that applies: views are outside
+    of the place; the map is rotated against the road; views are too far or too high.
 
     Args:
-        scene: scene that is looked at.
-        views: at least one.
-        rotates_map: whether the map is rotated from view to view.
+        scene: the scene.
+        views: positions and directions of its camera, at least one.
+        rotates_map: whether the map's rotation differs from view to view.
     """
     surroundings = find_surroundings(scene)
     place = find_place(scene)
@@ -437,7 +439,8 @@ def list_view_remarks(
     if outside or surroundings is None:
         return outside
     is_against_road = find_valid_range(surroundings, views[0]) == NO_RANGE
-    # houses are a box beside the road, other surroundings are equally far all around
+    # Houses along a road are at different distances in x and y, which are a tuple. Other
+    # surroundings are equally far in all directions.
     has_houses = isinstance(surroundings.nearest_distance, tuple)
     if is_against_road or (rotates_map and has_houses):
         return (
@@ -453,7 +456,12 @@ def _list_range_remarks(
 ) -> tuple[str, ...]:
     """Return a remark if views are too far or too high for an environment's picture.
 
-    Arguments are as for `list_view_remarks`; empty if no view is.
+    The result is empty if all views are within the limits.
+
+    Args:
+        scene: the scene.
+        surroundings: the place that the environment is a picture of.
+        views: positions and directions of its camera, at least one.
     """
     limits = [find_valid_range(surroundings, view) for view in views]
     views_beyond = [
@@ -506,12 +514,12 @@ def _describe_position(position: Float64Array) -> str:
 def list_outside_remarks(
     scene: SceneData, place: Place, views: Sequence[CameraView]
 ) -> tuple[str, ...]:
-    """Return a remark where views are outside of what the place is valid for.
+    """Return a remark if views are outside of the box that a place is valid for.
 
     Args:
-        scene: scene that is looked at.
-        place: place of the scene.
-        views: at least one.
+        scene: the scene.
+        place: its place, whose file states the box.
+        views: positions and directions of its camera, at least one.
     """
     axis_limits = [
         (axis, limits) for axis, limits in place.file.valid if limits is not None

@@ -42,11 +42,18 @@ MATERIAL_MAP_SIDE = 256  # texels along the maps of roughness, metal and clear c
 def make_finished_surface(
     mesh: Mesh, finishes: Mapping[str, Material], main: Material
 ) -> dict[str, object]:
-    """Return a principled surface, in Mitsuba's words, as `ObjectAsset.surface` has it.
+    """Return Mitsuba's description of a principled surface with several finishes.
 
-    Some materials of the mesh are as `finishes` say, by name, and all other faces like
-    `main`, whose `specular` holds for all. Roughness, metallic and clear coat become
-    textures whose texels are not interpolated.
+    Roughness, metallic and clear coat become textures. Their texels are not
+    interpolated, so that the border between two materials stays sharp.
+
+    Args:
+        mesh: mesh whose faces have materials by name.
+        finishes: numbers of some materials, by name.
+        main: numbers of all other faces. Its `specular` holds for all faces.
+
+    Returns:
+        A dictionary as `ObjectAsset.surface` has it.
     """
     face_values = np.tile(
         [main.roughness, main.metallic, main.clearcoat], (len(mesh.faces), 1)
@@ -180,8 +187,8 @@ def _read_mesh(
     Args:
         name: name of the object, for messages.
         directory: directory of its files.
-        material_runs: names of materials, each with how many faces in a row have it;
-            empty: the mesh has no materials by name.
+        material_runs: in the order of the faces, a material's name and how many
+            successive faces have it. It is empty if the mesh has no named materials.
     """
     # (F,) name of each face's material
     material_of_face = np.repeat(

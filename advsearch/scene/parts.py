@@ -425,10 +425,11 @@ def make_polygon(corners: int) -> Mesh:
 def make_sphere(rows: int, columns: int) -> Mesh:
     """Return a sphere of diameter 1 around the origin.
 
-    It has `rows` bands from pole to pole and `columns` around. Each cell between them
-    is two faces, and one at the poles, where the other would have no area: 2 (rows - 1)
-    times `columns` in all. v is 1 at the top; u goes around from +x to +y. Vertices
-    lie row by row from the bottom, `columns` + 1 in each, as a seam needs both ends.
+    A grid of `rows` bands from pole to pole and `columns` around divides it into cells.
+    A cell has two faces, but only one at a pole, where the other would have no area. So
+    there are 2 (rows - 1) columns faces. The texture coordinate v is 1 at the top, and
+    u goes around from +x to +y. Vertices are in rows from the bottom, with columns + 1
+    in each: the first and the last are at one position, where u is 0 and 1.
     """
     v, u = (
         array.ravel()

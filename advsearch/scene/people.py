@@ -194,6 +194,10 @@ class Person:
 
         Lengths become metres. Weights, which are stored as integers, are divided so
         that those of a point sum to 1.
+
+        Args:
+            data: arrays of the file of a body, by name.
+            defaults: values of parameters that differ from their usual defaults.
         """
         default_by_name = {
             parameter.name: float(parameter.default) for parameter in PARAMETERS
@@ -264,16 +268,19 @@ class Person:
     def _compute_leg_corrections(
         self, points: Tensor, joints: Tensor, number_by_name: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return by how many metres each foot has to rise, "l" and "r".
+        """Return by how many metres each foot has to rise so that the walk is on ground.
 
-        Then a foot in stance touches the ground. The heights are those of the shoes'
-        lowest points with the walk alone: joint angles that a user sets on top are left
-        as they are, so a raised foot stays raised.
+        With the correction, a foot in stance touches the ground. It is computed for the
+        walk alone, without the joint angles that a user sets in addition: a foot that
+        the user raises stays raised.
 
         Args:
-            points: (P, 3) in the rest pose, without the joints.
-            joints: (J, 3) in the rest pose.
-            number_by_name: the values of all parameters.
+            points: (P, 3) points of the body in the rest pose.
+            joints: (J, 3) positions of the joints in the rest pose.
+            number_by_name: scalar tensors of all parameters.
+
+        Returns:
+            The rise of the left foot, "l", and of the right one, "r".
         """
         zero = torch.zeros_like(number_by_name["walk"])
         without_joints = {parameter.name: zero for parameter in (*SPINE, *_JOINTS)}
@@ -300,18 +307,19 @@ class Person:
         joints: Tensor,
         foot_rises: Mapping[str, Tensor],
     ) -> Tensor:
-        """Return posed points (P, 3) with feet risen, and legs stretched in proportion.
+        """Return posed points (P, 3) with feet raised, and legs stretched in proportion.
 
         A point of the foot rises by all of the foot's rise. A point of the leg rises by
-        the fraction of the way from hip (0) to ankle (1) at which it is. Points count
-        by their skinning weights for these bones, so that the body stays as it is.
+        a fraction of it, from 0 at the hip to 1 at the ankle. Each rise is multiplied by
+        the point's skinning weight for these bones, so that the rest of the body stays
+        as it is.
 
         Args:
             posed: (P, 3) points after skinning.
-            rotations, translations: rotations and translations of the bones, see
-                `_pose_bones`.
-            joints: (J, 3) in the rest pose.
-            foot_rises: how much each foot rises, "l" and "r".
+            rotations: (J, 3, 3) rotations of the bones.
+            translations: (J, 3): a point p of a bone moves to rotation p + translation.
+            joints: (J, 3) positions of the joints in the rest pose.
+            foot_rises: metres by which the left ("l") and the right foot ("r") rise.
         """
         weights = self._get_tensor("weights", posed.device)
         rise = torch.zeros_like(posed[:, 2])
@@ -366,6 +374,10 @@ class Person:
     ) -> tuple[Tensor, Tensor]:
         """Return the mixture of extreme bodies, and the scale that it still needs.
 
+        Args:
+            number_by_name: scalar tensors of the parameters; gender, age, weight and
+                height are read.
+
         Returns:
             (G, A, W, H) weights of the extremes of gender, age, weight and height,
             which sum to 1; and the factor to the requested height.
@@ -381,7 +393,8 @@ class Person:
             number_by_name["weight"],
             number_by_name["weight"].new_tensor([0.0, 0.5, 1.0]),
         )
-        # (G, A, W); and heights (H,) of bodies so mixed, at the three extremes
+        # The mixture (G, A, W) without the height, and the heights (H,) in metres of the
+        # shortest, the average and the tallest body of that mixture.
         mixture = torch.einsum(
             "g,a,w->gaw", gender_weights, age_weights, weight_weights
         )
@@ -419,14 +432,14 @@ class Person:
     ) -> tuple[Tensor, Tensor]:
         """Return the rotation (J, 3, 3) and translation (J, 3) of each bone.
 
-        A point p moves to `rotation @ p + translation`. A bone's rotation is first the
-        one that makes it straight, from the rest pose to all angles 0; then its own
-        joint's and those of its ancestors' joints. Its joint goes where the parent bone
-        puts it. Bones come after their parents, which is why one pass is enough.
+        A point p moves to `rotation @ p + translation`. A bone is rotated first from the
+        rest pose to the pose with all angles 0, in which limbs are straight; then by its
+        own joint and by those of all its ancestors. Its joint goes where the parent bone
+        moves it. Bones come after their parents, so that one pass is enough.
 
         Args:
-            joints: (J, 3) positions in the rest pose.
-            angle_by_joint: degrees.
+            joints: (J, 3) positions of the joints in the rest pose.
+            angle_by_joint: degrees by parameter, such as "left_knee".
         """
         straight_rotations = self._compute_straight_turns(joints)
         rotation_by_bone = compute_joint_turns(angle_by_joint)
@@ -447,7 +460,8 @@ class Person:
             rotations.append(rotation @ straight_rotations.get(bone, identity))
             positions.append(position)
         all_rotations = torch.stack(rotations)
-        # so that the joint itself moves to its position
+        # The translation is position - rotation joint, so that the joint itself moves to
+        # its position.
         return all_rotations, torch.stack(positions) - torch.einsum(
             "jik,jk->ji", all_rotations, joints
         )
@@ -507,9 +521,13 @@ def compute_interpolation_weights(value: Tensor, nodes: Tensor) -> Tensor:
 def add_walk(angle_by_name: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return the angles of joints with those of a walk added, within their limits.
 
-    A walk swings each joint by `GAIT`, scaled by the stride; the right side is half a
-    cycle behind the left. All are scalar tensors by parameter, degrees; other
-    parameters are returned as they are.
+    `GAIT` has the angles of each joint over one cycle, which the stride multiplies. The
+    right side is half a cycle behind the left.
+
+    Args:
+        angle_by_name: scalar tensors by parameter, degrees: "walk" is the phase of the
+            cycle, and "stride" the factor. Other parameters, which are no angles, are
+            returned as they are.
     """
     angle_by_joint = dict(angle_by_name)
     phase = torch.deg2rad(angle_by_name["walk"])
@@ -626,8 +644,11 @@ def _correct_heights(
 def compute_joint_turns(angle: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return each bone's rotation (3, 3) against its parent, by the bone's name.
 
-    About the body's axes: x ahead, y to its left, z up. Bones without a parameter are
-    left out. `angle` are degrees by parameter.
+    Rotations are about the body's axes: x ahead, y to its left, z up. Bones that no
+    parameter rotates are left out.
+
+    Args:
+        angle: degrees by parameter, such as "left_knee".
     """
     # The back bends in three equal parts; neck and head have a half each.
     spine, side, turn = (
@@ -656,10 +677,11 @@ def compute_joint_turns(angle: Mapping[str, Tensor]) -> dict[str, Tensor]:
 def _compute_limb_turns(
     angle_by_joint: Mapping[str, Tensor], side: str, sign: float
 ) -> dict[str, Tensor]:
-    """Return the turns (3, 3) of the bones of arm and leg of a side, by bone.
+    """Return the rotations (3, 3) of the bones of one arm and one leg, by bone.
 
-    With all angles 0 a limb hangs down. About y (to the left) a negative angle raises
-    it ahead; about x (ahead) a positive one raises the left one to its side.
+    With all angles 0 a limb hangs down. A rotation about y (to the left) by a negative
+    angle raises it to the front. One about x (ahead) by a positive angle raises the
+    left limb to its side.
 
     Args:
         angle_by_joint: degrees by parameter, such as "left_knee".

@@ -128,7 +128,7 @@ def read_photograph_folder(
 ) -> dict[str, PhotographView]:
     """Read the camera files of all photographs of a folder.
 
-    Other files, hidden ones and folders in it are not looked at.
+    Other files, hidden files and subfolders are ignored.
 
     Args:
         folder: the folder.
@@ -140,9 +140,9 @@ def read_photograph_folder(
 
     Raises:
         FileFormatError: there are no photographs or too many, or they have too many
-            pixels; one needs a camera file and has none, or its file states other
-            things than that of the first; a file leads out of the folder or cannot be
-            used.
+            pixels; a camera file is missing, or does not state the same kinds of
+            things as the first one; a link leads out of the folder; or a file cannot
+            be used.
     """
     directory = Path(folder)
     views: dict[str, PhotographView] = {}
@@ -224,8 +224,8 @@ def _parse_view(
 
     Args:
         file: path of the camera file.
-        photograph: path of the photograph that it stands beside.
-        entries: entries of the file, by name.
+        photograph: path of its photograph, in the same folder.
+        entries: entries of the camera file, by name.
     """
     stated = {name: entries[name] for name in VIEW_KEYS & entries.keys()}
     has_lens = bool(entries.keys() - VIEW_KEYS)  # all else is about the lens
@@ -332,8 +332,9 @@ def put_into_photograph(
     Args:
         description: the scene.
         view: the photograph, and what its camera file states.
-        camera: a camera in the place of the file's, or the cameras of many photographs.
-        occluder: a mask in the place of the file's.
+        camera: replaces the camera of the camera file: a camera file or a name, or the
+            cameras of many photographs, of which that of this photograph is taken.
+        occluder: replaces the mask of what is before the object.
 
     Raises:
         FileFormatError: a file cannot be used.
@@ -344,8 +345,8 @@ def put_into_photograph(
         for name, value in view.settings.items()
         if name not in description.requested
     }
-    # As if the user had requested them: a control may not vary the ground, say. It may
-    # vary the pose.
+    # What the file states counts as requested by the user, so that a control may not
+    # vary the ground, for example. Camera and pose may be varied.
     fixed = {name for name in stated if not name.startswith(("camera.", "pose."))}
     scene = replace(
         description,

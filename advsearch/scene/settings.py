@@ -85,10 +85,21 @@ class Parameter:
         periodic: bool = False,
         log: bool = False,
     ) -> Parameter:
-        """Make a parameter that is one number and moves no outlines.
+        """Make a parameter that is one number and moves no outlines in the image.
 
-        See `moving` for one that does, and `Parameter` for the arguments: `text` is its
-        description.
+        `Parameter.moving` makes one that does.
+
+        Args:
+            estimators: valid estimators of its derivative, the preferred one first.
+            name: name without the control's, such as "roughness".
+            unit: unit, such as "degrees"; "1" for none.
+            low: smallest value.
+            high: largest value.
+            default: default value; a text says how the scene computes it.
+            text: description for the user.
+            search: range of a search by default; None: all values.
+            periodic: whether `high` is the same as `low`, as for an angle.
+            log: whether a search takes even steps of the logarithm.
         """
         return cls(
             name=name,
@@ -120,7 +131,20 @@ class Parameter:
         periodic: bool = False,
         log: bool = False,
     ) -> Parameter:
-        """Make a number that can move an outline in the image."""
+        """Make a parameter that is one number and can move an outline in the image.
+
+        Args:
+            estimators: valid estimators of its derivative, the preferred one first.
+            name: name without the control's, such as "yaw".
+            unit: unit, such as "degrees"; "1" for none.
+            low: smallest value.
+            high: largest value.
+            default: default value; a text says how the scene computes it.
+            text: description for the user.
+            search: range of a search by default; None: all values.
+            periodic: whether `high` is the same as `low`, as for an angle.
+            log: whether a search takes even steps of the logarithm.
+        """
         return cls(
             name=name,
             shape=(),
@@ -174,7 +198,13 @@ class Parameter:
     ) -> tuple[Parameter, ...]:
         """Make the three parameters of a color, display-referred sRGB.
 
-        The text goes on behind "Red", "Green", "Blue".
+        Args:
+            text: description for the user, to which "Red", "Green" or "Blue" is the
+                beginning: "of the ground" becomes "Red of the ground".
+            search: range of a search by default; None: all values.
+            low: smallest value of each channel; the largest is 1.
+            defaults: default values of red, green and blue.
+            estimators: valid estimators of the derivative, the preferred one first.
         """
         descriptions = [f"{name.capitalize()} {text}" for name in CHANNELS]
         return tuple(
@@ -644,10 +674,14 @@ def parse_mesh_name(name: str) -> str | None:
 
 
 def resolve_settings(settings: SettingValues) -> dict[str, float | None]:
-    """Return every setting's value: the defaults, and over them what was given.
+    """Return every setting's value: the user's, or else the default.
 
-    None where the scene works a value out. A choice has the index of its option.
-    Settings of meshes around the object are there where they were given.
+    The value is None if the scene computes it, as the camera's distance from the object.
+    The value of a choice is the index of its option. Settings of meshes around the
+    object are included only if the user has given them.
+
+    Args:
+        settings: the user's values by name, such as {"camera.fov": 40}.
 
     Raises:
         InputError: a value is not a finite number inside its range, or two settings

@@ -86,13 +86,18 @@ class ThingPart(MeshPart):
 
 
 def parse_things(things_spec: str | None) -> tuple[RequestedThing, ...]:
-    """Read the things of a setting, see above.
+    """Parse the setting that names things beside the object.
 
-    They are separated by semicolons. A name that is taken gets a number behind it,
-    unless it was chosen with `name=`.
+    Things are separated by semicolons, as in "car@12,3.5,heading=180; person@4,-2". If
+    the name of a thing is taken, a number is added to it ("car-2"), unless the user has
+    chosen it with `name=`.
+
+    Args:
+        things_spec: the setting; None or empty for no things.
 
     Raises:
-        InputError: it is invalid, or has more than `MAX_THINGS`.
+        InputError: a thing is not written so, a chosen name is taken, or there are more
+            than `MAX_THINGS`.
     """
     things: list[RequestedThing] = []
     for part in filter(None, map(str.strip, (things_spec or "").split(";"))):
@@ -116,10 +121,14 @@ def parse_things(things_spec: str | None) -> tuple[RequestedThing, ...]:
 
 
 def _parse_thing(part: str) -> RequestedThing:
-    """Read one thing of a setting, see `parse_things`.
+    """Parse one thing, such as "car@12,3.5,heading=180".
 
-    The name is that of the object unless it has one of its own. Raises InputError,
-    UnknownNameError: it is not as described there.
+    Before the @ is the name or file of its object; behind it are x and y in metres, and
+    options: heading, size, name, label, lamps and facing. Without `name=` the thing is
+    named after its object.
+
+    Raises InputError, UnknownNameError: it is not written so, or a number or an option
+    is not valid.
     """
     object_spec, separator, rest = part.rpartition("@")
     object_spec = object_spec.strip()
@@ -144,7 +153,7 @@ def _parse_thing(part: str) -> RequestedThing:
     size = None
     if "size" in options:
         size = _parse_number(part, "size", options["size"], MIN_METRES, MAX_METRES)
-    # without the part of the file that is behind a #
+    # what is behind a # names a part of a file, as in scene.glb#chair
     name = make_safe_name(Path(options.get("name") or object_spec.partition("#")[0]))
     return RequestedThing(
         object_spec=object_spec,
@@ -236,9 +245,16 @@ def _make_thing(
 ) -> tuple[ThingPart, list[str]]:
     """Return a thing that stands in a scene, and remarks on it.
 
-    Remarks are those of its file, doubts about its size, and where there are lanes a
-    guess of its front. `thing` is what was asked for; other arguments and errors are as
-    for `add_things`.
+    Remarks are notes on its file, doubts about its size and, if the ground has lanes,
+    that its front was guessed.
+
+    Args:
+        scene: the scene.
+        thing: what the user has requested.
+        load: loads an object by its name or file, and the axis that is its front.
+
+    Raises:
+        InputError: its size in metres is not known, or its name is taken.
     """
     object_spec = thing.object_spec
     name = thing.name
@@ -394,13 +410,17 @@ def add_solid_remarks(scene: AnyScene) -> AnyScene:
 def list_camera_remarks(
     scene: SceneData, eyes: Sequence[Float64Array]
 ) -> tuple[str, ...]:
-    """Return a remark where cameras are inside a solid of the place; empty if none is.
+    """Return a remark if cameras are inside a solid of the place, such as a house.
 
-    `eyes` are their positions (3,) in metres, at least one.
+    The result is empty if none is.
+
+    Args:
+        scene: the scene.
+        eyes: positions (3,) of the cameras in metres, at least one.
     """
     solid_names = list[str]()
     for eye in eyes:
-        # A camera is a tiny square.
+        # Overlap is defined for footprints, so that the camera is taken for a tiny square.
         x, y, z = eye / scene.size_in_metres
         corners = np.array(
             [(x - EYE_SIZE, y), (x, y - EYE_SIZE), (x + EYE_SIZE, y), (x, y + EYE_SIZE)]
