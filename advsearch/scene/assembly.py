@@ -91,9 +91,12 @@ class MovingMesh:
     def _compute_area_normals(self, vertices: Tensor) -> Tensor:
         """Return the unit normals (V, 3) that follow from the faces, weighted by area.
 
-        Vertices at one position with one normal (a UV seam splits them) share the mean
-        of all their faces; those with different normals do not, so that creases stay
-        creases. `vertices` are (V, 3) positions of the mesh's vertices.
+        At a UV seam there are several vertices at one position with one normal. They
+        share the mean of all their faces. Vertices at one position with different
+        normals do not, so that creases stay sharp.
+
+        Args:
+            vertices: (V, 3) positions of the mesh's vertices.
         """
         # (F, 3) vertices of the faces, and (V,) the group of vertices that share a mean
         faces, groups = (indices.to(vertices.device) for indices in self._shared_groups)
@@ -279,10 +282,13 @@ class Assembly:
         return {**inputs, name: pose}
 
     def _get_image_inputs(self, photograph: int) -> dict[str, Tensor]:
-        """Return what a photograph adds to the image; it is read once.
+        """Return the inputs that a photograph adds to the finished image.
+
+        They are computed on first use, and stored.
 
         Args:
-            photograph: its index among those of the scene's folder; 0 without one.
+            photograph: index of the photograph in the scene's folder; 0 if the scene has
+                no folder of photographs.
         """
         if self._resolution is None:
             return {}
@@ -346,12 +352,12 @@ def write_central_differences(
 ) -> None:
     """Write the central differences of a function into a derivative, in place.
 
-    Each is the rise of the function between two points, divided by their distance: at
-    the border of the box that is less than twice the step.
+    A difference is the rise of the function between two points, divided by their
+    distance. The distance is twice the step, or less at the border of the unit cube.
 
     Args:
-        value: from a configuration (d,) to a number.
-        group: the coordinates, and the half-width of the differences.
+        value: maps a configuration (d,) to a scalar.
+        group: the coordinates, and the step, which is half the distance.
         u: (d,) configuration.
         derivative: (d,) into which the slopes of the group are written.
     """

@@ -353,15 +353,19 @@ TEXTURE_CELLS = 32
 
 
 def _merge_clusters(mesh: Mesh, cluster_of: IntArray) -> tuple[IntArray, IntArray]:
-    """Merge the vertices of each cluster that lie in one cell of the texture.
+    """Merge the vertices of each cluster that are in one cell of the texture.
+
+    The texture is divided into cells so that vertices on both sides of a seam, which
+    are far apart in it, stay distinct.
 
     Args:
         mesh: the full mesh.
         cluster_of: (V,) cluster of each vertex.
 
     Returns:
-        For each new vertex (N,) one of the vertices that it stands for; and the faces
-        (F, 3) of new vertices whose corners are in three clusters.
+        (N,) for each new vertex the index of one of the vertices that it replaces; and
+        the faces (F, 3) of new vertices. Faces with two corners in one cluster are left
+        out.
     """
     texture_cell = np.floor(mesh.uvs.astype(np.float64) * TEXTURE_CELLS).astype(
         np.int64
@@ -640,7 +644,7 @@ def _find_usual_kind(name: str) -> str | None:
 def _describe_size_remedy(
     extent: float | None, usual_sizes: tuple[float, float]
 ) -> str:
-    """Return what to give so that an object's size is known, to follow "give".
+    """Return the end of a remark: what the user may give to state an object's size.
 
     Args:
         extent: longest side of the object in the unit of its file, if that is known.

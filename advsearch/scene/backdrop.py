@@ -139,9 +139,12 @@ def find_photograph_file(photograph: object) -> Path | None:
 
 
 def find_photographed_light(photograph: object) -> Path | None:
-    """Return the environment map that lies beside a photograph, or None.
+    """Return the environment map beside a photograph, or None if there is none.
 
-    It is called as the photograph, with the suffix .hdr or .exr.
+    The map of "kitchen.jpg" is "kitchen.hdr" or "kitchen.exr" in the same folder.
+
+    Args:
+        photograph: path of the photograph, or what else a user may give as one.
     """
     path = find_photograph_file(photograph)
     if path is None:
@@ -149,6 +152,7 @@ def find_photographed_light(photograph: object) -> Path | None:
     for suffix in LIGHT_SUFFIXES:
         light = path.with_suffix(suffix)
         if light != path and light.is_file():
+            # the map counts as opened for the photograph, with which it belongs
             with track_opened_files(path):
                 record_opened(light)
             return light
@@ -326,7 +330,12 @@ def compute_front(
 
 
 def _decode_photograph(image: Image.Image, path: Path) -> npt.NDArray[np.uint8]:
-    """Return the levels (H, W, 3) of an opened photograph, as a viewer shows it."""
+    """Return the 8-bit levels (H, W, 3) of an opened photograph.
+
+    It is rotated upright, as its EXIF data state.
+
+    Raises FileFormatError: it is damaged, too large, or transparent in some pixels.
+    """
     check_decodable(image, path)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of large images and odd metadata
@@ -351,7 +360,7 @@ def make_backdrop(
 
     Args:
         levels: levels of the full photograph.
-        spec: how it is called.
+        spec: its name for messages.
         crop: left, top, width and height in pixels of the part to use; None: all.
 
     Raises:

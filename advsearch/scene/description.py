@@ -405,9 +405,10 @@ class SceneDescription(SceneData):
         return scene.with_values(camera__distance=distance)
 
     def _make_preset_values(self, preset: CameraPreset) -> dict[str, float]:
-        """Return the settings of a mounted camera, but its distance, by name.
+        """Return the settings of a mounted camera by name, without its distance.
 
-        A small object on a plain ground stands on a table, whose side is set too.
+        A small object on a plain ground stands on a table. The preset's height counts
+        from the floor, `TABLE_HEIGHT` below, and the ground gets the size of a table.
         """
         is_on_plain_ground = (
             self.get_number("ground.size") > 0.0
@@ -587,9 +588,9 @@ class SceneDescription(SceneData):
     def gain(self) -> float:
         """Factor from scene radiance to display-linear values.
 
-        2 to the power of `camera.exposure`, times the exposure: by `camera.ev`, where
-        it is set; else that of the photograph that the scene is rendered into; else the
-        metered one, or 1 where exposure is not metered.
+        It is the exposure times 2 to the power of `camera.exposure`. The exposure is the
+        first of these that applies: that of the exposure value `camera.ev`; that of the
+        photograph that the scene is rendered into; the metered one; 1.
         """
         exposure_value = self.values.get("camera.ev")
         exposure = 1.0
@@ -604,9 +605,8 @@ class SceneDescription(SceneData):
     def _compute_exposure(self, exposure_value: float) -> float:
         """Return the factor from scene radiance to display-linear values of an EV.
 
-        A display value of 1 is where a sensor saturates: at a luminance of 1.2 times 2
-        to the power of the exposure value, in cd/m2 (Lagarde and de Rousiers 2014,
-        Moving Frostbite to PBR, section 5.1).
+        A sensor saturates, and the display value is 1, at a luminance of 1.2 * 2^EV in
+        cd/m2 (Lagarde and de Rousiers 2014, Moving Frostbite to PBR, section 5.1).
 
         Raises InputError: the radiance of the environment has no unit.
         """
@@ -735,7 +735,15 @@ def _import_source(
     up: str | None,
     facing: str | None,
 ) -> ImportedScene:
-    """Read an object, and what stands around it; arguments as of `load_description`."""
+    """Read an object, and what stands around it.
+
+    Args:
+        source: which file and which node of it the object is.
+        object_spec: name or file of the object; with `plugins` the id of a shape.
+        plugins: a Mitsuba scene as a dictionary; None: the object is from a file.
+        up: the axis of a mesh file that points up.
+        facing: the axis of a mesh file that is its front.
+    """
     if plugins is not None:
         # Mitsuba is imported only for what it reads
         from advsearch.scene.mitsuba_backend.scene_files import import_mitsuba_scene
@@ -760,9 +768,14 @@ def _choose_environment(imported: ImportedScene, *, is_mitsuba: bool) -> str:
 
 
 def _check_not_turned(up: str | None, facing: str | None, *, is_mitsuba: bool) -> None:
-    """Check that a scene file is not to be turned.
+    """Check that the user gives no axes for a scene file, whose axes are known.
 
-    Raises InputError: an axis is given that is to point up, or to be the front.
+    Raises InputError: `up` or `facing` is given.
+
+    Args:
+        up: the axis that is to point up; None if none is given.
+        facing: the axis that is to be the front; None if none is given.
+        is_mitsuba: whether it is a Mitsuba scene; otherwise it is glTF.
     """
     if up is not None:
         reason = "glTF files have y up"
@@ -852,7 +865,7 @@ def check_mesh_names(scene: SceneDescription, names: Iterable[str]) -> None:
 def check_single_environment(parts: Iterable[ScenePart], requester: str) -> None:
     """Check that a Mitsuba scene has no environment of its own among its parts.
 
-    Raises InputError: it has, and another is requested.
+    Raises InputError: it has one. A scene can have only one environment.
 
     Args:
         parts: parts of the scene.
@@ -870,9 +883,14 @@ def check_single_environment(parts: Iterable[ScenePart], requester: str) -> None
 def check_ground(
     requested: settings.SettingValues, lit_by: str | Path | EnvironmentAsset
 ) -> None:
-    """Check the settings of a ground that is no table.
+    """Check the settings of a ground that is a photograph, a road or a place.
 
-    Raises InputError: there is no photograph to show, or a table is described as well.
+    Raises InputError: there is no environment map for a photographed ground, or a
+    setting of a table is given as well.
+
+    Args:
+        requested: the user's settings by name.
+        lit_by: the environment; `NO_ENVIRONMENT` for none.
     """
     kind = requested.get("ground.kind")
     if kind not in (settings.PHOTOGRAPH, *settings.ROAD_KINDS, *settings.PLACE_KINDS):

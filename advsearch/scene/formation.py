@@ -83,7 +83,11 @@ class ImageFormation:
     quick: bool = False
 
     def __post_init__(self) -> None:
-        """Check the fields; raises InputError for one that is not possible."""
+        """Check the fields.
+
+        Raises InputError: an unknown denoiser or sampler, or a resolution that is too
+        small or too large.
+        """
         if self.denoiser not in DENOISERS:
             raise InputError(
                 f"denoise: expected one of {', '.join(DENOISERS)}, got "
@@ -102,8 +106,10 @@ class ImageFormation:
     def display(self, radiance: Tensor) -> Tensor:
         """Map linear radiance (..., 3) to display-referred values in [0, 1].
 
-        By `gain`, and the curve of `transfer`; "linear" has no curve and does not clip.
-        It is differentiable, and flat where it is clipped.
+        Radiance is multiplied by `gain` and goes through the tone curve `transfer`:
+        "srgb", "gamma" (1 / 2.2) or "reinhard", which is x / (1 + x) before sRGB's
+        curve. "linear" has no curve and is not clipped. The result is differentiable;
+        clipped values have the derivative 0.
         """
         if self.transfer == "linear":
             return radiance * self.gain
@@ -160,14 +166,18 @@ class _SrgbDisplay(torch.autograd.Function):
 
 @lru_cache(maxsize=64)
 def round_sample_count(sampler: str, samples: float) -> int:
-    """Return the number of samples that a sampler takes when it needs at least some.
+    """Return the number of samples that a sampler takes if it is to take at least some.
 
-    Independent samples come in any number; stratified ones in squares, multi-jittered
-    ones in products of two near numbers, orthogonal arrays in squares of primes, the
-    low-discrepancy sequence in powers of four.
+    Samplers of Mitsuba take only certain numbers: "stratified" squares, "multijitter"
+    products of two similar numbers, "orthogonal" squares of primes, "ldsampler" powers
+    of four. "independent" takes any number.
+
+    Args:
+        sampler: name of the sampler.
+        samples: least number of samples per pixel.
     """
-    # less 1e-9, here and below: a number just above an integer by rounding is that
-    # integer, and needs no further sample
+    # Here and below 1e-9 is subtracted before rounding up: a number that is above an
+    # integer only by a rounding error needs no further sample.
     count = max(1, math.ceil(samples - 1e-9))
     root = math.isqrt(count - 1) + 1  # the square root of the count, rounded up
     if sampler == "stratified":
@@ -409,8 +419,9 @@ def _find_nearest(
     """Return the index of the nearest sample in each pixel that has one.
 
     Args:
-        nearness: (S,) of each sample, larger for nearer ones.
-        row, column: (S,) the pixel of each sample.
+        nearness: (S,) one over the depth of each sample, larger for nearer ones.
+        row: (S,) row of the pixel of each sample.
+        column: (S,) column of the pixel of each sample.
         shape: height and width of the image.
     """
     order = np.argsort(nearness, kind="stable")
@@ -514,7 +525,8 @@ def _compute_block_directions(
     height, width = shape
     row_ends = np.append(rows[1:], height)
     column_ends = np.append(columns[1:], width)
-    # middle row (first + last) / 2 and middle column, as angles
+    # The middle row is (first + last) / 2, and a row is pi / (height - 1). Columns have
+    # their centers half a column further: there the middle is (start + end) / 2.
     theta = (rows + row_ends - 1)[:, None] * (0.5 * math.pi / (height - 1))
     azimuth = 0.5 * math.pi - (columns + column_ends) * (math.pi / width)
     z = np.broadcast_to(np.cos(theta), (len(rows), len(columns)))

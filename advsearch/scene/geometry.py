@@ -123,7 +123,7 @@ def _compute_edge_tangents(
         return torch.tensor(
             model.visible_tangents, dtype=torch.float64, device=fov.device
         )
-    # half-width and half-height, as fractions of half the larger side
+    # half the width and half the height, as fractions of half the larger side
     shape = torch.tensor(
         [min(1.0, aspect), min(1.0, 1.0 / aspect)],
         dtype=torch.float64,
@@ -378,10 +378,10 @@ def compute_car_pose(camera: Tensor) -> Tensor:
 
 
 def get_positioned_part(scene: SceneData, part: ScenePart) -> Any:
-    """Return one of a scene's parts as the settings and the camera have it.
+    """Return one of a scene's parts where the settings and the camera put it.
 
-    A mesh has the pose and the material of its settings. A beam stands where its
-    carrier, a mesh or the camera's car, takes it. Other parts are as they are.
+    A mesh gets the pose and the material of its settings. A beam gets its pose from its
+    carrier, which is a mesh or the camera's car. Other parts are returned as they are.
     """
     if not isinstance(part, BeamLamp):
         return scene.meshes.get(part.name, part)

@@ -54,7 +54,8 @@ def rasterize_triangles(
         For each pixel of each triangle, triangle by triangle, the triangle, row and
         column (N,), and the corners' barycentric weights (N, 3).
     """
-    # Candidates from a wider range, as their weights decide which lie in a triangle.
+    # The candidates are from a wider range, so that none is missed by rounding. Their
+    # weights decide.
     face, row, column = find_candidate_pixels(corners, shape, 10.0 * PIXEL_TOLERANCE)
     weights = compute_barycentric(corners[face], row, column)
     inside = (weights >= -tolerance).all(axis=1)
@@ -64,10 +65,15 @@ def rasterize_triangles(
 def find_candidate_pixels(
     corners: Float64Array, shape: tuple[int, int], tolerance: float = PIXEL_TOLERANCE
 ) -> tuple[IntArray, IntArray, IntArray]:
-    """List the pixels whose centers lie in triangles, also flat ones, or nearly.
+    """List the pixels whose centers lie in triangles, or almost.
 
-    They may miss a triangle by `tolerance` pixels along their row or column. Other
-    arguments as for `rasterize_triangles`.
+    A triangle without area has pixels too: those along its line.
+
+    Args:
+        corners: (F, 3, 2) columns and rows of the triangles' corners, whole at pixel
+            centers.
+        shape: height and width of the raster.
+        tolerance: pixels along the row or column by which a center may miss a triangle.
 
     Returns:
         Triangle, row and column (N,).
@@ -151,13 +157,14 @@ def compute_barycentric(
 ) -> Float64Array:
     """Return the barycentric weights (N, 3) of points in triangles (N, 3, 2).
 
-    A corner's weight is the share of the triangle's area that lies between the point
-    and the opposite side: all three are in [0, 1] inside, and one is negative outside.
-    They are NaN or infinite where a triangle has no area.
+    A corner's weight is the area between the point and the opposite side, as a fraction
+    of the triangle's. Inside all three are in [0, 1]; outside at least one is negative.
+    The weights in a triangle without area are NaN or infinite.
 
     Args:
-        corners: columns and rows of the corners.
-        row, column: (N,) where the points are.
+        corners: (N, 3, 2) columns and rows of the corners.
+        row: (N,) rows of the points.
+        column: (N,) columns of the points.
     """
     ax, ay = corners[:, 0].T
     bx, by = corners[:, 1].T
@@ -179,11 +186,12 @@ def compute_doubled_areas(corners: Float64Array) -> Float64Array:
 def _list_integers_within(
     lower: Float64Array, upper: Float64Array, size: int, tolerance: float
 ) -> tuple[IntArray, IntArray]:
-    """List the integers of N intervals, those of the first, then those of the second.
+    """List the integers in each of N intervals, one interval after the other.
 
     Args:
-        lower, upper: (N,) ends of the intervals; one with `lower` above `upper` has no
-            integer.
+        lower: (N,) lower ends of the intervals.
+        upper: (N,) upper ends. An interval whose upper end is below its lower end is
+            empty.
         size: integers outside of [0, size - 1] are left out.
         tolerance: by how much each interval is wider on both sides.
 
@@ -280,8 +288,8 @@ class Charts:
     def compute_areas(self) -> Float32Array:
         """Return the surface area (h, w) of each texel, in squared mesh units.
 
-        It is the area of the texel's face over the number of texels that the face has
-        on the texture; 0 where no chart is.
+        It is the area of the texel's face, divided by the number of texels that the face
+        covers in the texture. It is 0 outside of all charts.
         """
         corners = self.mesh.vertices[self.mesh.faces].astype(np.float64)
         face_areas = np.linalg.norm(compute_area_vectors(corners), axis=1)
@@ -301,7 +309,7 @@ class Charts:
 def find_exclusive_texels(
     mesh: Mesh, faces: IntArray, shape: tuple[int, int]
 ) -> tuple[BoolArray, float]:
-    """Return the texels that bilinear look-ups on some faces alone read.
+    """Return the texels that bilinear look-ups read on some faces and on no others.
 
     Args:
         mesh: the mesh.
@@ -503,12 +511,20 @@ class MeshSurface:
     def find_region(
         self, face: int, point: Float64Array, normal: Float64Array, radius: float
     ) -> BoolArray:
-        """Return the faces (F,) around a point that are connected to a face.
+        """Return the faces around a point that are connected to a face.
 
-        Their bounding boxes reach within a radius of the point (3,), they face a
-        direction (3,), and are reached from the face, which always counts, over edges
-        between such faces. So the other wall of a cup is not among them, and neither is
-        the next slat of a chair.
+        A face is one of them if its bounding box is within the radius, it faces the
+        direction `normal`, and a chain of such faces, neighbour by neighbour, leads to
+        it. So the opposite wall of a cup is left out, and the next slat of a chair.
+
+        Args:
+            face: index of the face from which the chains begin; it always counts.
+            point: (3,) center.
+            normal: (3,) direction.
+            radius: radius in the unit of the mesh.
+
+        Returns:
+            (F,) bool.
         """
         box_gap = np.maximum(np.maximum(self._lower - point, point - self._upper), 0.0)
         is_near = np.linalg.norm(box_gap, axis=1) <= radius

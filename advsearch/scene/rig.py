@@ -197,9 +197,13 @@ class PhotographCameras:
 
 
 def read_photograph_cameras(path: str) -> PhotographCameras | None:
-    """Read the cameras of many photographs; None if the file is of another kind.
+    """Read the cameras of many photographs from an images.txt or a transforms.json.
 
-    `path` names none of its cameras.
+    Args:
+        path: the file, without the name of one of its cameras.
+
+    Returns:
+        The cameras; None if the file is of another kind.
 
     Raises:
         FileFormatError: the file cannot be used.
@@ -238,17 +242,20 @@ def _read_image_cameras(path: str) -> PhotographCameras:
 
 
 def _find_photograph(path: str, files: Mapping[str, str], photograph: Path) -> str:
-    """Return the name of the entry whose file is a photograph.
+    """Return the name of the entry of a camera file that is for a photograph.
+
+    The paths in a camera file are often those of another computer. So the entry is
+    taken whose path has most parts in common with the photograph's, from the end.
 
     Args:
         path: path of the camera file, for messages.
-        files: files of the entries, by name.
-        photograph: the file.
+        files: path of the photograph of each entry, by the entry's name.
+        photograph: path of the photograph.
 
     Raises:
         FileFormatError: no entry fits, or several do equally well.
     """
-    # how many parts, counted from the end, each entry's path has in common
+    # number of parts that each path has in common with the photograph's
     counts = {
         name: _count_shared_parts(file, photograph) for name, file in files.items()
     }
@@ -267,7 +274,8 @@ def _find_photograph(path: str, files: Mapping[str, str], photograph: Path) -> s
 def _count_shared_parts(file: str, photograph: Path) -> int:
     """Return how many parts two paths share, counted from the last one.
 
-    A file without a suffix, as Instant NGP has it, fits any.
+    For "images/a.jpg" and "/home/me/images/a.jpg" it is 2. If the first has no suffix,
+    as in files of Instant NGP, the suffix of the other is ignored.
     """
     path = PurePosixPath(file.replace("\\", "/"))
     full = photograph.absolute()
@@ -284,8 +292,8 @@ def _count_shared_parts(file: str, photograph: Path) -> int:
 def _check_mounts(spec: str, mounts: Sequence[Mount]) -> None:
     """Raise FileFormatError unless cameras of a rig fit together.
 
-    They are 2 to `MAX_CAMERAS`, have names of their own, and the first, which is the
-    scene's camera, has no pose, azimuth or delay.
+    There have to be 2 to `MAX_CAMERAS` with different names. The first is the scene's
+    camera, to which the others are relative: it may have no pose, azimuth or delay.
     """
     if not 2 <= len(mounts) <= MAX_CAMERAS:
         raise FileFormatError(
@@ -350,8 +358,13 @@ def _read_entry(spec: str, index: int, entry: Any) -> Mount:
 def _read_entry_pose(where: str, entry: Mapping[str, Any]) -> Float64Array:
     """Return the pose (4, 4) of an entry of our own format, by `turn` and `place`.
 
-    It leads from the camera's axes, x to the right, y down, z ahead, to those of the
-    first camera. `where` is the beginning of an error.
+    It maps coordinates of the camera to those of the first one. In both x is to the
+    right, y down, z ahead. `turn` has yaw, pitch and roll in degrees, and `place` the
+    position in metres.
+
+    Args:
+        where: file and camera, for messages.
+        entry: the entry; a missing `turn` or `place` is 0.
     """
     angles = entry.get("turn", [0.0] * 3)
     yaw, pitch, roll = _parse_numbers(where, "turn", angles, 3, MAX_TURN)
@@ -406,10 +419,17 @@ def _to_rows(value: Any) -> list[list[Any]]:
 
 
 def _read_camchain(spec: str, data: Mapping[str, Any]) -> tuple[Mount, ...]:
-    """Return the cameras of Kalibr's camchain; empty if it has no extrinsics.
+    """Return the cameras of Kalibr's camchain, the first one first.
 
-    Cameras are in the order of their numbers; each but the first states its transform
-    from the one before.
+    Cameras are in the order of their numbers (cam0, cam1). Each but the first states
+    its transform from the camera before it.
+
+    Args:
+        spec: the file.
+        data: its content.
+
+    Returns:
+        The cameras; empty if the file has one, too many, or no transforms.
     """
     cameras = {
         name: camera
@@ -467,15 +487,15 @@ def _check_frames(path: str, data: Any) -> dict[str, Any]:
 
 
 def _read_frame_pose(path: str, data: Mapping[str, Any], name: str) -> Float64Array:
-    """Return the pose (4, 4), from its camera to the world, of a frame.
+    """Return the pose (4, 4) of a frame, which maps from its camera to the world.
 
-    The camera's axes are x to the right, y down, z ahead. Positions are divided by the
-    scale that the file has applied.
+    The camera's axes are x to the right, y down, z ahead. The tool may have scaled the
+    scene: positions are divided by the scale that the file states.
 
     Args:
         path: path of the transforms.json.
-        data: what is in it.
-        name: index of the frame.
+        data: content of the file.
+        name: index of the frame, as a text.
     """
     frame = data["frames"][int(name)]
     matrix = _parse_rigid(
@@ -562,7 +582,7 @@ def _parse_images(path: str) -> dict[str, list[str]]:
     """
     text = read_existing_text(path, "COLMAP's images", MAX_IMAGES_SIZE)
     lines = [line for line in text.splitlines() if not line.startswith("#")]
-    # A line of an image and a line of its points take turns; points are not read.
+    # Each image has two lines: its own, and one of its points, which are not needed.
     image_lines = [line for line in lines[::2] if line.strip()]
     # the last of ten words is the file, whose name may have blanks
     words_of_images = [line.split(maxsplit=9) for line in image_lines]
@@ -609,10 +629,14 @@ def _parse_image(where: str, words: Sequence[str]) -> Float64Array:
 
 
 def _parse_names(path: str, listing_text: str, known_names: Sequence[str]) -> list[str]:
-    """Return the names of cameras in a list with commas.
+    """Split a list of cameras such as "cam0,cam2" into names.
 
-    Raises FileFormatError unless they are 2 to `MAX_CAMERAS` different ones of
-    `known_names`.
+    Args:
+        path: the file, for messages.
+        listing_text: the list.
+        known_names: names of the file's cameras.
+
+    Raises FileFormatError: they are not 2 to `MAX_CAMERAS` different names of the file.
     """
     names = list(map(str.strip, listing_text.split(",")))
     if not 2 <= len(names) <= MAX_CAMERAS or len(set(names)) < len(names):
@@ -636,10 +660,16 @@ def _make_mounts(
     poses: Sequence[Float64Array],
     models: Sequence[CameraModel],
 ) -> tuple[Mount, ...]:
-    """Return cameras relative to the first.
+    """Return cameras with poses relative to the first.
 
-    Poses (4, 4) lead from their coordinates (x to the right, y down, z ahead) to common
-    ones.
+    Args:
+        spec: the file, for messages.
+        names: names of the cameras.
+        poses: (4, 4) for each from its coordinates (x to the right, y down, z ahead) to
+            those of a common world.
+        models: lens of each.
+
+    Raises FileFormatError: the lenses are of different kinds.
     """
     kinds = sorted({model.kind for model in models})
     if len(kinds) > 1:
@@ -656,8 +686,12 @@ def _make_mounts(
 def _measure_scale(path: str, applied_transform: Any) -> float:
     """Return the scale of nerfstudio's `applied_transform`.
 
-    It has 3 or 4 rows of 4 numbers. Raises FileFormatError: it is no rotation times a
-    scale, with a shift.
+    Args:
+        path: the file, for messages.
+        applied_transform: 3 or 4 rows of 4 numbers, by which the tool has moved and
+            scaled the scene.
+
+    Raises FileFormatError: it is not a rotation times a scale, with a shift.
     """
     rows = _to_rows(applied_transform)
     cells = [cell for row in rows for cell in row]

@@ -53,9 +53,11 @@ MAX_ARC_COSINE = 1.0 - 1e-9
 
 
 def find_rig_parameter(name: str) -> Parameter | None:
-    """Return the parameter of a name `JOINT.x` (or y, z) or `TARGET.weight`.
+    """Return the parameter of a name such as "Head.x" or "Smile.weight".
 
-    None for other names. Whether there is such a joint or target is not asked.
+    It is the turn of a joint about x, y or z, or the weight of a morph target. The
+    result is None for other names. It is not checked whether an object has such a joint
+    or target.
     """
     owner, dot, component = name.rpartition(".")
     if not (owner and dot and component in (*AXES, WEIGHT)):
@@ -485,7 +487,7 @@ def _group_by_depth(parents: IntArray) -> list[tuple[Tensor, Tensor]]:
     """
     levels = list[tuple[Tensor, Tensor]]()
     nodes = np.flatnonzero(parents < 0)
-    # position of each node among those of its depth, once that is known
+    # position of each node among those of its depth; 0 until its depth is reached
     row_in_level = np.zeros(len(parents), np.int64)
     while len(nodes):
         parent_rows = row_in_level[parents[nodes]]
@@ -541,10 +543,15 @@ def sample_track(track: Track, seconds: Tensor) -> Tensor:
 
 
 def slerp(start: Tensor, end: Tensor, fraction: Tensor) -> Tensor:
-    """Interpolate between two rotations (4,) along the shorter arc.
+    """Interpolate between two rotations along the shorter arc (Shoemake 1985).
 
-    `fraction` is 0 at the start and 1 at the end. Rotations that are almost the same
-    are interpolated along the chord, since the arc's formula divides by zero there.
+    Rotations that are almost the same are interpolated along the chord, since the
+    formula of the arc divides by the sine of their angle, which is almost 0.
+
+    Args:
+        start: (4,) quaternion.
+        end: (4,) quaternion.
+        fraction: () 0 at the start and 1 at the end.
     """
     start = start / start.norm()
     end = end / end.norm()

@@ -97,7 +97,8 @@ class Parameter:
             high: largest value.
             default: default value; a text says how the scene computes it.
             text: description for the user.
-            search: range of a search by default; None: all values.
+            search: range that is searched by default; None: the value stays at its
+                default.
             periodic: whether `high` is the same as `low`, as for an angle.
             log: whether a search takes even steps of the logarithm.
         """
@@ -141,7 +142,8 @@ class Parameter:
             high: largest value.
             default: default value; a text says how the scene computes it.
             text: description for the user.
-            search: range of a search by default; None: all values.
+            search: range that is searched by default; None: the value stays at its
+                default.
             periodic: whether `high` is the same as `low`, as for an angle.
             log: whether a search takes even steps of the logarithm.
         """
@@ -201,7 +203,8 @@ class Parameter:
         Args:
             text: description for the user, to which "Red", "Green" or "Blue" is the
                 beginning: "of the ground" becomes "Red of the ground".
-            search: range of a search by default; None: all values.
+            search: range that is searched by default; None: the value stays at its
+                default.
             low: smallest value of each channel; the largest is 1.
             defaults: default values of red, green and blue.
             estimators: valid estimators of the derivative, the preferred one first.

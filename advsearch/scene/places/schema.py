@@ -72,8 +72,9 @@ class SolidEntry(_Entry):
     def _check_form(self) -> SolidEntry:
         """Check that an entry has one convex outline, or a radius and positions.
 
-        Raises ValueError, which pydantic reports: both or neither, heights that do not
-        rise, an outline that is not convex, or a name that is no line of text.
+        Raises ValueError, which pydantic reports: the entry has both or neither, the
+        lower height is not first, the outline is not convex, or the name is not a
+        single line of text.
         """
         has_positions = self.at is not None
         has_radius = self.radius is not None
