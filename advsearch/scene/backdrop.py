@@ -385,8 +385,9 @@ def compute_photograph_gain(
 ) -> float:
     """Return the factor from a scene's radiance to a photograph's display-linear values.
 
-    By it a level surface of reflectance `GREY_CARD`, lit by the environment, gets the
-    mean luminance of the photograph. 1 where no environment lights the scene.
+    With it a level surface of the reflectance `GREY_CARD`, lit by the environment, has
+    the mean luminance of the photograph. The factor is 1 if no environment lights the
+    scene.
     """
     irradiance = float(compute_level_irradiance(description) @ LUMINANCE)
     if not irradiance > 0.0:
@@ -408,18 +409,20 @@ def compute_photograph_gain(
 def compute_level_irradiance(description: SceneData) -> Float64Array:
     """Return the irradiance (3,) of a level surface under the environment alone.
 
-    It is that of the map, before `environment.exposure`.
+    It is that of the map itself: the setting `environment.exposure` does not count. It
+    is 0 without an environment.
     """
     environment = description.environment
     if environment is None:
         return np.zeros(len(CHANNELS))
     rows = environment.radiance.shape[0]
-    # of the angle from straight up at the edges of rows, 0 below the horizon
+    # cosines of the angle from straight up at the borders between rows
     edge_cosines = np.cos(np.arange(rows + 1) * math.pi / rows)
     upper_cosines = np.maximum(edge_cosines[:-1], 0.0)
     lower_cosines = np.maximum(edge_cosines[1:], 0.0)
     row_means = environment.radiance.mean(axis=1, dtype=np.float64)
-    # the integral of cosine times solid angle over each row
+    # the integral of cosine times solid angle over each row: 2 pi times that of
+    # cos(t) sin(t) dt. It is 0 below the horizon.
     weights = math.pi * (upper_cosines**2 - lower_cosines**2)
     # by a sum, not by BLAS, whose last bits depend on the number of threads
     return np.asarray((weights[:, None] * row_means).sum(axis=0))
@@ -509,8 +512,12 @@ def _look_up_levels(
 ) -> npt.NDArray[np.uint8]:
     """Return the levels (M, 3) of the pixels of a photograph that show points (N, 3).
 
-    The points are in world space; those outside of the photograph are left out, so that
-    M is at most N. The scene has the camera of the full photograph, not of a part.
+    Points outside of the photograph are left out, so that M is at most N.
+
+    Args:
+        description: the scene with the camera of the full photograph, not of a part.
+        photograph: the photograph.
+        points: (N, 3) in world space.
     """
     height, width = photograph.full_size
     camera = camera_to_world(description, width / height)
@@ -619,9 +626,15 @@ def fit_to_photograph(
 def crop_camera(model: CameraModel, photograph: BackdropPhotograph) -> CameraModel:
     """Return the camera that sees the used part of a photograph.
 
-    Focal lengths, skew and center are fractions of the image's width or height, so that
-    they grow as the image shrinks; the center moves by the part's top left corner too.
-    `model` is the camera of the full photograph. Raises InputError: it is a panorama.
+    Focal lengths, skew and center are fractions of the image's width or height. Those of
+    a part are larger fractions, since the part is smaller. The center also moves by the
+    part's top left corner.
+
+    Args:
+        model: camera of the full photograph.
+        photograph: the photograph, with the part that is used.
+
+    Raises InputError: the camera is a panorama, which has no parts.
     """
     if model.kind == EQUIRECTANGULAR:
         raise InputError(
@@ -676,7 +689,11 @@ def _check_film(photograph: BackdropPhotograph, resolution: tuple[int, int]) -> 
 
 
 def _check_gloss(description: SceneData) -> None:
-    """Raise InputError if a coat of the ground was requested that nothing would have."""
+    """Check that a gloss of the ground that the user requests has an effect.
+
+    Raises InputError: a roughness is given without a gloss, or a gloss without a plane
+    that could reflect the object.
+    """
     is_glossy = description.get_number("ground.gloss") > 0.0
     if "ground.roughness" in description.requested and not is_glossy:
         raise InputError(
@@ -697,7 +714,11 @@ def _check_gloss(description: SceneData) -> None:
 
 
 def _check_camera_shape(photograph: BackdropPhotograph, model: CameraModel) -> None:
-    """Raise InputError if a camera takes pictures of another shape."""
+    """Check that a photograph has the shape of its camera's pictures.
+
+    Raises InputError: their ratios of width and height differ by more than
+    `SHAPE_TOLERANCE`. A camera without a size fits any photograph.
+    """
     if model.size is None:
         return
     height, width = photograph.full_size
@@ -789,9 +810,10 @@ def compute_mesh_to_camera(
     """Return the rigid map (4, 4) from a mesh to camera coordinates, in object sizes.
 
     Args:
-        file_to_mesh: (4, 4), see `ObjectAsset.file_to_mesh`.
+        file_to_mesh: (4, 4) from coordinates of the object's file to those of its mesh,
+            whose longest side is 1.
         pose: rigid (4, 4) from the file's coordinates to the camera's, in the file's
-            unit, hence the division by the size of the object in that unit.
+            unit. The result is divided by the object's size in that unit.
     """
     mesh_to_file = np.linalg.inv(file_to_mesh)
     # the scale of a map of uniform scale is the cube root of its determinant
@@ -854,8 +876,12 @@ def _check_rigid(pose: npt.ArrayLike) -> Float64Array:
 def _make_world_axes(up: Float64Array) -> Float64Array:
     """Return world axes (3, 3), rows in camera coordinates, with z along `up`.
 
-    +x points from the object to the camera as far as that is level. `up` is a direction
-    (3,) in camera coordinates: x to the right, y down, z ahead.
+    +x is the level part of the direction from the object to the camera.
+
+    Args:
+        up: (3,) direction in camera coordinates: x to the right, y down, z ahead.
+
+    Raises InputError: it is no direction.
     """
     if up.shape != (3,) or not np.isfinite(up).all() or not up.any():
         raise InputError(f"up: expected a direction of three numbers, got {up!r}")
@@ -872,14 +898,15 @@ def _make_world_axes(up: Float64Array) -> Float64Array:
 def _decompose_rotation(rotation: Float64Array) -> dict[str, float]:
     """Return the settings that make a rotation (3, 3), degrees.
 
-    It is taken apart as `Rz(yaw) Ry(pitch) Rx(roll)`.
+    The rotation is `Rz(yaw) Ry(pitch) Rx(roll)`.
     """
     # the entry (2, 0) is -sin pitch; (0, 0), (1, 0) and (2, 1), (2, 2) are cosines and
     # sines of yaw and roll times cos pitch
     pitch = math.asin(min(max(-float(rotation[2, 0]), -1.0), 1.0))
     yaw = math.atan2(rotation[1, 0], rotation[0, 0])
     roll = math.atan2(rotation[2, 1], rotation[2, 2])
-    # At a pitch of 90 degrees yaw and roll turn about one axis: all goes to the yaw.
+    # At a pitch of 90 degrees yaw and roll are about the same axis, and only their sum or
+    # difference is known: the roll is set to 0.
     if abs(rotation[2, 0]) > 1.0 - 1e-9:
         yaw = math.atan2(-rotation[0, 1], rotation[1, 1])
         roll = 0.0

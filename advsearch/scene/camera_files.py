@@ -170,17 +170,17 @@ def _list_lines(text: str) -> list[str]:
 def read_camera(spec: str) -> CameraModel:
     """Read a camera's model from a file.
 
-    The format is found by the content: COLMAP's text, a dialect of another tool,
-    nerfstudio, Kalibr with several cameras or one, or OpenCV and ROS.
+    The content tells the format: COLMAP's text, files of OpenCV, ROS, Kalibr,
+    nerfstudio, and of some other tools.
 
     Args:
-        spec: the file; of several cameras in it, that which is named, as in
-            ``camchain.yaml#cam1`` and ``cameras.txt#3``.
+        spec: the file. If it has several cameras, one is named behind a #:
+            ``camchain.yaml#cam1``, ``cameras.txt#3``.
 
     Raises:
-        FileFormatError: the file is missing, is of no known kind, has a model that is
-            not one of ours, numbers that no camera has, or an entry that changes the
-            image and is not read.
+        FileFormatError: the file is missing or of no known format; its projection is
+            not supported; it has numbers that no camera has; or an entry changes the
+            image, but is not supported.
     """
     path, _, camera_name = spec.partition("#")
     text = _read_camera_text(path)
@@ -263,7 +263,8 @@ def _read_camera_text(path: str) -> str:
 def _flatten_groups(data: Mapping[str, Any]) -> dict[str, Any]:
     """Return entries with those of camodocal's groups on the top level.
 
-    The numbers of its fisheye lens get the names that other programs give them.
+    {"projection_parameters": {"fx": 400}} becomes {"fx": 400}. The numbers of its
+    fisheye lens (mu, mv, u0, v0) get the names that other programs use.
     """
     groups = {
         name: data[name]
@@ -282,8 +283,9 @@ def _flatten_groups(data: Mapping[str, Any]) -> dict[str, Any]:
 def _parse_file(path: str, text: str) -> dict[str, Any]:
     """Parse a camera file that is XML, JSON or YAML.
 
-    Of a YAML file with several documents the first counts. Raises FileFormatError if it
-    is no mapping of names.
+    If a YAML file has several documents, the first one counts.
+
+    Raises FileFormatError: it cannot be parsed, or is no mapping of names.
     """
     if text.lstrip().startswith("<"):
         return _parse_xml(path, text)
@@ -569,10 +571,15 @@ def _read_kalibr(
 def _read_opencv(spec: str, entries: Entries) -> CameraModel:
     """Return the model of a camera of OpenCV or ROS.
 
-    The calibration is of the sensor's pixels; ROS may bin several of them into one
-    pixel of the image, and the model has the size of that image. A tilted sensor is
-    rejected, a region of interest too. `spec` is the file, and perhaps the camera in
-    it.
+    The calibration is of the sensor's pixels. ROS may bin several of them into one pixel
+    of the image; the model has the size of that image.
+
+    Args:
+        spec: the file, and perhaps the camera in it.
+        entries: entries of the camera.
+
+    Raises FileFormatError: the sensor is tilted, images are of a region of interest, or
+    numbers are missing.
     """
     path = entries.path
     kind = _find_opencv_kind(path, entries)
@@ -711,8 +718,12 @@ def _read_optional_numbers(entries: Entries, names: Sequence[str]) -> dict[str, 
 def _find_rectified(entries: Entries, matrix: Sequence[float]) -> list[str]:
     """Return the names of matrices of rectified images that differ from the camera's.
 
-    Such a matrix changes nothing if its rotation is 1, or if its projection is the
-    camera matrix beside a column of zeros. `matrix` is the camera's, row by row.
+    A rectification matrix changes nothing if it is the identity. A projection changes
+    nothing if it is the camera matrix and a column of zeros.
+
+    Args:
+        entries: entries of the camera.
+        matrix: the camera matrix, nine numbers row by row.
     """
     fx, skew, cx, _, fy, cy = matrix[:6]
     differing_names = []
@@ -735,7 +746,11 @@ def _find_rectified(entries: Entries, matrix: Sequence[float]) -> list[str]:
 def _check_roi(entries: Entries, size: tuple[float, float]) -> list[str]:
     """Check that a region of interest of ROS is the full image.
 
-    Zeros mean the full image too. `size` is its height and width in pixels.
+    ROS writes zeros for the full image.
+
+    Args:
+        entries: entries of the camera.
+        size: height and width of the image in pixels.
 
     Returns:
         The entries of the region that were not read.

@@ -104,9 +104,10 @@ class CameraModel:
         """Project points (N, 3), to the right, down and ahead, to the image.
 
         Returns:
-            Coordinates (N, 2) float64 in image widths and heights, which may be outside
-            of the image; and which points are visible, (N,) bool: those behind a lens,
-            or beyond the angle at which it folds, are not.
+            Coordinates (N, 2) float64 in image widths and heights, (0, 0) at the top
+            left; they may be outside of the image. And (N,) bool, which points are
+            visible: those behind a lens, or beyond the angle at which it folds, are
+            not.
         """
         x, y, z = points.double().unbind(dim=-1)
         if self.kind == EQUIRECTANGULAR:
@@ -146,8 +147,9 @@ class CameraModel:
     def compute_rays(self, image_points: Tensor) -> tuple[Tensor, Tensor]:
         """Return the rays of image coordinates (N, 2).
 
-        The distortion is inverted step by step. Coordinates whose inversion has not
-        converged, before the angle at which the lens folds, are outside of the view.
+        The distortion is inverted by iteration. If that does not converge to a direction
+        within the angle at which the lens folds, the coordinates are outside of the
+        view.
 
         Returns:
             Directions (N, 3) float64, unit vectors for a fisheye and a panorama, else
@@ -181,9 +183,14 @@ class CameraModel:
     def _compute_perspective_rays(self, distorted: Tensor) -> tuple[Tensor, Tensor]:
         """Return directions with z = 1 and margins of distorted points.
 
-        The points (N, 2) are in focal lengths; for the result see `compute_rays`. The
-        radial distortion is inverted first; with decentering, an inversion in two
-        dimensions starts from there.
+        First the radial distortion is inverted. If the lens also has decentering, that
+        solution is the start of an inversion in two dimensions.
+
+        Args:
+            distorted: (N, 2) points in focal lengths from the optical axis.
+
+        Returns:
+            Directions (N, 3), and a margin (N,) that is positive inside the view.
         """
         radius = distorted.norm(dim=-1)
         # 0 for the center, which has no direction
@@ -336,12 +343,12 @@ class CameraModel:
     def fold_angle(self) -> float:
         """Angle to the axis, radians, at which the radial distortion turns back.
 
-        It is infinite if it never does. Beyond it two directions have one image point,
-        so that no image tells them apart.
+        Beyond it the image point moves back towards the center, so that two directions
+        have the same image point. It is infinite if that never happens.
         """
         # radial(r) = r n(s) / d(s) with s = r^2. The numerator of its derivative, as a
-        # polynomial in s, is (n + 2 s n') d - 2 s n d'. It folds at the smallest root
-        # of that, or at a pole.
+        # polynomial in s, is (n + 2 s n') d - 2 s n d'. The lens folds at the smallest
+        # positive root of that, or at a pole, a root of d.
         numerator, denominator = self._polynomials
         double_square = Polynomial([0.0, 2.0])  # 2 r^2
         slope = (
@@ -461,7 +468,8 @@ class CameraModel:
             float(center[0, axis]), border, BORDER_POINTS, dtype=torch.float64
         )
         directions, margin = self.compute_rays(line_points)
-        # 0.1: rays almost aside, at more than about 84 degrees, do not count
+        # A z of 0.1 is at about 84 degrees from the axis: rays farther out do not count,
+        # since their tangents would be huge.
         is_visible = (margin > 0.0) & (directions[:, 2] > 0.1)
         tangents = directions[:, axis].abs() / directions[:, 2].clamp_min(0.1)
         return float(
@@ -614,8 +622,8 @@ def _evaluate_with_jacobian(
 ) -> tuple[Tensor, list[Tensor]]:
     """Evaluate a function that maps each of N points separately, and differentiate it.
 
-    As no value depends on another point, the derivative of the sum over all points has
-    the derivative of each.
+    No value depends on another point. So one derivative of the sum over all points has
+    the derivatives of all.
 
     Args:
         function: function from points to values (N, k).

@@ -449,7 +449,11 @@ class SceneDescription(SceneData):
     def _has_plugin(self, *kinds: str) -> bool:
         """Return whether a Mitsuba plugin of one of these kinds is in the scene.
 
-        Plugins within others count, of surfaces in Mitsuba's words too.
+        Plugins inside other plugins count too, and so do those of surfaces that are
+        described as Mitsuba plugins.
+
+        Args:
+            *kinds: values of a plugin's "type", such as "thinlens".
         """
         surfaces = [
             mesh.surface for mesh in self.meshes.values() if mesh.surface is not None
@@ -524,9 +528,12 @@ class SceneDescription(SceneData):
         )
 
     def require_environment(self, requester: str) -> EnvironmentAsset:
-        """Return the environment for what cannot do without a map.
+        """Return the environment of the scene.
 
-        Raises InputError: the scene has none.
+        Args:
+            requester: the setting or control that needs it, for the message.
+
+        Raises InputError: the scene has no environment map.
         """
         if self.environment is None:
             check_single_environment(self.parts, requester)
@@ -818,7 +825,12 @@ def _describes_orbit(requested: settings.SettingValues) -> bool:
 def _load_environment(
     lit_by: str | Path | EnvironmentAsset,
 ) -> EnvironmentAsset | None:
-    """Return an environment, bundled or from a file; None for `NO_ENVIRONMENT`."""
+    """Return an environment, bundled or from a file; None for `NO_ENVIRONMENT`.
+
+    Args:
+        lit_by: an environment, the name of a bundled one, the file of a map, or the
+            YAML file of a place.
+    """
     if isinstance(lit_by, EnvironmentAsset):
         return lit_by
     if lit_by == NO_ENVIRONMENT:
@@ -834,7 +846,11 @@ def _load_environment(
 def _check_material_settings(
     asset: ObjectAsset, requested: settings.SettingValues
 ) -> None:
-    """Check that settings of the material apply. Raises InputError: they do not."""
+    """Check that an object has the single material that settings change.
+
+    Raises InputError: "material." settings are given, but the object has several
+    materials or a surface that is described as a Mitsuba plugin.
+    """
     material_settings = [name for name in requested if name.startswith("material.")]
     if asset.surface is not None and material_settings:
         surface = "a surface of Mitsuba's own"
@@ -847,9 +863,13 @@ def _check_material_settings(
 
 
 def check_mesh_names(scene: SceneDescription, names: Iterable[str]) -> None:
-    """Check that a scene has the meshes whose settings are named.
+    """Check that a scene has the meshes around the object that settings name.
 
-    Raises UnknownNameError: it has not.
+    Args:
+        scene: the scene.
+        names: names of settings. Those of other things than meshes are ignored.
+
+    Raises UnknownNameError: there is no such mesh.
     """
     for name in names:
         mesh = settings.parse_mesh_name(name)

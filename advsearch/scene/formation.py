@@ -133,7 +133,12 @@ class _SrgbDisplay(torch.autograd.Function):
     def forward(ctx: Any, radiance: Tensor, gain: float) -> Tensor:
         """Return the sRGB image of radiance times a gain.
 
-        As `linear_to_srgb`, but in place where that saves memory.
+        The result is that of `linear_to_srgb`. Operations are in place to save memory.
+
+        Args:
+            ctx: autograd's context, which stores the arguments for `backward`.
+            radiance: (..., 3) linear radiance.
+            gain: factor from radiance to display-linear values.
         """
         ctx.save_for_backward(radiance)
         ctx.gain = gain
@@ -471,7 +476,7 @@ def _interpolate_normals(
     Args:
         scene: scene with the object.
         corners: (N, 3) vertices of the face that each point is on.
-        weights: (N, 3) of the corners.
+        weights: (N, 3) barycentric weights of the corners at the point.
     """
     normals = (weights[:, :, None] * scene.object.mesh.normals[corners]).sum(axis=1)
     normals = normals @ object_to_world(scene)[:3, :3].T
@@ -654,10 +659,13 @@ CHANNELS: Mapping[str, str] = {
 
 
 def parse_aovs(text: str | None) -> tuple[str, ...]:
-    """Return the names in a list separated by commas, each once.
+    """Parse a list of layers such as "depth,normal"; each is returned once.
+
+    Args:
+        text: names separated by commas; None or empty for no layers.
 
     Raises:
-        UnknownNameError: one is not of `AOVS`.
+        UnknownNameError: a name is not in `AOVS`.
     """
     stripped = [name.strip() for name in (text or "").split(",")]
     names = tuple(dict.fromkeys(name for name in stripped if name))

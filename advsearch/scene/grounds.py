@@ -43,11 +43,15 @@ MAX_CAR_CAMERA_HEIGHT = 2.5
 
 
 def is_against_traffic(scene: SceneData, camera: Float64Array) -> bool:
-    """Return whether a camera (4, 4) drives in the object's lane towards its front.
+    """Return whether a camera would drive against the traffic, towards the object.
 
-    It does if it is before the object, at most half a lane aside and no higher than a
-    car's camera, if the object is one that drives and stands in a lane. Lanes run along
+    That is so if the object is a vehicle in a lane, and the camera is in front of it, at
+    most half a lane to the side, and no higher than the camera of a car. Lanes run along
     x, and the object faces +x.
+
+    Args:
+        scene: the scene.
+        camera: (4, 4) pose of the camera.
     """
     if not (scene.object.drives and (scene.is_in_lane or has_lanes(scene))):
         return False
@@ -100,11 +104,11 @@ PLACE_BY_GROUND_KIND: Mapping[str, tuple[str, str | None]] = {
 
 
 def find_ground_kind(scene: SceneData) -> str | None:
-    """Return the kind of ground that a scene's environment and its settings ask for.
+    """Return the kind of ground that settings or the environment require.
 
-    None where the ground has a size of 0. Otherwise the setting `ground.kind` wins, and
-    then the environment's own kind, which does not count where settings describe a
-    table. None where neither names one.
+    It is None if the ground has the size 0. Otherwise the setting `ground.kind` counts,
+    and without it the environment's own kind. The latter is ignored if settings describe
+    a table. It is None if neither names a kind.
     """
     requested = scene.values.get("ground.kind")
     if scene.get_number("ground.size") <= 0.0:
@@ -131,10 +135,11 @@ def find_place(scene: SceneData) -> Place | None:
 
 
 def load_requested_place(scene: SceneData) -> Place | None:
-    """Return the place that a scene's environment and its settings ask for.
+    """Return the place that settings or the environment require; None for none.
 
-    A kind of ground wins, which may be no place; else it is the environment's own,
-    unless settings describe the ground. None where they ask for none.
+    If there is a kind of ground, that decides: it is a bundled place or none. Otherwise
+    the environment may have a place, which is ignored if settings describe a table or
+    the ground has the size 0.
     """
     kind = find_ground_kind(scene)
     if kind is not None:
@@ -154,8 +159,8 @@ def load_requested_place(scene: SceneData) -> Place | None:
 def with_requested_ground(scene: AnyScene) -> AnyScene:
     """Return the scene with the road or the place that its settings request.
 
-    Another one that it had is left out. The place's lamps are on where the light is
-    dark, see `_is_dark`.
+    A road or place that the scene has already is replaced. The place's lamps are on if
+    the environment is dark.
     """
     other_parts = tuple(
         part
@@ -264,12 +269,19 @@ class CameraView(NamedTuple):
 def find_valid_range(
     surroundings: Surroundings, camera: CameraView
 ) -> tuple[float, float]:
-    """Return up to which distance and height an environment's picture fits a camera.
+    """Return the largest distance and height of a camera for an environment's picture.
 
-    In the lengths of `surroundings`, infinite without a bound; `NO_RANGE` where the
-    picture is turned against the ground. The distance has two bounds, as said above:
-    what stands around becomes too large, or the end of the ground comes into sight. The
-    camera's own distance does not count, its height and angles do.
+    The distance has two bounds: beyond the first, things in the picture look too large
+    by the factor `MAX_SCALE_ERROR`; beyond the second, the end of the ground comes into
+    sight. They depend on the camera's height and direction, not on its own distance.
+
+    Args:
+        surroundings: the place that the picture shows.
+        camera: position and direction of the camera.
+
+    Returns:
+        Distance and height in the unit of `surroundings`, infinite if there is no
+        bound; `NO_RANGE` if the picture is rotated against the ground.
     """
     # from -180 to 180 degrees
     rotation = (surroundings.rotation + 180.0) % 360.0 - 180.0
@@ -278,7 +290,7 @@ def find_valid_range(
     max_scale_distance = (MAX_SCALE_ERROR - 1.0) * _reach_of_area(
         surroundings.nearest_distance, camera.towards
     )
-    # how much of the ground below the camera its image does not show
+    # length of the ground in front of the camera that is below the image's lower border
     hidden_ground_distance = math.inf
     if camera.lower_angle > 0.0:
         lower_angle = math.radians(min(camera.lower_angle, 179.0))
@@ -488,8 +500,8 @@ def _describe_limits(limits: Sequence[tuple[float, float]], unit: str) -> str:
     """Return up to where an environment's picture fits a camera, for a message.
 
     Args:
-        limits: distance and height of each view, see `find_valid_range`.
-        unit: unit of these.
+        limits: largest distance and height of each view.
+        unit: their unit, such as "m".
     """
     distances = [distance for distance, _ in limits]
     smallest = min(distances)

@@ -194,8 +194,12 @@ def add_lamps(scene: AnyScene) -> AnyScene:
 def _check_units(scene: SceneData, carrier: str) -> float:
     """Return the luminance of a radiance of 1, cd/m2, in the scene's environment.
 
-    `carrier` is what has lamps, for the message. Raises InputError: the environment has
-    no unit, or the object's size in metres is not known.
+    Args:
+        scene: the scene.
+        carrier: name of what has lamps, for the message.
+
+    Raises InputError: the environment's light has no unit, or the object's size in
+    metres is not known.
     """
     settings = {"object": "`set` object.lamps", CAMERA: "`set` camera.lamps"}
     setting = settings.get(carrier, "things: lamps")
@@ -289,14 +293,15 @@ def _count_units_per_metre(scene: SceneData, part: MeshPart) -> float:
 def _find_beam_positions(
     vertices: Float32Array, units_per_metre: float
 ) -> list[Float64Array]:
-    """Return where the left and the right beam start, before the glass of a car.
+    """Return where the left and the right beam of a car start.
 
-    The glass is one mesh: what lies to the left of its mean is the left lamp. A beam
-    starts `BEAM_OFFSET` before the middle of its lamp. The car drives along +x.
+    The glass of both lamps is one mesh. Its vertices to the left of their mean are the
+    left lamp. A beam starts `BEAM_OFFSET` in front of the middle of its lamp, so that
+    the glass does not hide it. The car drives along +x.
 
     Args:
-        vertices: (V, 3) of the glass.
-        units_per_metre: a metre in the car's coordinates.
+        vertices: (V, 3) of the glass, in the car's coordinates.
+        units_per_metre: length of a metre in the car's coordinates.
     """
     positions = []
     for side in (1.0, -1.0):  # +y is left
@@ -465,14 +470,14 @@ def _make_disk_faces() -> IntArray:
 
 
 def _find_foremost(corners: Float64Array, disk: Float64Array, default: float) -> float:
-    """Return the largest x of triangles where a disk covers them, seen along x.
+    """Return the largest x at which a line along x through a disk's vertex meets a face.
 
-    Only the triangles at the disk's vertices count, by their y and z, not their x.
+    So a disk at this x is in front of the car's body.
 
     Args:
-        corners: (F, 3, 3) of the triangles.
-        disk: (V, 3) vertices of the disk.
-        default: returned where none of them has a triangle before or behind it.
+        corners: (F, 3, 3) corners of the faces.
+        disk: (V, 3) vertices of the disk, whose x does not count.
+        default: result if no such line meets a face.
     """
     # (F, 3): per axis, whether the boxes of triangle and disk lie apart; x is not used
     is_disjoint = (corners.min(axis=1) > disk.max(axis=0)) | (

@@ -245,8 +245,8 @@ class Person:
         The pelvis is above the origin, and the lowest vertex on z = 0.
 
         Args:
-            values: scalar tensors by the names of `PARAMETERS`; this person's default
-                if one is missing.
+            values: scalar tensors by the names of `PARAMETERS`, such as "left_knee" in
+                degrees. Those that are missing have this person's defaults.
         """
         number_by_name = self._complete_values(values)
         device = number_by_name["height"].device
@@ -413,8 +413,12 @@ class Person:
     def _shape_body(self, mixture: Tensor) -> tuple[Tensor, Tensor]:
         """Return the points (P, 3) and the joints (J, 3) of a body at rest.
 
-        `mixture` (G, A, W, H) are the weights of the extremes of gender, age, weight
-        and height, see `_mix_phenotype`. Joints are in the order of bones.
+        Args:
+            mixture: (G, A, W, H) weights of the extreme bodies of each gender, age,
+                weight and height, which sum to 1.
+
+        Returns:
+            The points, and the joints in the order of bones.
         """
         device = mixture.device
         # the factors of R shapes, each of which moves all points
@@ -469,9 +473,15 @@ class Person:
     def _compute_straight_turns(self, joints: Tensor) -> dict[str, Tensor]:
         """Return the rotations (3, 3) of limbs from the rest pose to all angles 0.
 
-        They are by bone, such as "thigh_l"; each turns the bone, which leads from its
-        joint to the next, to its direction in `STRAIGHT`. Hands follow the forearm, and
-        are turned by 60 degrees about the vertical in addition. `joints` are (J, 3).
+        A bone goes from its joint to the next one. Its rotation is the smallest that
+        turns it to its direction in `STRAIGHT`. Hands follow the forearm, and are also
+        rotated by 60 degrees about the vertical.
+
+        Args:
+            joints: (J, 3) positions in the rest pose.
+
+        Returns:
+            The rotations by bone, such as "thigh_l".
         """
         rotations = dict[str, Tensor]()
         for side, sign in (("l", 1.0), ("r", -1.0)):
@@ -502,8 +512,12 @@ def load_body() -> Mapping[str, np.ndarray]:
 def compute_interpolation_weights(value: Tensor, nodes: Tensor) -> Tensor:
     """Return the weights (n,) of linear interpolation between rising nodes (n,).
 
-    They sum to 1 from the first node to the last, and beyond these the nearest node has
-    all of the weight.
+    Between two nodes these have weights that sum to 1, and all others 0. Before the
+    first and after the last node, that node has the weight 1.
+
+    Args:
+        value: () where to interpolate.
+        nodes: (n,) rising positions of the nodes.
     """
     # how far the value is through each of the n - 1 intervals
     fraction = (value - nodes[:-1]) / (nodes[1:] - nodes[:-1])
@@ -558,9 +572,9 @@ def _compute_gait_angle(
 ) -> Tensor:
     """Return an angle of the gait, degrees, at a phase.
 
-    The ten samples of a cycle are interpolated by their Fourier series, smooth and
-    periodic. Of its waves 0 to 5 the highest is left out: ten samples do not tell its
-    phase.
+    The ten samples of a cycle are interpolated by their Fourier series, which is smooth
+    and periodic. It has waves of the orders 0 to 5. The last is left out, since ten
+    samples do not determine its phase.
 
     Args:
         tenths: degrees at each tenth of the cycle.
@@ -622,12 +636,13 @@ def _correct_heights(
 ) -> dict[str, Tensor]:
     """Return how much each foot has to rise to touch the ground, "l" and "r".
 
-    The ground is taken to lie at the mean height of both feet, weighted by contact. A
-    foot with full contact goes there; one without keeps its height above it, but is not
-    below it; between them in proportion. A negative rise lowers the foot.
+    The ground is assumed at the mean height of both feet, weighted by contact. A foot
+    with full contact is moved to the ground. A foot without contact keeps its height
+    above the ground, but is not left below it. In between it is in proportion. A
+    negative rise lowers the foot.
 
     Args:
-        lowest: height of the lowest point of each foot, "l" and "r".
+        lowest: height in metres of the lowest point of each foot, "l" and "r".
         contact: contact of each foot with the ground, 0 to 1.
         amount: () fraction of the correction that is made.
     """

@@ -241,9 +241,14 @@ class Renderer:
 
     @contextmanager
     def share_paths(self, paths: SharedPaths | None) -> Iterator[None]:
-        """Trace what images of one seed have in common once inside the `with`.
+        """Let renders inside the `with` block share paths.
 
-        Each image is traced in full with None, or the paths of another scene.
+        Images with one seed have a part of their paths in common. Inside the block that
+        part is traced once for all of them.
+
+        Args:
+            paths: stores the shared paths. With None, or with those of another scene,
+                each image is traced in full.
         """
         paths_before = self.shared_paths
         is_of_scene = paths is not None and paths.scene is self.scene
@@ -259,11 +264,16 @@ class Renderer:
         return self.crop.window if self.crop else None
 
     def crop_to(self, window: Window, u: Tensor, seed: int, spp: int) -> Renderer:
-        """Return a renderer that renders a window alone.
+        """Return a renderer that renders only a window of each image.
 
-        Around the window, all of its images show what the image of u (d,) shows there.
-        That is rendered now, with arguments as for a call, and does not count as a
-        render.
+        Around the window, all images show the same: the image of u, which is rendered
+        now, and does not count as a render.
+
+        Args:
+            window: rows and columns that are rendered.
+            u: (d,) configuration of the surroundings.
+            seed: seed of their noise.
+            spp: their samples per pixel.
         """
         with torch.no_grad():
             inputs = self.scene.assembly(self.space.inputs(u))

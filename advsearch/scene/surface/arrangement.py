@@ -297,7 +297,11 @@ class Arrangement:
         )
 
     def _make_view_tracer(self, object_center: Float32Array) -> ViewTracer:
-        """Return what traces rays through cameras, with the lens of the inputs."""
+        """Return the tracer of camera rays, with the lens that the inputs set.
+
+        Args:
+            object_center: (3,) center of the object in world space.
+        """
         model = self._scene.definition[0].camera_model
         if model is not None and "camera.lens" in self.inputs:
             model = model.with_numbers(self.inputs["camera.lens"])
@@ -353,8 +357,13 @@ class Arrangement:
     ) -> list[texels.LitTexels]:
         """Return the texels of the object, as one surface.
 
-        If its back is visible from outside there are two: the front and the back, whose
-        normals are reversed.
+        If the back of its faces is visible from outside, there are two surfaces: the
+        front and the back. They have the same texels with opposite normals.
+
+        Args:
+            charts: rasterised texture coordinates of the object.
+            vertices: (V, 3) in world space.
+            normals: (V, 3) in world space.
         """
         single = texels.make_mesh_texels(OBJECT, charts, vertices, normals)
         if not is_visible_from_behind(self._scene, OBJECT, single.positions):
@@ -373,9 +382,14 @@ class Arrangement:
     def _find_buried(self, met_cells: Ints, side: int) -> BoolArray:
         """Return which texels (n,) of one side of the object lie inside something.
 
-        `met_cells` has what each texel's rays met: a cell, or a negative number for a
-        back without light of its own. A texel is buried if most of its rays meet backs.
-        Where the backs have texels too (two sides), it also has to see no sky.
+        Inside of something, rays meet the backs of faces. A texel is buried if more than
+        `BURIED_FRACTION` of its rays do. If backs have texels too (two sides), the
+        object may be an open shell: then the texel also has to see no sky.
+
+        Args:
+            met_cells: (n, rays) cell that each ray of a texel met; a negative number is
+                a back without texels.
+            side: 0 for the front of the object, 1 for its back.
         """
         cells = met_cells[self.texels.select_grid(side)]
         if self.n_sides == 1:
@@ -521,10 +535,16 @@ class Arrangement:
             return ArrangementLight(torch.cat(side_irradiances), light_maps)
 
     def _find_hot_cosines(self, sky: texels.SkyLight) -> Tensor | None:
-        """Return the visible cosines (n, k) towards what is hot; None if nothing is.
+        """Return the cosines (n, k) of n texels towards k directions of hot light.
 
-        Its k directions are sampled where the map is far brighter than its mean, see
-        `texels.HOT_FACTOR`. The cosine is 0 where something hides one.
+        Hot is the light far above the map's mean, such as that of the sun. A cosine is 0
+        if something hides the direction from the texel.
+
+        Args:
+            sky: the environment, with the directions of its hot light.
+
+        Returns:
+            None if nothing is hot.
         """
         hot_directions = sky.hot[0]
         if not len(hot_directions):
@@ -543,10 +563,14 @@ class Arrangement:
     ) -> Tensor:
         """Return what the camera sees of the ground's texels (n, 3), smoothed.
 
-        That is the radiance that leaves them. For a photographed ground it is the
-        fraction of the photograph that is left: the irradiance, divided by that under
-        the open sky. `irradiance` and `leaving` (radiance) are those of all texels, the
-        ground's last.
+        For a plain ground that is the radiance that leaves its texels. For a
+        photographed ground it is the factor on the photograph, which a shadow darkens:
+        the irradiance divided by that under the open sky.
+
+        Args:
+            irradiance: (N, 3) of all texels; the ground's are the last.
+            leaving: (N, 3) radiance that leaves all texels.
+            padded: (H, W + 2, 3) map of the environment.
         """
         ground = self.texels.select_grid(self.n_sides)
         if self._capture_height is None:
@@ -568,8 +592,13 @@ class Arrangement:
     ) -> Tensor:
         """Put the ground into a map (h, w, 3) of what surrounds the object.
 
-        All of the ground has the value `far_ground` (1, 3) of its far end: a radiance,
-        or for a photographed ground a fraction of the photograph there.
+        The map is for gloss, and so coarse that all of the ground may have one value.
+
+        Args:
+            surroundings: (h, w, 3) map of the environment alone.
+            far_ground: (1, 3) value of the ground's far end: a radiance, or for a
+                photographed ground the factor on the photograph.
+            padded: (H, W + 2, 3) map of the environment.
         """
         is_hidden, photograph_directions = self._ground_below
         ground = far_ground
@@ -583,8 +612,11 @@ class Arrangement:
     def _compute_reflectance(self, color: Tensor, padded: Tensor) -> Tensor:
         """Return which fraction (n, 3) of even light each texel reflects.
 
-        That is the base color times the diffuse fraction, plus the fraction of the
-        gloss. Arguments are those of `compute_light`.
+        It is the base color times the diffuse fraction, plus the fraction of the gloss.
+
+        Args:
+            color: (h, w, 3) base color of the object.
+            padded: (H, W + 2, 3) map of the environment, for a photographed ground.
         """
         colors = [self._compute_object_color(color)] * self.n_sides
         if self._has_ground:
@@ -607,8 +639,11 @@ class Arrangement:
     def _compute_ground_color(self, padded: Tensor) -> Tensor:
         """Return the base color (n, 3) of the ground's texels.
 
-        A photographed ground has the color with which it looks like its photograph when
-        it is lit by the whole sky, radiance = color E / pi.
+        A photographed ground has the color with which it looks like its photograph under
+        the full sky: radiance = color E / pi, where E is the irradiance.
+
+        Args:
+            padded: (H, W + 2, 3) map of the environment.
         """
         ground = self.texels.positions[self.texels.select_grid(self.n_sides)]
         if self._capture_height is None:

@@ -104,9 +104,14 @@ class SurfaceRenderer(Predictor):
     n_traced_images = 0
 
     def __init__(self, traced: Renderer, u: Tensor, seed: int) -> None:
-        """Fix everything as it is at u, but cameras, environment and base color.
+        """Lay texels over the scene as it is at one configuration.
 
-        The arrangement of texels is made for it; `seed` is that of its rays.
+        Predictions hold as long as only cameras, environment and base color change.
+
+        Args:
+            traced: renderer of the scene.
+            u: (d,) configuration.
+            seed: seed of the rays by which texels see each other and the sky.
         """
         super().__init__(traced)
         self.n_dropped = 0
@@ -135,10 +140,10 @@ class SurfaceRenderer(Predictor):
         return inputs.get(COLOR_INPUT, self._base[COLOR_INPUT])
 
     def is_applicable(self, inputs: Mapping[str, Tensor]) -> bool:
-        """Return whether the arrangement holds for some scene inputs.
+        """Return whether `predict_images` holds for some scene inputs.
 
-        They may differ from its own in cameras and environment only, not in the base
-        color.
+        They may differ from those of this arrangement in cameras and environment only,
+        not in the base color, which `predict_images` leaves as it is.
         """
         expected = {**self.arrangement.inputs, COLOR_INPUT: self.base_color}
         fixed_inputs = {
@@ -357,8 +362,8 @@ def find_refusal(renderer: Renderer, varying: Collection[str]) -> Refusal | None
 def find_scene_refusal(renderer: Renderer) -> Refusal | None:
     """Return why light cannot be stored on a scene's surfaces; None if it may be.
 
-    It may be for an object with one texture, on a ground and under an environment, if
-    images are denoised.
+    It can be if the scene is an object with one texture on a ground, under an
+    environment, and if images are denoised: predictions have no noise.
     """
     description = renderer.scene.definition[0]
     mesh_part = description.meshes[OBJECT]
@@ -381,9 +386,12 @@ def find_scene_refusal(renderer: Renderer) -> Refusal | None:
 def find_changed_inputs(renderer: Renderer, varying: Collection[str]) -> frozenset[str]:
     """Return the names of the scene inputs that some controls change.
 
-    `varying` has names of controls or of groups of coordinates. Their coordinates are
-    set to one fraction of their ranges after another, all at once, and the inputs are
-    compared with those of the start.
+    All coordinates of these controls are set to one value, one of a few fractions of
+    their range after another, and the inputs are compared with those of the start.
+
+    Args:
+        renderer: renderer of the scene.
+        varying: names of controls, or of groups of coordinates such as "pose.yaw".
     """
     changed: set[str] = set()
     with torch.no_grad():

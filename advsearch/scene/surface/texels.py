@@ -70,9 +70,11 @@ class LitTexels:
 def join_texels(surfaces: Sequence[LitTexels]) -> LitTexels:
     """Join the texels of several surfaces, each with one grid.
 
-    Cells and texels are numbered on from one surface to the next.
+    The cells and texels of a surface get the numbers that follow those of the surface
+    before it.
     """
-    # index of each surface's first texel and first cell, and last the number of all
+    # Indices of the first texel and the first cell of each surface. The last entry is
+    # the total number.
     texel_bounds = np.cumsum([0] + [len(texels.positions) for texels in surfaces])
     cell_bounds = np.cumsum([0] + [texels.grids[0].n_cells for texels in surfaces])
     grids = []
@@ -105,13 +107,14 @@ def make_mesh_texels(
 
     Args:
         name: name of the mesh.
-        charts: its rasterised texture coordinates.
-        vertices, normals: (V, 3) in world space.
-        side: side of its faces, as `TexelGrid` has it.
+        charts: rasterised texture coordinates of the mesh.
+        vertices: (V, 3) in world space.
+        normals: (V, 3) in world space.
+        side: side of the faces: 0 if there is one, 1 the front and -1 the back of two.
     """
     position, normal = _interpolate(charts, vertices, normals)
-    # index of the texel in each covered cell, which are counted row by row; in other
-    # cells it means nothing
+    # Texels are the covered cells, numbered row by row: the index of each. In cells that
+    # are not covered the number means nothing.
     texel_of_covered = np.cumsum(charts.is_covered.ravel()) - 1
     rows, columns = np.nonzero(charts.is_covered)
     return LitTexels(
@@ -168,8 +171,8 @@ def make_ground_texels(
 def _find_warp_rate(ratio: float) -> float:
     """Find the rate with sinh(rate) / rate = ratio, by bisection.
 
-    A ratio of 1 or less has no such rate: the result is then the lower bound, 0.001,
-    for which a grid is all but even.
+    For a ratio of 1 or less there is no such rate. Then the result is the lower bound,
+    0.001, with which all texels of a grid have almost the same width.
     """
     lower = 1e-3
     upper = 20.0  # a ratio of twelve million
@@ -246,11 +249,15 @@ def _use_nearest_texel(
     texel_index: IntArray,
     weights: Float64Array,
 ) -> None:
-    """Give all the weight to the nearest texel where no neighbour of a point has any.
+    """Give all the weight to the nearest texel if no neighbour of a point has any.
 
-    The first columns of `texel_index` and `weights` (N, neighbours), the results of
-    `_weigh_neighbours`, are overwritten for these points. Other arguments are those of
-    `_weigh_neighbours`.
+    Args:
+        texels: texels of the mesh.
+        charts: charts of the mesh.
+        grid_position: rows and columns (N,) of the points in the grid of the charts.
+        texel_index: (N, neighbours) texels around the points; the first column is
+            overwritten for points without weights.
+        weights: (N, neighbours) their weights, likewise.
     """
     y, x = grid_position
     n_rows, n_columns = charts.is_covered.shape
@@ -326,6 +333,8 @@ def _make_sparse(
     size: tuple[int, int],
 ) -> Tensor:
     """Return a sparse matrix of weights, without those of 0.001 and less.
+
+    So small weights change nothing that is visible, and would make the matrix larger.
 
     Args:
         fine_cell: (N,) row of the matrix for each row of the weights.
@@ -403,10 +412,12 @@ def make_smoothing_matrix(ground: LitTexels, sees_sky: BoolArray) -> Tensor:
 def _interpolate(
     charts: Charts, vertices: Float32Array, normals: Float32Array
 ) -> tuple[Float32Array, Float32Array]:
-    """Return the position and the unit normal of the surface in each cell, both (h, w,
-    3).
+    """Return the position and the unit normal (h, w, 3) of the surface in each cell.
 
-    `vertices` and `normals` are (V, 3).
+    Args:
+        charts: face and barycentric weights of each cell.
+        vertices: (V, 3) in world space.
+        normals: (V, 3) in world space.
     """
     corners = charts.mesh.faces[charts.face]
     position = np.einsum("hwk,hwkc->hwc", charts.weights, vertices[corners])

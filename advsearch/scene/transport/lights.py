@@ -179,9 +179,10 @@ def _measure_effect(
 def _sample_configurations(group: Group, reference: Tensor) -> Iterator[Tensor]:
     """Yield copies of a configuration in which one group has other values.
 
-    All coordinates of the group have the same value: one of a few fractions of the
-    range, or the middle of an option of a choice, of which at most `MAX_OPTIONS` are
-    taken, evenly. For a group of several coordinates a random point is added.
+    All coordinates of the group have the same value, one of a few fractions of the
+    range. For a choice it is the middle of an option, and at most `MAX_OPTIONS` options
+    are taken at even steps. For a group of several coordinates a random point is added,
+    since equal values may cancel.
     """
     fractions = list(PROBE_FRACTIONS)
     if group.options:
@@ -264,9 +265,12 @@ def _is_explained(basis: Tensor, target: Tensor) -> bool:
 def _make_harmonic_maps(like: Tensor) -> Tensor:
     """Return spherical harmonics of degrees 0 to 2 as maps (9, H, W, 3).
 
-    Light cannot be negative: each harmonic is lifted to at least zero by a multiple of
-    the first, which is constant. Size and mean are those of the map `like`, with its
-    copied columns at both ends.
+    Light cannot be negative. So each harmonic is raised to at least zero by adding a
+    multiple of the first one, which is constant: sums of the maps stay the same.
+
+    Args:
+        like: (H, W, 3) map whose size and mean the results have. Its first and last
+            columns are copies of the columns at the other end.
     """
     basis = compute_real_harmonics(like.shape[0], like.shape[1] - 2)
     # (9, H, W): the last column before the first, and the first after the last
@@ -286,9 +290,9 @@ class BasisMaps:
     def fit_weights(self, target: Tensor) -> Tensor:
         """Return the weights (k, 3) with which the maps add up to a map (H, W, 3).
 
-        With several maps they are a least squares fit, weighted by solid angle. A
-        single map is taken for proportional to the target. The weights are
-        differentiable.
+        There is one weight for each map and channel. With several maps they are a least
+        squares fit, weighted by solid angle. A single map is assumed to be proportional
+        to the target. The weights are differentiable.
         """
         flat_target = target.permute(2, 0, 1).reshape(3, -1, 1)
         if len(self.maps) == 1:
@@ -320,7 +324,8 @@ class BasisMaps:
         angle: the least squares fit.
         """
         count, height, width, _ = self.maps.shape
-        # the solid angle of a texel goes by the sine of its angle from straight up
+        # The solid angle of a texel is proportional to the sine of its angle from
+        # straight up. Least squares with weights W: (A W A^T)^-1 A W.
         polar = (torch.arange(height) + 0.5) * torch.pi / height
         sine = torch.sin(polar)[:, None].expand(height, width).reshape(-1)
         channel_maps = self.maps.permute(3, 0, 1, 2).reshape(3, count, -1).double()
@@ -409,8 +414,13 @@ class LightBasis:
 def _make_basis_maps(renderer: Renderer, lighting: Lighting, first: Tensor) -> Tensor:
     """Return the environment's basis maps (k, H, W, 3).
 
-    The first is `first`. If some group adds spherical harmonics, they are the others,
-    set to zero in texels where no harmonics are added.
+    The first is `first`. If a group adds spherical harmonics to the environment, they
+    are the others. They are zero in texels in which no harmonics are added.
+
+    Args:
+        renderer: renderer of the scene.
+        lighting: groups that change light.
+        first: (H, W, 3) the environment's map.
     """
     if not lighting.harmonic_groups:
         return first[None]
@@ -479,7 +489,14 @@ class BasisRenderer(Predictor):
     def _trace_lights(
         self, traced: Renderer, u: Tensor, seed: int, tick: ProgressCallback
     ) -> list[LinearRenderer]:
-        """Trace image and matrices under each light; arguments as of the class."""
+        """Trace the image and the matrices of base colors under each light.
+
+        Args:
+            traced: renderer of the scene.
+            u: (d,) configuration at which images are traced.
+            seed: seed of the noise; each light gets its own.
+            tick: called with the samples per pixel of each pass as it is done.
+        """
         set_inputs = traced.scene.assembly(traced.space.inputs(u)).keys()
         linear_names = set_inputs & find_linear_inputs(traced)
         # patterns of projectors shine in the first light alone
@@ -576,9 +593,15 @@ def _find_general_refusal(
     searched_groups: Sequence[Group],
     light_groups: Mapping[str, object],
 ) -> Refusal | None:
-    """Return why images cannot be predicted though each searched group allows it.
+    """Return a reason against predictions that is not about a single group.
 
-    `light_groups` has what the groups change that change light, by their names.
+    There are three: nothing needs a render, the scene has haze, or no denoiser.
+
+    Args:
+        renderer: renderer of the space.
+        searched_groups: groups that are searched.
+        light_groups: inputs that are changed by the groups that change only light, by
+            the group's name.
     """
     if not any(
         renderer.routes.get(group.name) or light_groups.get(group.name)

@@ -99,7 +99,13 @@ class ColoredRows:
     """
 
     def __init__(self, rows: int, columns: int, small: bool) -> None:
-        """Make an empty matrix of rows x columns; `small` is as for the class."""
+        """Make an empty matrix.
+
+        Args:
+            rows: number of rows.
+            columns: number of columns.
+            small: store it in 16 bits, and unpack it for each product.
+        """
         self._shape = (rows, columns)
         self._small = small
         self.entries = 0
@@ -593,11 +599,14 @@ class LinearRenderer(Predictor):
         self.path_renderer.space = space
 
     def predict_radiance(self, inputs: Inputs) -> Tensor:
-        """Return radiance (H, W, 3), and coverage as a fourth channel if there is a
-        backdrop.
+        """Return the radiance (H, W, 3) of scene inputs; with a backdrop more channels.
 
-        Each matrix adds to the base image what its base color changes from where it was
-        linearised. Coverage stays as it is.
+        It is the base image plus the change by each base color: its matrix times its
+        difference from the value at which the image was linearised. The channels behind
+        the first three, such as coverage, stay as they are.
+
+        Args:
+            inputs: scene inputs; only those that have a matrix count.
         """
         base = self.collected.base_image()
         radiance = base[..., :3]
@@ -745,8 +754,15 @@ def _append_plane_change(
 ) -> Tensor:
     """Append to a base image the change of the plane that takes the shadow.
 
-    The three channels are rendered once, since no base color changes them. Without such
-    a plane the image is returned as it is. Arguments are those of `_trace_matrices`.
+    The channels are rendered once, since no base color changes them. If the scene has no
+    such plane, the image is returned as it is.
+
+    Args:
+        renderer: renderer of the scene.
+        base: (H, W, 4) radiance and coverage.
+        traced: inputs of the scene, without those of the finished image.
+        seed: seed of the noise.
+        spp: samples per pixel.
     """
     if renderer.scene.plane_radiance is None:
         return base
