@@ -453,7 +453,8 @@ def compute_refractive_index(gloss: float) -> float:
 def compute_plane_radiance(description: SceneData) -> Tensor | None:
     """Return the radiance (3,) float32 of the plane without the object.
 
-    None if a scene has no plane.
+    A diffuse plane has the radiance albedo * irradiance / pi. The result is None if the
+    scene has no plane.
     """
     if not has_plane(description):
         return None
@@ -855,7 +856,10 @@ def _compute_orbit(world_axes: Float64Array) -> dict[str, float]:
 
 
 def _check_rigid(pose: npt.ArrayLike) -> Float64Array:
-    """Return a pose (4, 4) as float64. Raises InputError: it is not rigid."""
+    """Return a pose (4, 4) as float64.
+
+    Raises InputError: it is not rigid, that is a rotation and a translation alone.
+    """
     matrix = np.asarray(pose, np.float64)
     is_rigid = (
         matrix.shape == (4, 4)

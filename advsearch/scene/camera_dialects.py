@@ -349,8 +349,8 @@ def _translate_kitti(
 def _translate_realsense(data: Mapping[str, Any]) -> dict[str, Any]:
     """Translate the intrinsics of RealSense.
 
-    Two models that we do not have count as "none" where all coefficients are 0: there
-    they are the same as a pinhole.
+    Two of its models are not supported. If all their coefficients are 0 they are the
+    same as a pinhole, and are translated to "none".
     """
     entries = {REALSENSE_NAMES.get(name, name): value for name, value in data.items()}
     kind = re.sub(
@@ -375,8 +375,12 @@ def _translate_realsense(data: Mapping[str, Any]) -> dict[str, Any]:
 def _translate_opensfm(path: str, camera: Mapping[str, Any]) -> dict[str, Any]:
     """Translate a camera of OpenSfM, whose lengths are fractions of the larger side.
 
-    For a camera of an unknown kind, or a panorama, no lengths are translated. `path` is
-    the file, for messages.
+    Lengths of a panorama are not needed, and those of an unknown kind are not
+    translated, since the camera is rejected later.
+
+    Args:
+        path: the file, for messages.
+        camera: entries of the camera.
     """
     stated_type = str(camera["projection_type"])
     kind = OPENSFM_KINDS.get(stated_type)  # None if it is unknown

@@ -101,10 +101,10 @@ class Entries:
         """Return a finite number, or a default if there is no such entry.
 
         Args:
-            name: the entry.
-            default: the default; None if the entry is required.
-            aliases: plain names for the entry, see `normalize_key`, if there are
-                several; otherwise that of `name`.
+            name: name of the entry.
+            default: value if there is no such entry; None if the entry is required.
+            aliases: other names for the entry, as `normalize_key` writes them; by
+                default the entry has one name.
 
         Raises:
             FileFormatError: it is no number, or is required and missing.
@@ -217,9 +217,9 @@ def select_camera(path: str, camera_name: str, cameras: Mapping[str, Any]) -> An
 
 
 def is_neutral(value: object) -> bool:
-    """Return whether an entry changes nothing: it is zero, empty or none.
+    """Return whether an entry changes nothing: it is zero, empty, false or "none".
 
-    Of a matrix, a list or a mapping all values have to be.
+    A matrix, a list or a mapping is neutral if all of its values are.
     """
     if isinstance(value, Mapping):
         # a matrix has its numbers as `data`

@@ -165,14 +165,19 @@ class CameraModel:
         return self._compute_perspective_rays(distorted)
 
     def _compute_fisheye_rays(self, distorted: Tensor) -> tuple[Tensor, Tensor]:
-        """Return unit directions and margins of distorted points, see `compute_rays`.
+        """Return the rays of a fisheye for distorted points.
 
-        The points (N, 2) are in focal lengths.
+        Args:
+            distorted: (N, 2) points in focal lengths from the optical axis.
+
+        Returns:
+            Unit directions (N, 3), and a margin (N,) that is positive inside the view.
         """
         radius = distorted.norm(dim=-1)
         # 0 for the center, which has no direction
         radial_direction = distorted / radius.clamp_min(1e-300)[..., None]
-        # beyond the circle of the image too, so that the margin changes sign there
+        # Angles beyond the circle of the image are solved for too, so that the margin
+        # changes its sign at the circle.
         angle, converged = self._invert_radial(radius, min(self.fold_angle, math.pi))
         directions = torch.cat(
             [radial_direction * angle.sin()[..., None], angle.cos()[..., None]], dim=-1
@@ -486,7 +491,11 @@ class CameraModel:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a user should know about the camera, in sentences."""
+        """Notes for the user, as sentences.
+
+        They are about entries of the file that were not read, and about a part of the
+        image that the lens leaves black.
+        """
         if self.black_fraction == 0.0:
             return self.reading_notes
         name = self.name or "the lens"

@@ -119,7 +119,10 @@ class SceneDescription(SceneData):
     photographs: PhotographFolder | None = None
 
     def with_part(self, part: ScenePart) -> SceneDescription:
-        """Return the scene with one more part. Raises InputError: its name is taken."""
+        """Return the scene with one more part, such as a lamp that a control adds.
+
+        Raises InputError: the scene has a part of that name.
+        """
         part_by_name = {existing.name: existing for existing in self.parts}
         if part.name in (OBJECT, "environment", "ground", "camera", *part_by_name):
             is_plugin = isinstance(part_by_name.get(part.name), PluginPart)
@@ -939,11 +942,19 @@ def _load_thing(spec: str, facing: str | None) -> ObjectAsset:
 def _load_object(
     spec: str | Path | ObjectAsset, up: str | None, facing: str | None
 ) -> ObjectAsset:
-    """Return an asset as it is, or load a bundled object or a mesh file."""
+    """Return an asset as it is, or load a bundled object or a mesh file.
+
+    Args:
+        spec: an asset, the name of a bundled object, or a mesh file.
+        up: "y" or "z", the axis of a mesh file that points up; None: its usual one.
+        facing: the axis of a mesh file that is its front; None: its usual one.
+
+    Raises InputError: an axis is given for a bundled object.
+    """
     if isinstance(spec, ObjectAsset):
         return spec
     if is_path(spec):
-        # any other `up` was refused with the settings
+        # Any other `up` was rejected before. The branches tell the type checker so.
         known_up: Literal["y", "z"] | None = None
         if up == "y":
             known_up = "y"

@@ -102,9 +102,10 @@ class GlbBuffer:
         return len(self.accessors) - 1
 
     def to_bytes(self, header: dict[str, Any]) -> bytes:
-        """Return the complete file.
+        """Return the complete .glb file: a header, then JSON, then binary data.
 
-        The entries of the buffer are added to the header.
+        Args:
+            header: the glTF document. The entries that describe the buffer are added.
         """
         header |= {
             "accessors": self.accessors,
@@ -114,7 +115,8 @@ class GlbBuffer:
         text = json.dumps(header).encode()
         text += b" " * (-len(text) % 4)
         binary = bytes(self.data)
-        # 12 bytes of the file's header, and 8 of each of both chunks
+        # The file's header has 12 bytes, and that of each of the two chunks 8. The two
+        # numbers below are the chunk types "JSON" and "BIN".
         size = 28 + len(text) + len(binary)
         file_header = struct.pack("<4sIIII", b"glTF", 2, size, len(text), 0x4E4F534A)
         chunk_header = struct.pack("<II", len(binary), 0x004E4942)
@@ -236,8 +238,9 @@ def _make_document(
 def _add_geometry(buffer: GlbBuffer, shape: Shape) -> dict[str, Any]:
     """Add the mesh of a shape to a buffer, and return its primitive.
 
-    Axes are turned to glTF's, and v is turned over, since glTF's is 0 at the top. A
-    normal of length 0 becomes upright. Indices have 16 bits where these suffice.
+    The mesh is converted to glTF's axes, with y up. v becomes 1 - v, since glTF's is 0
+    at the top. glTF requires unit normals, so that a normal of length 0 becomes +z.
+    Indices have 16 bits if that suffices.
     """
     mesh = shape.mesh
     lengths = np.linalg.norm(mesh.normals, axis=1, keepdims=True)

@@ -400,7 +400,8 @@ def forbid_second_derivatives(backward: Backward) -> Backward:
         # gradients are enabled here only with `create_graph`, for a second derivative
         if not torch.is_grad_enabled():
             return derivatives
-        # a guarded value depends on all that the derivative depends on
+        # A guarded value depends, for autograd, on all that the derivative depends on:
+        # differentiating it again reaches the guard, which raises the error.
         arguments = (cotangent, *ctx.saved_tensors)
         guarded = []
         for value in derivatives:

@@ -288,10 +288,17 @@ class LightImage:
 def read_light(path: Path, label: str = "environment") -> LightImage:
     """Read an ``.hdr`` or ``.exr`` image of any shape.
 
-    Its rows become floats only when they are read, so that a large one takes less
-    memory. Errors are those of `import_environment`; radiance that is not finite, or
-    negative, is one, of which the message names the first texel. `label` is what the
-    image is, for messages.
+    Its rows become floats only when they are read, so that a large image takes less
+    memory.
+
+    Args:
+        path: the file.
+        label: what the image is, for messages.
+
+    Raises:
+        FileFormatError: the file is missing, of another kind, damaged, or lacks
+            channels.
+        InputError: values are negative, NaN or infinite.
     """
     data = read_bytes(path, label, ENVIRONMENT_SUFFIXES)
     if path.suffix.lower() == ".hdr":
@@ -349,7 +356,7 @@ def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
 
     Raises:
         FileFormatError: the file is missing, of another kind, damaged, or lacks
-            channels; the message names it.
+            channels.
         InputError: values are negative, NaN or infinite; the message counts them and
             gives the first position.
     """
@@ -382,8 +389,12 @@ def _resize_map(
 ) -> Float32Array:
     """Bring a map to a size from `MIN_MAP_SIZE` to `MAX_MAP_SIZE`.
 
-    A larger one is averaged down, both sides by the same factor; the texels of a
-    smaller one are repeated. `read_rows` and `size` are as in `LightImage`.
+    A larger map is averaged down, both sides by the same factor. The texels of a smaller
+    one are repeated.
+
+    Args:
+        read_rows: returns the rows (n, W, 3) from a first row to an end.
+        size: height and width of the map.
     """
     height, width = size
     shrink = min(1.0, MAX_MAP_SIZE[0] / height, MAX_MAP_SIZE[1] / width)
@@ -408,9 +419,13 @@ def _average_map(
 ) -> Float32Array:
     """Average a map down to a shape, weighted by the solid angles of its texels.
 
-    These go by the sine of the angle between their row and straight up. The weighted
-    texels are averaged, and divided by the averaged weights. `read_rows` and `size` are
-    as in `LightImage`.
+    The solid angle is proportional to the sine of the angle between a texel's row and
+    straight up. The weighted texels are averaged, and divided by the averaged weights.
+
+    Args:
+        read_rows: returns the rows (n, W, 3) from a first row to an end.
+        size: height and width of the map.
+        target_shape: height and width of the result.
     """
     height = size[0]
     polar = (np.arange(height, dtype=np.float32) + np.float32(0.5)) * np.float32(

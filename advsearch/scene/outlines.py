@@ -57,10 +57,14 @@ class VisibleMesh:
 def find_visible_meshes(
     renderer: Renderer, u: Tensor, names: Collection[str] | None = None
 ) -> list[VisibleMesh]:
-    """Return the meshes that the image of a configuration (d,) shows.
+    """Return the meshes that are visible in the image of a configuration.
 
-    A mesh counts if it is seen first in a pixel. With `names` only those are
-    considered.
+    A mesh is visible if it is the nearest surface in at least one pixel.
+
+    Args:
+        renderer: renderer of the scene.
+        u: (d,) configuration.
+        names: the meshes that are considered; None for all.
     """
     description = renderer.scene.definition[0]
     surfaces = renderer.surfaces(u)

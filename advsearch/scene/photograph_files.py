@@ -287,7 +287,15 @@ def _parse_numbers(
 
 
 def _parse_settings(file: Path, stated: object) -> dict[str, float]:
-    """Return the settings of the scene that a camera file states as `set`."""
+    """Return the settings of the scene that a camera file has in its entry `set`.
+
+    Args:
+        file: path of the camera file, for messages.
+        stated: the entry: settings by name, such as {"ground.level": 0.2}.
+
+    Raises FileFormatError: it has other settings than those of the view, or values out
+    of their range.
+    """
     if not isinstance(stated, Mapping):
         raise FileFormatError(f"{file}: set: expected settings by name")
     for name in stated:

@@ -16,7 +16,8 @@ from advsearch.scene.settings import POSE
 def make_rotation(yaw: float, pitch: float, roll: float) -> Float64Array:
     """Return `Rz(yaw) Ry(pitch) Rx(roll)`, angles in degrees, as a (3, 3) matrix.
 
-    That is first a turn about x by the roll, then about y, then about z.
+    It rotates first about x by the roll, then about y by the pitch, then about z by the
+    yaw.
     """
     # cosine and sine of each
     (cz, sz), (cy, sy), (cx, sx) = (

@@ -228,7 +228,11 @@ def read_photograph_cameras(path: str) -> PhotographCameras | None:
 
 
 def _read_image_cameras(path: str) -> PhotographCameras:
-    """Read the cameras of COLMAP's images.txt."""
+    """Read the cameras of the photographs in COLMAP's images.txt.
+
+    The file has a line with the pose of each photograph; its lens is in the cameras.txt
+    beside it, and is read when the photograph is requested.
+    """
     words_by_id = _parse_images(path)
     files = {name: words[-1] for name, words in words_by_id.items()}
     read_model = cache(read_camera)  # many images have one camera
@@ -509,7 +513,13 @@ def _read_frame_pose(path: str, data: Mapping[str, Any], name: str) -> Float64Ar
 def _read_frame_models(
     path: str, names: Sequence[str], frames: Sequence[Mapping[str, Any]]
 ) -> list[CameraModel]:
-    """Return the camera models of frames of a transforms.json, which have names."""
+    """Return the camera models of frames of a transforms.json.
+
+    Args:
+        path: the file.
+        names: indices of the frames in the file, as texts.
+        frames: entries of these frames.
+    """
     lenses = [
         {key: frame[key] for key in frame if key in LENS_KEYS} for frame in frames
     ]
@@ -600,10 +610,14 @@ def _parse_images(path: str) -> dict[str, list[str]]:
 
 
 def _parse_image(where: str, words: Sequence[str]) -> Float64Array:
-    """Return the pose (4, 4), from the camera to the world, of an image of COLMAP.
+    """Return the pose (4, 4) of an image of COLMAP, which maps from camera to world.
 
-    `words` are those of its line, see `_parse_images`. Raises FileFormatError: they are
-    not ten, or have no quaternion of length 1.
+    Args:
+        where: file and image, for messages.
+        words: IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID and NAME of its line.
+
+    Raises FileFormatError: there are not ten words, or the quaternion does not have the
+    length 1.
     """
     if len(words) != 10:
         raise FileFormatError(

@@ -173,7 +173,18 @@ class Parameter:
         estimators: tuple[str, ...] = (),
         moves_silhouettes: bool = False,
     ) -> Parameter:
-        """Make a choice among names, whose values are the indices of its options."""
+        """Make a parameter that is a choice among names.
+
+        Its value is the index of an option.
+
+        Args:
+            name: name without the control's, such as "kind".
+            options: names to choose from.
+            default: what the scene has without a choice, in words.
+            text: description for the user.
+            estimators: valid estimators of a derivative; none by default.
+            moves_silhouettes: whether it can move an outline in the image.
+        """
         return cls(
             name=name,
             shape=(),
@@ -231,7 +242,13 @@ class Parameter:
 def _make_surface_parameter(
     name: str, text: str, search: tuple[float, float]
 ) -> Parameter:
-    """Return a parameter of the principled surface."""
+    """Return a parameter of the principled surface, a number from 0 to 1.
+
+    Args:
+        name: name of Mitsuba's parameter, such as "roughness".
+        text: description for the user.
+        search: range that is searched by default.
+    """
     return Parameter(
         name=name,
         shape=(),
@@ -438,7 +455,11 @@ LAMPS_OFF = LAMPS[0]
 
 
 def _make_lamp_parameter(whose: str) -> Parameter:
-    """Return the parameter for the lamps of a car."""
+    """Return the parameter for the lamps of a car: off, low beam or high beam.
+
+    Args:
+        whose: the car, for the description, such as "the object".
+    """
     text = (
         f"Headlamps of {whose}, with its tail lamps: the low beam, or the high "
         "beam; in the avenue."

@@ -171,8 +171,11 @@ def _parse_thing(part: str) -> RequestedThing:
 def _parse_options(part: str, words: Iterable[str]) -> dict[str, str]:
     """Return the options of a thing, words such as heading=180, by name.
 
-    `part` is the text of the thing, for messages. Raises UnknownNameError: there is no
-    such option, or no such word for its lamps.
+    Args:
+        part: text of the thing, for messages.
+        words: its options, such as "heading=180".
+
+    Raises UnknownNameError: there is no such option, or no such value for its lamps.
     """
     options: dict[str, str] = {}
     for word in words:
@@ -287,9 +290,10 @@ def _make_thing(
 
 
 def _list_overlap_remarks(scene: SceneData) -> list[str]:
-    """Return a remark on each pair that overlaps, of the object and the things.
+    """Return a remark on each pair of the object and the things that overlaps.
 
-    That is by their convex outlines from above, at heights that both have.
+    Two of them overlap if their convex outlines, seen from above, do and they have some
+    height in common.
     """
     footprints = {"the object": compute_footprint(scene.base_vertices)} | {
         name: compute_footprint(compute_base_vertices(part))
@@ -315,8 +319,8 @@ def _compute_pose(
     Args:
         scene: scene with the object, whose size is the unit of lengths.
         asset: the thing's object.
-        requested: where it stands and how it is turned.
-        metres: its longest side.
+        requested: position in metres from the object, and heading in degrees.
+        metres: longest side of the thing in metres.
     """
     # the point of the mesh that is put on the ground, and its longest side
     foot_point, extent = find_footing(asset.mesh.vertices.astype(np.float64))
@@ -329,9 +333,10 @@ def _compute_pose(
 
 
 def find_ground_height(scene: SceneData, position: Float64Array) -> float:
-    """Return how high the ground lies at a position (2,), object sizes.
+    """Return the height of the ground at a position (2,), in object sizes.
 
-    That is the height of the road, the pavement, the table or the floor; or 0.
+    The ground is the highest of the meshes on which things stand: a road, a pavement, a
+    table or a floor. The height is 0 if there is none.
     """
     ground = (part for part in scene.surrounding_meshes.values() if part.is_ground)
     triangles = (

@@ -216,7 +216,13 @@ def _drop_supported_extensions(header: Header) -> Header:
 def _note_left_out(
     header: Header, primitives: Sequence[PosedPrimitive], notes: Notes
 ) -> None:
-    """Note what an object of the file would have, and a place does not."""
+    """Note what the file has and a place ignores: vertex colors, skins and lights.
+
+    Args:
+        header: header of the file.
+        primitives: the primitives that were read.
+        notes: gets the notes.
+    """
     if any(primitive.part.colors is not None for primitive in primitives):
         notes.warn(
             " has colours of vertices, which are left out; paint them into a texture"

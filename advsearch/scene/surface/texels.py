@@ -110,7 +110,7 @@ def make_mesh_texels(
         charts: rasterised texture coordinates of the mesh.
         vertices: (V, 3) in world space.
         normals: (V, 3) in world space.
-        side: side of the faces: 0 if there is one, 1 the front and -1 the back of two.
+        side: side of the faces that the texels are on: 1 the front, -1 the back, 0 both.
     """
     position, normal = _interpolate(charts, vertices, normals)
     # Texels are the covered cells, numbered row by row: the index of each. In cells that
@@ -701,13 +701,14 @@ def make_view_matrices(
 
 
 def look_up_environment(padded: Tensor, directions: Tensor) -> Tensor:
-    """Look up an environment in some directions, at the nearest texel: (n, 3).
+    """Return the radiance (n, 3) of an environment in n directions.
 
-    In the map's axes y is up, and row 0 is straight up.
+    The nearest texel counts, without interpolation. In the map's axes y is up, and the
+    texels of row 0 are straight up.
 
     Args:
         padded: (H, W + 2, 3) map, with a copied column at each end.
-        directions: (n, 3) in the map's own axes, of any length.
+        directions: (n, 3) in the map's axes, of any length.
     """
     n_rows = padded.shape[0]
     n_columns = padded.shape[1] - 2

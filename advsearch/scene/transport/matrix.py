@@ -364,9 +364,17 @@ class TextureTransport:
         return radiance.reshape(*self._image_shape, 3)
 
     def _average_cells(self, values: Tensor) -> Tensor:
-        """Return the mean of texels (h, w, 3) in each cell, (rows, columns, 3)."""
+        """Return the mean of the texels in each cell.
+
+        Args:
+            values: (h, w, 3) values of the texels.
+
+        Returns:
+            (rows, columns, 3) one mean for each cell.
+        """
         n_rows, n_columns = self._cell_shape
-        # the texels that the last cells lack are filled with zeros
+        # The last cells may have fewer texels: they are filled up with zeros, which add
+        # nothing to the sum.
         bottom = CELL_SIZE * n_rows - self._texture_shape[0]
         right = CELL_SIZE * n_columns - self._texture_shape[1]
         padded = values
