@@ -542,12 +542,12 @@ def is_road_vehicle(asset: ObjectAsset) -> bool:
 
 
 def with_size(asset: ObjectAsset, size: float | None, unit: str | None) -> ObjectAsset:
-    """Return an object with the size in metres that its user states, if any.
+    """Return an object with the size in metres that the user states, if any.
 
     Args:
         asset: the object.
-        size: its longest side in metres; or None.
-        unit: unit of its file, one of `METRES_PER_UNIT`; or None.
+        size: its longest side in metres; None if the user does not state it.
+        unit: unit of its file, "mm", "cm", "m" or "in"; None likewise.
 
     Raises:
         InputError: both are given, the size is out of range, or the object comes

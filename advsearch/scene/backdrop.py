@@ -591,6 +591,9 @@ def fit_to_photograph(
 ) -> AnyScene:
     """Return a scene with the camera of the part of a photograph that is used.
 
+    The color of the plane is measured as well, with the camera of the full photograph,
+    since points around the object may be outside of the part.
+
     Args:
         description: the scene, whose camera took the full photograph.
         photograph: photograph that it is rendered into.
@@ -607,6 +610,7 @@ def fit_to_photograph(
     full_aspect = full_width / full_height
     model = description.camera_model
     if model is not None:
+        # bundled models, such as the fisheye, depend on the shape of the image
         model = make_bundled_models(full_aspect).get(model.name, model)
         _check_camera_shape(photograph, model)
     uncropped = replace(description, camera_model=model)

@@ -239,7 +239,7 @@ def _translate_orbslam(
         path: the file, for messages.
         camera_name: "" if none is named.
         data: all entries of the file.
-        cameras: names of its cameras: what stands before the dot.
+        cameras: names of its cameras, the part before the dot, such as "Camera1".
     """
     camera_group = select_camera(
         path, camera_name, dict(zip(cameras, cameras, strict=True))
@@ -415,7 +415,7 @@ def _scale_opensfm_lengths(
         path: the file, for messages.
         camera: the camera's entries, in which lengths are fractions of the larger side.
         width: width of the image in pixels.
-        height: likewise.
+        height: height of the image in pixels.
     """
     focal_x = parse_number(path, "focal_x", camera.get("focal_x", camera.get("focal")))
     focal_y = parse_number(path, "focal_y", camera.get("focal_y", focal_x))

@@ -143,11 +143,12 @@ class Entries:
         return [parse_number(self.path, name, value) for value in values]
 
     def find_unread(self, prefix: str = "") -> list[str]:
-        """Return the entries that were not read and need a note, as the file spells
-        them.
+        """Return the names of entries that were not read and need a note.
+
+        They are spelled as in the file. Entries that change nothing need no note.
 
         Args:
-            prefix: name, with a dot, of the entry that all of these stand in.
+            prefix: for entries inside another one, its name with a dot, such as "roi.".
 
         Raises:
             FileFormatError: one of them changes the image.

@@ -539,11 +539,11 @@ def _read_kalibr(
 
     Args:
         spec: the file, and perhaps the camera in it.
-        entries: those of the camera.
-        unread: further entries of the file that are to be noted.
+        entries: entries of the camera.
+        unread: other entries of the file that were not read: the user gets a note.
 
     Raises:
-        FileFormatError: it is no pinhole, or lacks numbers.
+        FileFormatError: the camera is no pinhole, or numbers are missing.
     """
     path = entries.path
     model = str(entries.get("cameramodel") or "pinhole")

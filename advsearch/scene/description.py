@@ -191,9 +191,10 @@ class SceneDescription(SceneData):
         return with_requested_ground(scene)
 
     def _check_backdrop(self, photograph: BackdropPhotograph) -> None:
-        """Check that nothing that was requested contradicts a photograph as backdrop.
+        """Check that no setting contradicts a photograph as backdrop.
 
-        Raises InputError: a ground other than the plane, a rig, or drops on the lens.
+        Raises InputError: the user requests a ground other than the plane, several
+        cameras (a rig), or drops on the lens.
         """
         other_grounds = sorted(
             name

@@ -139,6 +139,9 @@ def _read_environment_facts() -> dict[str, dict[str, Any]]:
 def load_object(name: str) -> ObjectAsset:
     """Return a bundled object, its largest extent 1, standing on z = 0.
 
+    Args:
+        name: its name, such as "mug".
+
     Raises:
         FileFormatError: the installation is damaged.
         UnknownNameError: there is no such object.
@@ -230,6 +233,11 @@ def make_person(defaults: Mapping[str, float] = MappingProxyType({})) -> Person:
 
 def load_environment(name: str) -> EnvironmentAsset:
     """Return a bundled environment.
+
+    Several environments may share one map, with different grounds.
+
+    Args:
+        name: name of the environment.
 
     Raises:
         FileFormatError: the installation is damaged.

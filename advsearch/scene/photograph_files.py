@@ -263,11 +263,11 @@ def _parse_numbers(
     Args:
         file: path of the camera file, for messages.
         name: name of the entry.
-        stated: entries of the file.
-        counts: how many numbers it may have.
+        stated: entries of the file, by name.
+        counts: how many numbers it may have, such as (12, 16).
 
     Raises:
-        FileFormatError: it has others.
+        FileFormatError: it has another number of numbers, or other values.
     """
     value = stated[name]
     if isinstance(value, Mapping):  # a matrix as OpenCV writes it

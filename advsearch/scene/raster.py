@@ -484,7 +484,11 @@ class MeshSurface:
         The method is that of Moeller and Trumbore 1997, for all faces at once. As in
         the paper t goes from the face's corner a to the origin, and u and v are the
         barycentric weights of b and c where the ray meets the plane of the face. A ray
-        in that plane does not meet the face; nor does what lies behind the origin.
+        in that plane does not meet the face. Faces behind the origin do not count.
+
+        Args:
+            origin: (3,) start of the ray.
+            direction: (3,) its direction.
         """
         a = self._corners[:, 0]
         b = self._corners[:, 1]
@@ -502,7 +506,7 @@ class MeshSurface:
         q = np.cross(t, b - a)
         v = (q @ direction) * inverse
         distance = ((c - a) * q).sum(axis=1) * inverse
-        # so that no ray slips through between two faces
+        # With some slack, no ray goes between two neighbouring faces by rounding.
         slack = 1e-9
         is_hit = (inverse != 0.0) & (u >= -slack) & (v >= -slack)
         is_hit &= (u + v <= 1.0 + slack) & (distance > 0.0)

@@ -557,9 +557,16 @@ class Renderer:
     def _render_image(
         self, u: Tensor, seed: int, spp: int, *, display: bool = True
     ) -> Tensor:
-        """Render the image of u, or its radiance before display.
+        """Render the image of a configuration, or its radiance before display.
 
-        For a rig the images of its cameras stand side by side, (H, K W, 3).
+        Args:
+            u: (d,) configuration.
+            seed: seed of the noise.
+            spp: samples per pixel.
+            display: if False, return the radiance that is to be displayed.
+
+        Returns:
+            (H, W, 3); for a rig of K cameras their images side by side, (H, K W, 3).
         """
         renders_before = self.renders
         images = list[Tensor]()
@@ -580,7 +587,8 @@ class Renderer:
             images.append(self.finish_image(rendered, inputs, u, display=display))
         if len(images) == 1:
             return images[0]
-        self.renders = renders_before + 1  # one configuration, as budgets count it
+        # Budgets count configurations: all cameras of a rig are one render.
+        self.renders = renders_before + 1
         return torch.cat(images, dim=1)
 
     def _camera_inputs(
@@ -736,9 +744,9 @@ class Renderer:
         *,
         denoised: bool = True,
     ) -> Tensor:
-        """Return linear radiance of scene inputs, with a graph.
+        """Return the linear radiance of scene inputs, differentiable in them.
 
-        What is traced counts in `renders`.
+        If paths are traced, it counts in `renders`; a prediction does not.
 
         Args:
             inputs: inputs of the scene.
@@ -748,9 +756,10 @@ class Renderer:
             denoised: denoise it if the formation requires it.
 
         Returns:
-            (H, W, 3), or (H, W, 4) with coverage if the environment is hidden, or (H,
-            W, 7) with the change of the plane that takes the shadow in a photograph, or
-            (H, W, 13) with that of what its coat reflects, and the environment in it.
+            (H, W, C). C is 3, or 4 with coverage if the environment is hidden. It is 7
+            with the change of the radiance of a plane that takes the shadow in a
+            photograph. It is 13 if that plane has a coat, with the change of what the
+            coat reflects, and the environment in it.
         """
         if self._predict is not None:
             return self._predict(inputs)

@@ -536,9 +536,9 @@ def _read_applied_scale(path: str, data: Mapping[str, Any]) -> float:
     """Return the factor by which the positions of a transforms.json are scaled already.
 
     It is nerfstudio's `applied_scale`, times the scale within its `applied_transform`.
-    The rotation and the shift of that move all cameras alike, and do not count.
-    Instant NGP's `scale` and `offset` are applied by the program that reads
-    the file, so the positions in it are without them.
+    The rotation and the shift of that transform move all cameras alike, and so do not
+    count. Instant NGP's `scale` and `offset` do not count either: the program that reads
+    the file applies them, so that the positions in the file are without them.
 
     Raises:
         FileFormatError: the transform is none of rotation, shift and scale, or the

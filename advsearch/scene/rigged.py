@@ -342,8 +342,10 @@ class SkeletonRig:
         """Return the vertices (V, 3) of the meshes with morph targets applied.
 
         Args:
-            number_by_name: values of parameters, which override those of a clip.
-            clip_weights: weights of a clip, by node.
+            number_by_name: values of parameters such as "Smile.weight", which replace
+                those of a clip.
+            clip_weights: for each node whose weights the clip sets, the weights (T,) of
+                its targets.
             device: device of the result.
         """
         points = self._points.to(device)
@@ -355,7 +357,8 @@ class SkeletonRig:
                     weight = clip_weights[target.node][target.index_in_node]
                 else:
                     weight = torch.tensor(target.rest_weight, dtype=torch.float64)
-            # A weight of 0 is left out, unless its derivative is wanted.
+            # A weight of 0 changes nothing, and is left out to save time, unless its
+            # derivative is required.
             if weight.requires_grad or float(weight) != 0.0:
                 offsets = weight.to(device) * target.offsets.to(device)
                 points = points.index_add(0, target.rows.to(device), offsets)

@@ -92,9 +92,12 @@ def unwrap(soup: TriangleSoup, chart_group: IntArray | None = None) -> TriangleS
 def _make_grid_uvs(count: int) -> Float64Array:
     """Return texture coordinates (count, 3, 2): two faces in each cell of a grid.
 
-    Faces 0 and 1 are the lower left and the upper right half of the first cell, and so
-    on, row by row from the bottom. The grid is the smallest with as many rows as
-    columns that has a place for all.
+    Faces 0 and 1 are the lower left and the upper right half of the first cell, faces 2
+    and 3 those of the second, and so on, row by row from the bottom. The grid is the
+    smallest square grid that has room for all faces.
+
+    Args:
+        count: number of faces.
     """
     n_columns = int(np.ceil(np.sqrt(np.ceil(count / 2))))
     face = np.arange(count)
@@ -216,8 +219,9 @@ def _smooth_normals(
     A round replaces each normal by the unit mean of itself and its neighbours'.
 
     Args:
-        normals: (F, 3).
-        face, neighbour: (E,) indices of the two faces of each shared edge.
+        normals: (F, 3) unit normals of the faces.
+        face: (E,) index of one face of each shared edge.
+        neighbour: (E,) index of the other face.
     """
     count = len(normals)
     itself = np.arange(count)
@@ -244,9 +248,9 @@ def _halve_patches(centers: Float64Array, patch: IntArray, max_faces: int) -> In
     A patch is cut across its longest axis, at the median of its faces' centers.
 
     Args:
-        centers: (F, 3) of the faces.
-        patch: (F,) the patch of each face.
-        max_faces: how many a piece may have.
+        centers: (F, 3) centers of the faces.
+        patch: (F,) number of the patch that each face is in.
+        max_faces: largest number of faces of a piece.
 
     Returns:
         (F,) the piece of each face, numbered from 0.
@@ -341,11 +345,11 @@ class SurfaceParts:
         return kinds
 
     def find_cells(self, face: IntArray, uv: Float64Array) -> IntArray:
-        """Return the index of the map's cell (n,) in which each point on a face lies.
+        """Return the index (n,) of the cell of the map that each point is in.
 
-        Where the map has texture coordinates of its own, `is_unwrapped`, a point is
-        taken to it by its barycentric weights in the face. What is outside of the map
-        counts as on its border.
+        If the map has its own texture coordinates (`is_unwrapped`), the point's
+        coordinates in it follow from its barycentric weights in the face. Points outside
+        of the map count as on its border.
 
         Args:
             face: (n,) index of the face.
@@ -354,7 +358,7 @@ class SurfaceParts:
         if self.is_unwrapped:
             # its arguments are in the order of rows and columns: v, then u
             weights = compute_barycentric(self._mesh_uvs[face], uv[:, 1], uv[:, 0])
-            # of a face without area, whose weights are not finite, the middle is taken
+            # The weights in a face without area are not finite: its middle is taken.
             weights = np.nan_to_num(weights, nan=1 / 3, posinf=1 / 3, neginf=1 / 3)
             weights = np.clip(weights, 0.0, 1.0)
             weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
@@ -378,7 +382,7 @@ def _unwrap_mesh(mesh: Mesh) -> Float64Array:
     unique_points, unique_index = np.unique(points, axis=0, return_inverse=True)
     faces = unique_index.reshape(-1)[mesh.faces.astype(np.int64)]
     n_faces = len(faces)
-    # only points and faces count: the rest says that nothing is known
+    # `unwrap` uses points and faces alone: the other fields are fillers.
     soup = TriangleSoup(
         points=unique_points,
         faces=faces,

@@ -213,9 +213,9 @@ def add_things(
 
     Args:
         scene: scene with the object.
-        things_spec: the setting; None for no things.
-        load: loads an object; its arguments are a name or a file, and the axis of
-            the file that is the object's front, None for what its format says.
+        things_spec: the setting, such as "car@12,3.5,heading=180"; None for no things.
+        load: loads an object. Its arguments are a name or a file, and the axis of the
+            file that is the object's front; None for the usual one of its format.
 
     Raises:
         InputError: the text is invalid, a name is taken, or sizes in metres are not

@@ -167,7 +167,7 @@ def read_place_meshes(
 ) -> tuple[list[MeshPart], list[str]]:
     """Read the meshes of a place, and notes on what is left out.
 
-    They are in metres, z up, with what they emit in cd/m2.
+    Meshes are in metres, z up, and their emission is in cd/m2. Each has one material.
 
     Args:
         path: the glTF file.

@@ -435,8 +435,8 @@ def find_bilinear_weights(
 ) -> tuple[npt.NDArray[np.int32], Float32Array]:
     """Return the four texels of each bilinear look-up, and their fractions.
 
-    The centers of texels are half a texel from the border, across which the texture
-    repeats.
+    The center of the first texel is half a texel from the border, and the texture
+    repeats across the border.
 
     Args:
         uv: (n, 2) texture coordinates.
