@@ -164,13 +164,13 @@ def with_front(photograph: BackdropPhotograph, spec: str | Path) -> BackdropPhot
 
     Args:
         photograph: the photograph.
-        spec: a picture file of the full photograph's size, white where something is
-            before the object, black elsewhere; or one of depth, as `read_depth` takes
-            it.
+        spec: a mask: a picture file of the full photograph's size, white where something
+            is in front of the object, black elsewhere. Or a picture of the photograph's
+            depth: an .exr or .npy file, or "depth.png#0.001".
 
     Raises:
         FileFormatError: the file cannot be used.
-        InputError: it has another size.
+        InputError: it has another size than the photograph.
     """
     if is_depth(spec):
         depth = read_depth(spec)

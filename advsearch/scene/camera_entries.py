@@ -271,8 +271,8 @@ def add_notes(
 
     Args:
         model: the model.
-        unread_keys: entries of the camera.
-        rectified_keys: entries about rectified images.
+        unread_keys: names of entries that were not read.
+        rectified_keys: names of entries about rectified images, which were not read.
     """
     unread = [f"{join_names(unread_keys)}."] if unread_keys else []
     if rectified_keys:

@@ -510,9 +510,12 @@ class CameraModel:
         return (*self.reading_notes, sentence)
 
     def describe_scaling(self, resolution: tuple[int, int]) -> tuple[str, ...]:
-        """Return a note if an image has another size (height, width) than the model.
+        """Return a note if an image has another size than the camera's pictures.
 
-        It says so too if the sizes differ in shape, by more than half a percent.
+        If their shapes differ by more than half a percent, the note has the stretch too.
+
+        Args:
+            resolution: height and width of the image in pixels.
         """
         if self.size is None or self.size == resolution:
             return ()
@@ -573,8 +576,8 @@ def _solve_two_by_two(rows: Sequence[Tensor], right: Tensor) -> tuple[Tensor, Te
     """Solve N linear systems of two equations by Cramer's rule.
 
     Args:
-        rows: the two rows (N, 2) of the matrices.
-        right: (N, 2), their right-hand sides.
+        rows: the first and the second row of the matrices, each (N, 2).
+        right: (N, 2) right-hand sides.
 
     Returns:
         The solutions (N, 2), large where a matrix is nearly singular; and the

@@ -175,7 +175,9 @@ def compute_framing_distance(
 
 
 def compute_camera_axes(azimuth: float, elevation: float, roll: float) -> Float64Array:
-    """Return the axes of a camera on an orbit: rows left, up and from the object to it.
+    """Return the axes (3, 3) of a camera on an orbit.
+
+    The rows are its directions left and up, and that from the object to the camera.
 
     Args:
         azimuth: azimuth of the camera around the object, degrees.

@@ -440,12 +440,12 @@ def _attach_disks(mesh: Mesh, disks: Sequence[Float64Array], facing: float) -> _
 
     Args:
         mesh: mesh of the car.
-        disks: vertices (1 + `N_SPOKES`, 3) of each: its center, and those on the rim.
+        disks: vertices (1 + `N_SPOKES`, 3) of each disk: its center, then its rim.
         facing: 1 for disks whose front is towards +x, -1 towards -x.
     """
     vertices = np.concatenate(disks)
     disk_faces = _make_disk_faces()
-    # those of the second disk count on behind the vertices of the first
+    # The vertices of the second disk follow those of the first.
     faces = np.concatenate([disk_faces, (1 + N_SPOKES) + disk_faces])
     normals = np.tile([[facing, 0.0, 0.0]], (len(vertices), 1))
     vertex_of_carrier = cKDTree(mesh.vertices).query(vertices)[1]

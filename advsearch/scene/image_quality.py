@@ -43,6 +43,9 @@ CALIBRATION_ANGLES = (10.0, 35.0, 65.0, 80.0)  # of these edges, degrees
 def measure_noise(levels: npt.NDArray[np.uint8]) -> Float64Array:
     """Return the standard deviation (3,) of the noise of an image, in levels.
 
+    A high-pass filter removes what is smooth. Blocks of pixels are compared, and those
+    with the smallest residuals count, since the others have texture.
+
     Args:
         levels: (H, W, 3) 8-bit sRGB.
     """
@@ -59,7 +62,7 @@ def measure_noise(levels: npt.NDArray[np.uint8]) -> Float64Array:
         if len(usable):
             medians = np.median(usable, axis=1)
             sigma = MEDIAN_TO_SIGMA * float(np.quantile(medians, QUIET_FRACTION))
-        # without what rounding to levels adds
+        # The rounding to whole levels adds a variance of its own, which is subtracted.
         sigmas.append(np.sqrt(max(0.0, sigma**2 - ROUNDING_VARIANCE)))
     return np.array(sigmas)
 
@@ -139,10 +142,11 @@ def _measure_edges(image: Float64Array) -> float | None:
 
 @lru_cache(maxsize=1)
 def _calibrate() -> tuple[Float64Array, Float64Array]:
-    """Return blurs (N,), and what is measured on edges that are blurred so, pixels.
+    """Return blurs (N,), and what `_measure_edges` gives for edges with these blurs.
 
-    The edges are straight, at several angles, and averaged over pixels as a renderer
-    does: what is measured on an edge without further blur is not 0.
+    Both are in pixels. The edges are straight, at several angles, and averaged over
+    pixels as a renderer does. That blurs an edge already, so that the measurement of an
+    edge without further blur is not 0: a measurement is corrected by this table.
     """
     oversampling = 8
     size = CALIBRATION_SIZE

@@ -610,16 +610,16 @@ def compute_contact(phase: Tensor) -> Tensor:
 def skin_points(
     points: Tensor, weights: Tensor, rotations: Tensor, translations: Tensor
 ) -> Tensor:
-    """Return points (P, 3) moved with bones: linear blend skinning.
+    """Return points (P, 3) moved with bones, by linear blend skinning.
 
-    A point moves by the weighted mean of the maps of all bones, `rotation @ p +
-    translation`.
+    A bone moves a point p to `rotation @ p + translation`. The result is the weighted
+    mean over all bones.
 
     Args:
-        points: (P, 3).
-        weights: (P, J) of the bones, which sum to 1 for each point.
-        rotations: (J, 3, 3) of the bones.
-        translations: (J, 3).
+        points: (P, 3) points at rest.
+        weights: (P, J) weight of each bone; they sum to 1 for each point.
+        rotations: (J, 3, 3) rotations of the bones.
+        translations: (J, 3) translations of the bones.
     """
     # (P, 12): the weighted mean of the bones' rotations and translations
     blended = torch.einsum(

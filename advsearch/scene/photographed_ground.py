@@ -108,18 +108,18 @@ class Photograph:
     def compute_reflectance(self, radiance: Tensor) -> Tensor:
         """Return the plane's texture (h, W, 3) for a map (H, W, 3) of any size.
 
-        Row 0 is the horizon, the last one is straight down, and columns are those of
-        the map. The height h is that of the lower half of the map that the plane was
-        made of: a map of another size is interpolated to these rows. A reflectance is
-        pi times radiance over irradiance, and 0 where no light comes from above.
-        Differentiable.
+        Row 0 is the horizon, the last row is straight down, and columns are those of the
+        map. The plane was made for a map of some height, and h is half of that: the rows
+        of another map are interpolated. The reflectance is pi * radiance / irradiance,
+        with which the plane looks like the map; it is 0 if no light comes from above.
+        The result is differentiable.
         """
         rows = radiance.shape[0]
         # where the rows of the plane's own map lie in this one
         map_row = torch.arange(
             self._horizon_row, self._map_rows, device=radiance.device
         ) * ((rows - 1) / (self._map_rows - 1))
-        # at most the last but one, so that there is a next row
+        # The row above is at most the last but one, so that there is a next row.
         upper = map_row.floor().long().clamp_max(rows - 2)
         fraction = (map_row - upper)[:, None, None].to(radiance.dtype)
         lower_half = radiance[upper] + fraction * (

@@ -364,12 +364,12 @@ def rasterize_charts(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
 def _compute_clipped_weights(corners: Float64Array, points: IntArray) -> Float64Array:
     """Return the barycentric weights (N, 3) of points, clipped to their triangles.
 
-    Negative weights, of points outside, become 0, and the others are scaled so that
-    they add up to 1. A triangle without area gets weights of 1 / 3.
+    A point outside of its triangle has negative weights. They become 0, and the others
+    are scaled so that they add up to 1. In a triangle without area all are 1 / 3.
 
     Args:
-        corners: (N, 3, 2) of the triangles.
-        points: (N, 2).
+        corners: (N, 3, 2) columns and rows of the corners of each point's triangle.
+        points: (N, 2) columns and rows of the points.
     """
     doubled = compute_doubled_areas(corners)
     # Without an area all three are 0 here, and 1 / 3 at the end.
@@ -461,12 +461,12 @@ class MeshSurface:
         """Find the first face that a ray meets, from either side.
 
         Args:
-            origin: (3,) outside of the mesh.
+            origin: (3,) start of the ray, outside of the mesh.
             direction: (3,) unit vector.
 
         Returns:
-            The face, and the point (3,) where the ray meets it. If it meets none: the
-            face with the corner nearest to the ray's line, and that corner.
+            The face, and the point (3,) where the ray meets it. If the ray meets no
+            face, they are that corner which is nearest to the ray's line, and its face.
         """
         distance = self._intersect(origin, direction)
         if np.isfinite(distance).any():

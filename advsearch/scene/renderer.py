@@ -594,13 +594,13 @@ class Renderer:
     def _camera_inputs(
         self, mount: Mount | None, u: Tensor, space: InputMapping | None = None
     ) -> dict[str, Tensor]:
-        """Return the scene inputs of u for a camera of a rig, or for the only one.
+        """Return the scene inputs of a configuration for one camera.
 
         Args:
-            mount: the camera of the rig; None for the only one.
+            mount: a camera of a rig; None if the scene has one camera.
             u: (d,) configuration.
-            space: maps u to scene inputs; None: the renderer's, at the time when the
-                camera takes its image.
+            space: maps u to scene inputs. None: the renderer's space; a camera that
+                takes its image later than the first has things that move at that time.
         """
         if space is None:
             space = self.space
@@ -789,9 +789,15 @@ class Renderer:
     ) -> Tensor:
         """Return the gradient of `sum(cotangent * image)` by differences.
 
-        It is zero for coordinates that do not use them. All renders share one seed
-        (common random numbers), and the image is taken after the tone curve and after
-        what controls do to it.
+        It is zero for coordinates with another estimator. All renders share one seed, so
+        that their noise cancels in the differences (common random numbers). The image
+        is the finished one, after the tone curve and the controls that change it.
+
+        Args:
+            u: (d,) configuration.
+            cotangent: (H, W, 3) derivative of a loss by the image.
+            seed: seed of the noise.
+            spp: samples per pixel, unless the plan has its own number.
         """
         noise_seed = seeds.stream(self.root_seed, "differences", seed)
         spp = self.plan.spp or spp

@@ -274,9 +274,9 @@ class SkeletonRig:
         The result is in the unit of the mesh, and differentiable.
 
         Args:
-            values: scalar tensors by the names of `parameters`; those that are missing
-                are as in the clip, or at rest.
-            clip: name of an animation.
+            values: scalar tensors by the names of `parameters`, such as "Head.z". Those
+                that are missing have the values of the clip, or those at rest.
+            clip: name of an animation of the file; None for the pose at rest.
 
         Raises:
             InputError: the file's numbers are so large that vertices are not finite.

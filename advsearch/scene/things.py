@@ -353,10 +353,14 @@ def find_ground_height(scene: SceneData, position: Float64Array) -> float:
 
 
 def find_triangle_heights(corners: Float64Array, position: Float64Array) -> list[float]:
-    """Return the heights of triangles (F, 3 corners, 3) above or below a point (2,).
+    """Return the heights at which a vertical line meets triangles.
 
-    A triangle counts if the point is inside it or on its border, seen from above; one
-    that stands upright does not. Its height is that of its plane at the point.
+    A triangle counts if the line's point is inside it or on its border, seen from above.
+    A vertical triangle does not count.
+
+    Args:
+        corners: (F, 3, 3) corners of the triangles.
+        position: (2,) x and y of the line.
     """
     a, b, c = np.moveaxis(corners, 1, 0)
     # The point makes a triangle with each side; the areas, signed and seen from above.
@@ -389,9 +393,10 @@ def find_overlapping_solid(scene: SceneData, footprint: Footprint) -> str | None
 
 
 def add_solid_remarks(scene: AnyScene) -> AnyScene:
-    """Return the scene with a remark on its object and each thing inside a solid.
+    """Return the scene with a remark if its object or a thing is inside a solid.
 
-    Solids are those of the place around it; without any the scene is returned as it is.
+    Solids are parts of the place, such as houses, in which nothing can stand. If the
+    place has none, the scene is returned as it is.
     """
     if not any(part.solids for part in scene.surrounding_meshes.values()):
         return scene

@@ -327,9 +327,17 @@ def _fit_uvs(
 def _read_pieces(
     file: GltfFile, meshes: Sequence[int], variant: int | None
 ) -> dict[tuple[int, int], PrimitiveData]:
-    """Read the primitives of meshes, by the mesh and the index in it.
+    """Read the primitives of meshes with the materials of a variant.
 
-    Each has the material of the variant. Those without faces are left out.
+    Primitives without faces, such as lines, are left out.
+
+    Args:
+        file: the glTF file.
+        meshes: indices of the meshes.
+        variant: index of a variant of the materials; None for none.
+
+    Returns:
+        The primitives, by the index of the mesh and that of the primitive in it.
     """
     header = file.header
     pieces: dict[tuple[int, int], PrimitiveData] = {}

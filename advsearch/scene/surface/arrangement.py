@@ -663,8 +663,11 @@ def _make_upsampling_matrix(
 ) -> scipy.sparse.csr_matrix:
     """Return the matrix from the texels of a small texture to those of the fine grid.
 
-    Both shapes are (rows, columns). The interpolation is bilinear: each row of the
-    matrix has four entries.
+    The interpolation is bilinear, so that each row of the matrix has four entries.
+
+    Args:
+        texture: rows and columns of the texture.
+        fine: rows and columns of the fine grid.
     """
     n_rows, n_columns = fine
     y, x = np.meshgrid(
