@@ -218,9 +218,9 @@ class Assembly:
             if isinstance(part, (BeamLamp, LampGlass))
         ]
         self._photograph = description.photograph
-        # A scene may be rendered into one of several photographs: the scene of each, and
-        # by its index what it adds to the image. The light of the plane is always that
-        # of the scene itself.
+        # A scene may be rendered into one of several photographs: the scene of each,
+        # and by its index what it adds to the image. The light of the plane is always
+        # that of the scene itself.
         self._views = [description]
         if description.photographs is not None:
             self._views = list(description.photographs.scenes.values())
@@ -287,8 +287,8 @@ class Assembly:
         They are computed on first use, and stored.
 
         Args:
-            photograph: index of the photograph in the scene's folder; 0 if the scene has
-                no folder of photographs.
+            photograph: index of the photograph in the scene's folder; 0 if the scene
+                has no folder of photographs.
         """
         if self._resolution is None:
             return {}
@@ -318,9 +318,9 @@ def _move_carried(
 ) -> dict[str, Tensor]:
     """Return the inputs that move a lamp with the car that carries it.
 
-    The glass of a lamp has the carrier's pose, and is deformed with the vertices that it
-    lies on. A beam keeps its place on the carrier. The result is empty if nothing moves
-    the carrier.
+    The glass of a lamp has the carrier's pose, and is deformed with the vertices that
+    it lies on. A beam keeps its place on the carrier. The result is empty if nothing
+    moves the carrier.
 
     Args:
         part: the beam or the glass.

@@ -385,12 +385,12 @@ def _merge_clusters(mesh: Mesh, cluster_of: IntArray) -> tuple[IntArray, IntArra
 def make_simplifier(mesh: Mesh, max_faces: int) -> Callable[[Mesh], Mesh] | None:
     """Return a function that simplifies a mesh in any of its poses.
 
-    The method is that of Rossignac and Borrel (1993, "Multi-resolution 3D approximations
-    for rendering complex scenes"). The cells of a grid divide the vertices into
-    clusters, each of which moves to the mean of its vertices. A face is left out if two
-    of its corners are in one cluster. At a seam of the texture the vertices of both
-    sides stay distinct, but are in one cluster, so that no gap opens. The grid is the
-    finest that leaves at most `max_faces` faces.
+    The method is that of Rossignac and Borrel (1993, "Multi-resolution 3D
+    approximations for rendering complex scenes"). The cells of a grid divide the
+    vertices into clusters, each of which moves to the mean of its vertices. A face is
+    left out if two of its corners are in one cluster. At a seam of the texture the
+    vertices of both sides stay distinct, but are in one cluster, so that no gap opens.
+    The grid is the finest that leaves at most `max_faces` faces.
 
     Args:
         mesh: the full mesh.

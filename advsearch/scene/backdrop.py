@@ -16,8 +16,9 @@ Its change, light of the object minus that of the environment behind it, is adde
 as much of the photograph as the coat reflects of the environment takes no shadow.
 
 The photograph is read as a viewer shows it, decoded from sRGB, and averaged over the
-area of each pixel of the film. A part of it may be cut out, `photo.jpg#X,Y,WIDTH,HEIGHT`
-in pixels from its top left corner; the intrinsics of the camera follow.
+area of each pixel of the film. A part of it may be cut out,
+`photo.jpg#X,Y,WIDTH,HEIGHT` in pixels from its top left corner; the intrinsics of the
+camera follow.
 """
 
 from __future__ import annotations
@@ -164,9 +165,9 @@ def with_front(photograph: BackdropPhotograph, spec: str | Path) -> BackdropPhot
 
     Args:
         photograph: the photograph.
-        spec: a mask: a picture file of the full photograph's size, white where something
-            is in front of the object, black elsewhere. Or a picture of the photograph's
-            depth: an .exr or .npy file, or "depth.png#0.001".
+        spec: a mask: a picture file of the full photograph's size, white where
+            something is in front of the object, black elsewhere. Or a picture of the
+            photograph's depth: an .exr or .npy file, or "depth.png#0.001".
 
     Raises:
         FileFormatError: the file cannot be used.
@@ -287,8 +288,9 @@ def compose(rendered: Tensor, behind: Tensor, inputs: Mapping[str, Tensor]) -> T
         uncovered = shade
         shade = (shade + change).clamp_min(0.0)
         if reflection.shape[-1]:
-            # A shadow takes light from the plane's color, but not from the reflection of
-            # the environment in its coat: that part of the photograph is added again.
+            # A shadow takes light from the plane's color, but not from the reflection
+            # of the environment in its coat: that part of the photograph is added
+            # again.
             coat = rendered[..., 10:] / (1.0 - rendered[..., 3:4]).clamp_min(1e-3)
             unshaded = (uncovered - shade) * torch.minimum(coat, behind)
             return radiance + (shade * behind + unshaded + reflection).clamp_min(0.0)
@@ -631,9 +633,9 @@ def fit_to_photograph(
 def crop_camera(model: CameraModel, photograph: BackdropPhotograph) -> CameraModel:
     """Return the camera that sees the used part of a photograph.
 
-    Focal lengths, skew and center are fractions of the image's width or height. Those of
-    a part are larger fractions, since the part is smaller. The center also moves by the
-    part's top left corner.
+    Focal lengths, skew and center are fractions of the image's width or height. Those
+    of a part are larger fractions, since the part is smaller. The center also moves by
+    the part's top left corner.
 
     Args:
         model: camera of the full photograph.
@@ -913,8 +915,8 @@ def _decompose_rotation(rotation: Float64Array) -> dict[str, float]:
     pitch = math.asin(min(max(-float(rotation[2, 0]), -1.0), 1.0))
     yaw = math.atan2(rotation[1, 0], rotation[0, 0])
     roll = math.atan2(rotation[2, 1], rotation[2, 2])
-    # At a pitch of 90 degrees yaw and roll are about the same axis, and only their sum or
-    # difference is known: the roll is set to 0.
+    # At a pitch of 90 degrees yaw and roll are about the same axis, and only their sum
+    # or difference is known: the roll is set to 0.
     if abs(rotation[2, 0]) > 1.0 - 1e-9:
         yaw = math.atan2(-rotation[0, 1], rotation[1, 1])
         roll = 0.0

@@ -310,8 +310,8 @@ def _parse_file(path: str, text: str) -> dict[str, Any]:
 def _parse_xml(path: str, text: str) -> dict[str, Any]:
     """Parse a camera of OpenCV or Metashape in XML.
 
-    An element with `data` is a matrix, and becomes the list of its words. Another element
-    with elements in it becomes a dictionary, and any other its text.
+    An element with `data` is a matrix, and becomes the list of its words. Another
+    element with elements in it becomes a dictionary, and any other its text.
 
     Raises FileFormatError: it is no XML of these two, or declares entities, by which a
     small file could become very large.
@@ -571,8 +571,8 @@ def _read_kalibr(
 def _read_opencv(spec: str, entries: Entries) -> CameraModel:
     """Return the model of a camera of OpenCV or ROS.
 
-    The calibration is of the sensor's pixels. ROS may bin several of them into one pixel
-    of the image; the model has the size of that image.
+    The calibration is of the sensor's pixels. ROS may bin several of them into one
+    pixel of the image; the model has the size of that image.
 
     Args:
         spec: the file, and perhaps the camera in it.

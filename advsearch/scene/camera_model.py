@@ -147,9 +147,9 @@ class CameraModel:
     def compute_rays(self, image_points: Tensor) -> tuple[Tensor, Tensor]:
         """Return the rays of image coordinates (N, 2).
 
-        The distortion is inverted by iteration. If that does not converge to a direction
-        within the angle at which the lens folds, the coordinates are outside of the
-        view.
+        The distortion is inverted by iteration. If that does not converge to a
+        direction within the angle at which the lens folds, the coordinates are outside
+        of the view.
 
         Returns:
             Directions (N, 3) float64, unit vectors for a fisheye and a panorama, else
@@ -473,8 +473,8 @@ class CameraModel:
             float(center[0, axis]), border, BORDER_POINTS, dtype=torch.float64
         )
         directions, margin = self.compute_rays(line_points)
-        # A z of 0.1 is at about 84 degrees from the axis: rays farther out do not count,
-        # since their tangents would be huge.
+        # A z of 0.1 is at about 84 degrees from the axis: rays farther out do not
+        # count, since their tangents would be huge.
         is_visible = (margin > 0.0) & (directions[:, 2] > 0.1)
         tangents = directions[:, axis].abs() / directions[:, 2].clamp_min(0.1)
         return float(
@@ -512,7 +512,8 @@ class CameraModel:
     def describe_scaling(self, resolution: tuple[int, int]) -> tuple[str, ...]:
         """Return a note if an image has another size than the camera's pictures.
 
-        If their shapes differ by more than half a percent, the note has the stretch too.
+        If their shapes differ by more than half a percent, the note has the stretch
+        too.
 
         Args:
             resolution: height and width of the image in pixels.

@@ -599,9 +599,9 @@ class SceneDescription(SceneData):
     def gain(self) -> float:
         """Factor from scene radiance to display-linear values.
 
-        It is the exposure times 2 to the power of `camera.exposure`. The exposure is the
-        first of these that applies: that of the exposure value `camera.ev`; that of the
-        photograph that the scene is rendered into; the metered one; 1.
+        It is the exposure times 2 to the power of `camera.exposure`. The exposure is
+        the first of these that applies: that of the exposure value `camera.ev`; that of
+        the photograph that the scene is rendered into; the metered one; 1.
         """
         exposure_value = self.values.get("camera.ev")
         exposure = 1.0

@@ -452,8 +452,8 @@ def compute_visible_normals(scene: SceneData) -> Float64Array:
     frame = Frame.of(scene.get_number("camera.fov"), scene.aspect)
     pixel_width, shape = _choose_metering_shape(frame)
     tangents = points[faces][..., :2] / points[faces][..., 2:]
-    # minus half a pixel, since the raster's coordinates are 0 at the center of its first
-    # pixel
+    # minus half a pixel, since the raster's coordinates are 0 at the center of its
+    # first pixel
     face, row, column, weights = rasterize_triangles(
         (tangents - (frame.left, frame.low)) / pixel_width - 0.5, shape
     )

@@ -232,10 +232,10 @@ def _compute_framing_distance_all_around(
     sine = math.sin(math.radians(elevation))
     inverse_width = 1.0 / tangents[0]
     inverse_height = 1.0 / tangents[1]
-    # A vertex at azimuth a of the circle is `outwards` towards the camera, and at `left`
-    # and `up` in its image. It is inside an edge if the distance is at least outwards +
-    # side / tangent, where side is left or up. The largest value of the terms with
-    # cos(a) and sin(a) is the norm of their two factors.
+    # A vertex at azimuth a of the circle is `outwards` towards the camera, and at
+    # `left` and `up` in its image. It is inside an edge if the distance is at least
+    # outwards + side / tangent, where side is left or up. The largest value of the
+    # terms with cos(a) and sin(a) is the norm of their two factors.
     # outwards = rho cosine cos(a) + z sine, left = rho sin(a)
     for_sides = rho * torch.sqrt(inverse_width**2 + cosine**2) + z * sine
     # up = z cosine - rho sine cos(a), and its negative for the bottom edge

@@ -45,9 +45,9 @@ MAX_CAR_CAMERA_HEIGHT = 2.5
 def is_against_traffic(scene: SceneData, camera: Float64Array) -> bool:
     """Return whether a camera would drive against the traffic, towards the object.
 
-    That is so if the object is a vehicle in a lane, and the camera is in front of it, at
-    most half a lane to the side, and no higher than the camera of a car. Lanes run along
-    x, and the object faces +x.
+    That is so if the object is a vehicle in a lane, and the camera is in front of it,
+    at most half a lane to the side, and no higher than the camera of a car. Lanes run
+    along x, and the object faces +x.
 
     Args:
         scene: the scene.
@@ -107,8 +107,8 @@ def find_ground_kind(scene: SceneData) -> str | None:
     """Return the kind of ground that settings or the environment require.
 
     It is None if the ground has the size 0. Otherwise the setting `ground.kind` counts,
-    and without it the environment's own kind. The latter is ignored if settings describe
-    a table. It is None if neither names a kind.
+    and without it the environment's own kind. The latter is ignored if settings
+    describe a table. It is None if neither names a kind.
     """
     requested = scene.values.get("ground.kind")
     if scene.get_number("ground.size") <= 0.0:
@@ -335,8 +335,8 @@ def find_surroundings(scene: SceneData) -> Surroundings | None:
         environment.place if bundled is None else load_bundled_place(*bundled)
     )
     picture = None if captured_site is None else captured_site.file.picture
-    # The near part of the place is geometry, and the far part a picture, whose limits the
-    # place's file states.
+    # The near part of the place is geometry, and the far part a picture, whose limits
+    # the place's file states.
     if place is not None and picture is not None:
         return Surroundings(
             height=picture.height,
@@ -451,8 +451,8 @@ def list_view_remarks(
     if outside or surroundings is None:
         return outside
     is_against_road = find_valid_range(surroundings, views[0]) == NO_RANGE
-    # Houses along a road are at different distances in x and y, which are a tuple. Other
-    # surroundings are equally far in all directions.
+    # Houses along a road are at different distances in x and y, which are a tuple.
+    # Other surroundings are equally far in all directions.
     has_houses = isinstance(surroundings.nearest_distance, tuple)
     if is_against_road or (rotates_map and has_houses):
         return (

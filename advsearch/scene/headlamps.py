@@ -98,8 +98,8 @@ def compute_candela(kind: str, h: Float64Array, v: Float64Array) -> Float64Array
         v: degrees above the horizon, of the same shape.
     """
     below_cut_off = CUT_OFF - v
-    # 14500 and 4000 are candela; 5 and 16 standard deviations, and 1.5 and 5 the fall by
-    # e, in degrees.
+    # 14500 and 4000 are candela. The standard deviations to the side (5 and 16) and the
+    # angles in which a beam falls by the factor e (1.5 and 5) are in degrees.
     narrow_beam = 14500.0 * np.exp(
         -((h / 5.0) ** 2) / 2.0 - below_cut_off.clip(0.0) / 1.5
     )
@@ -176,8 +176,8 @@ def add_lamps(scene: AnyScene) -> AnyScene:
         return replace(scene, parts=other_parts) if had_lamps else scene
     radiance_unit = _check_units(scene, next(iter(kind_by_lit_carrier)))
     scene = replace(scene, parts=other_parts)
-    # Each car has two beams. With this weight all beams together are sampled as often as
-    # the environment.
+    # Each car has two beams. With this weight all beams together are sampled as often
+    # as the environment.
     weight = 1.0 / (2 * len(kind_by_lit_carrier))
     lamps: list[ScenePart] = []
     for carrier, kind in kind_by_lit_carrier.items():
@@ -470,9 +470,9 @@ def _make_disk_faces() -> IntArray:
 
 
 def _find_foremost(corners: Float64Array, disk: Float64Array, default: float) -> float:
-    """Return the largest x at which a line along x through a disk's vertex meets a face.
+    """Return the largest x at which a line through a disk's vertex meets a face.
 
-    So a disk at this x is in front of the car's body.
+    The lines are along x, so that a disk at this x is in front of the car's body.
 
     Args:
         corners: (F, 3, 3) corners of the faces.

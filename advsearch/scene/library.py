@@ -397,8 +397,8 @@ def _resize_map(
 ) -> Float32Array:
     """Bring a map to a size from `MIN_MAP_SIZE` to `MAX_MAP_SIZE`.
 
-    A larger map is averaged down, both sides by the same factor. The texels of a smaller
-    one are repeated.
+    A larger map is averaged down, both sides by the same factor. The texels of a
+    smaller one are repeated.
 
     Args:
         read_rows: returns the rows (n, W, 3) from a first row to an end.

@@ -268,7 +268,7 @@ class Person:
     def _compute_leg_corrections(
         self, points: Tensor, joints: Tensor, number_by_name: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return by how many metres each foot has to rise so that the walk is on ground.
+        """Return the metres by which each foot has to rise to walk on the ground.
 
         With the correction, a foot in stance touches the ground. It is computed for the
         walk alone, without the joint angles that a user sets in addition: a foot that
@@ -307,12 +307,12 @@ class Person:
         joints: Tensor,
         foot_rises: Mapping[str, Tensor],
     ) -> Tensor:
-        """Return posed points (P, 3) with feet raised, and legs stretched in proportion.
+        """Return posed points (P, 3) with raised feet and legs stretched to them.
 
         A point of the foot rises by all of the foot's rise. A point of the leg rises by
-        a fraction of it, from 0 at the hip to 1 at the ankle. Each rise is multiplied by
-        the point's skinning weight for these bones, so that the rest of the body stays
-        as it is.
+        a fraction of it, from 0 at the hip to 1 at the ankle. Each rise is multiplied
+        by the point's skinning weight for these bones, so that the rest of the body
+        stays as it is.
 
         Args:
             posed: (P, 3) points after skinning.
@@ -393,8 +393,8 @@ class Person:
             number_by_name["weight"],
             number_by_name["weight"].new_tensor([0.0, 0.5, 1.0]),
         )
-        # The mixture (G, A, W) without the height, and the heights (H,) in metres of the
-        # shortest, the average and the tallest body of that mixture.
+        # The mixture (G, A, W) without the height, and the heights (H,) in metres of
+        # the shortest, the average and the tallest body of that mixture.
         mixture = torch.einsum(
             "g,a,w->gaw", gender_weights, age_weights, weight_weights
         )
@@ -436,10 +436,11 @@ class Person:
     ) -> tuple[Tensor, Tensor]:
         """Return the rotation (J, 3, 3) and translation (J, 3) of each bone.
 
-        A point p moves to `rotation @ p + translation`. A bone is rotated first from the
-        rest pose to the pose with all angles 0, in which limbs are straight; then by its
-        own joint and by those of all its ancestors. Its joint goes where the parent bone
-        moves it. Bones come after their parents, so that one pass is enough.
+        A point p moves to `rotation @ p + translation`. A bone is rotated first from
+        the rest pose to the pose with all angles 0, in which limbs are straight; then
+        by its own joint and by those of all its ancestors. Its joint goes where the
+        parent bone moves it. Bones come after their parents, so that one pass is
+        enough.
 
         Args:
             joints: (J, 3) positions of the joints in the rest pose.
@@ -464,8 +465,8 @@ class Person:
             rotations.append(rotation @ straight_rotations.get(bone, identity))
             positions.append(position)
         all_rotations = torch.stack(rotations)
-        # The translation is position - rotation joint, so that the joint itself moves to
-        # its position.
+        # The translation is position - rotation joint, so that the joint itself moves
+        # to its position.
         return all_rotations, torch.stack(positions) - torch.einsum(
             "jik,jk->ji", all_rotations, joints
         )

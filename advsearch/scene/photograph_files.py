@@ -96,8 +96,9 @@ def read_photograph_view(spec: str | Path) -> PhotographView:
     The photograph itself is not read.
 
     Args:
-        spec: a picture file, perhaps with the part to use, ``photo.jpg#X,Y,WIDTH,HEIGHT``,
-            which replaces the part that the camera file states.
+        spec: a picture file, perhaps with the part to use,
+            ``photo.jpg#X,Y,WIDTH,HEIGHT``, which replaces the part that the camera file
+            states.
 
     Raises:
         FileFormatError: the file cannot be used.

@@ -108,11 +108,11 @@ class Photograph:
     def compute_reflectance(self, radiance: Tensor) -> Tensor:
         """Return the plane's texture (h, W, 3) for a map (H, W, 3) of any size.
 
-        Row 0 is the horizon, the last row is straight down, and columns are those of the
-        map. The plane was made for a map of some height, and h is half of that: the rows
-        of another map are interpolated. The reflectance is pi * radiance / irradiance,
-        with which the plane looks like the map; it is 0 if no light comes from above.
-        The result is differentiable.
+        Row 0 is the horizon, the last row is straight down, and columns are those of
+        the map. The plane was made for a map of some height, and h is half of that: the
+        rows of another map are interpolated. The reflectance is pi * radiance /
+        irradiance, with which the plane looks like the map; it is 0 if no light comes
+        from above. The result is differentiable.
         """
         rows = radiance.shape[0]
         # where the rows of the plane's own map lie in this one

@@ -94,6 +94,7 @@ def compute_pose(
         np.array([parameters["x"], parameters["y"], floor + parameters["z"] - lowest])
         - linear @ center
     )
-    # In x and y the middle goes back to where it was; its height follows from the floor.
+    # In x and y the middle goes back to where it was; its height follows from the
+    # floor.
     translation[:2] += center[:2]
     return make_pose(linear, translation)

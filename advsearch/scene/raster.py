@@ -99,8 +99,8 @@ def find_read_texels(corners: Float64Array, shape: tuple[int, int]) -> BoolArray
             most half a texel outside of the texture.
         shape: height and width of the texture.
     """
-    # The first cell begins at texel -1, which is the last texel again, since the texture
-    # repeats. A shift by 1 lets the indices of cells begin at 0.
+    # The first cell begins at texel -1, which is the last texel again, since the
+    # texture repeats. A shift by 1 lets the indices of cells begin at 0.
     shifted = corners + 1.0
     lowest_row = np.floor(shifted[..., 1].min(axis=1) - PIXEL_TOLERANCE)
     highest_row = np.floor(shifted[..., 1].max(axis=1) + PIXEL_TOLERANCE)
@@ -288,8 +288,8 @@ class Charts:
     def compute_areas(self) -> Float32Array:
         """Return the surface area (h, w) of each texel, in squared mesh units.
 
-        It is the area of the texel's face, divided by the number of texels that the face
-        covers in the texture. It is 0 outside of all charts.
+        It is the area of the texel's face, divided by the number of texels that the
+        face covers in the texture. It is 0 outside of all charts.
         """
         corners = self.mesh.vertices[self.mesh.faces].astype(np.float64)
         face_areas = np.linalg.norm(compute_area_vectors(corners), axis=1)

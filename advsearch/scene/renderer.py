@@ -362,7 +362,8 @@ class Renderer:
                 """Return the image on the tone curve's tangent at the denoised image.
 
                 The curve's slope is a difference over `STRAIGHT_FRACTION` of the way
-                from the denoised to the noisy image, where the curve is almost straight.
+                from the denoised to the noisy image, where the curve is almost
+                straight.
                 """
                 nudged = torch.lerp(clean, finish(radiance), STRAIGHT_FRACTION)
                 slope = (
@@ -789,9 +790,9 @@ class Renderer:
     ) -> Tensor:
         """Return the gradient of `sum(cotangent * image)` by differences.
 
-        It is zero for coordinates with another estimator. All renders share one seed, so
-        that their noise cancels in the differences (common random numbers). The image
-        is the finished one, after the tone curve and the controls that change it.
+        It is zero for coordinates with another estimator. All renders share one seed,
+        so that their noise cancels in the differences (common random numbers). The
+        image is the finished one, after the tone curve and the controls that change it.
 
         Args:
             u: (d,) configuration.
@@ -857,9 +858,9 @@ class Renderer:
         routes: dict[str, set[str]] = {group.name: set() for group in groups}
         generator = torch.Generator().manual_seed(0)
         noise = torch.rand(self.start.shape, generator=generator)
-        # The point is half way from the start to the center, with some noise: at borders
-        # and special values a derivative may be zero by chance. The random weights keep
-        # the derivatives of an input's entries from cancelling in the sum.
+        # The point is half way from the start to the center, with some noise: at
+        # borders and special values a derivative may be zero by chance. The random
+        # weights keep the derivatives of an input's entries from cancelling in the sum.
         u = (0.5 * self.start + 0.25 + 0.1 * (noise - 0.5)).requires_grad_()
         with torch.enable_grad():
             inputs = self.scene.assembly(self.space.inputs(u))

@@ -537,8 +537,8 @@ def _read_applied_scale(path: str, data: Mapping[str, Any]) -> float:
 
     It is nerfstudio's `applied_scale`, times the scale within its `applied_transform`.
     The rotation and the shift of that transform move all cameras alike, and so do not
-    count. Instant NGP's `scale` and `offset` do not count either: the program that reads
-    the file applies them, so that the positions in the file are without them.
+    count. Instant NGP's `scale` and `offset` do not count either: the program that
+    reads the file applies them, so that the positions in the file are without them.
 
     Raises:
         FileFormatError: the transform is none of rotation, shift and scale, or the

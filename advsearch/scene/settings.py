@@ -700,9 +700,9 @@ def parse_mesh_name(name: str) -> str | None:
 def resolve_settings(settings: SettingValues) -> dict[str, float | None]:
     """Return every setting's value: the user's, or else the default.
 
-    The value is None if the scene computes it, as the camera's distance from the object.
-    The value of a choice is the index of its option. Settings of meshes around the
-    object are included only if the user has given them.
+    The value is None if the scene computes it, as the camera's distance from the
+    object. The value of a choice is the index of its option. Settings of meshes around
+    the object are included only if the user has given them.
 
     Args:
         settings: the user's values by name, such as {"camera.fov": 40}.

@@ -61,9 +61,9 @@ _SMOOTHING_ROUNDS = 10
 def unwrap(soup: TriangleSoup, chart_group: IntArray | None = None) -> TriangleSoup:
     """Return faces with new texture coordinates from xatlas.
 
-    xatlas cuts the surface into charts, which it lays side by side into the unit square,
-    without overlap. If the mesh is in very many pieces, xatlas is not used: all faces
-    become triangles of one size in a grid. The result is deterministic.
+    xatlas cuts the surface into charts, which it lays side by side into the unit
+    square, without overlap. If the mesh is in very many pieces, xatlas is not used: all
+    faces become triangles of one size in a grid. The result is deterministic.
 
     Args:
         soup: the faces.
@@ -348,8 +348,8 @@ class SurfaceParts:
         """Return the index (n,) of the cell of the map that each point is in.
 
         If the map has its own texture coordinates (`is_unwrapped`), the point's
-        coordinates in it follow from its barycentric weights in the face. Points outside
-        of the map count as on its border.
+        coordinates in it follow from its barycentric weights in the face. Points
+        outside of the map count as on its border.
 
         Args:
             face: (n,) index of the face.
@@ -409,9 +409,10 @@ def _rasterise_map(mesh: Mesh, uvs: Float64Array) -> Charts:
 def _has_unique_uvs(mesh: Mesh, uvs: Float64Array) -> bool:
     """Return whether texture coordinates (F, 3, 2) tell points of a surface apart.
 
-    They do under four conditions. They are in the unit square. Almost all of the surface
-    has an area in the texture. They cover enough of the square, and hardly any of it
-    twice. The last two are tested on a raster of `_TEST_RASTER_SIZE` pixels a side.
+    They do under four conditions. They are in the unit square. Almost all of the
+    surface has an area in the texture. They cover enough of the square, and hardly any
+    of it twice. The last two are tested on a raster of `_TEST_RASTER_SIZE` pixels a
+    side.
 
     Args:
         mesh: the mesh.
@@ -431,8 +432,8 @@ def _has_unique_uvs(mesh: Mesh, uvs: Float64Array) -> bool:
         (_TEST_RASTER_SIZE, _TEST_RASTER_SIZE),
         tolerance=-1e-6,
     )
-    # The rows of the result are pairs of face and pixel. Those beyond one for each covered
-    # pixel are in a further face.
+    # The rows of the result are pairs of face and pixel. Those beyond one for each
+    # covered pixel are in a further face.
     covered = len(np.unique(row * _TEST_RASTER_SIZE + column))
     doubled = len(row) - covered
     return (

@@ -355,8 +355,8 @@ def find_ground_height(scene: SceneData, position: Float64Array) -> float:
 def find_triangle_heights(corners: Float64Array, position: Float64Array) -> list[float]:
     """Return the heights at which a vertical line meets triangles.
 
-    A triangle counts if the line's point is inside it or on its border, seen from above.
-    A vertical triangle does not count.
+    A triangle counts if the line's point is inside it or on its border, seen from
+    above. A vertical triangle does not count.
 
     Args:
         corners: (F, 3, 3) corners of the triangles.
@@ -430,7 +430,8 @@ def list_camera_remarks(
     """
     solid_names = list[str]()
     for eye in eyes:
-        # Overlap is defined for footprints, so that the camera is taken for a tiny square.
+        # Overlap is defined for footprints, so that the camera is taken for a tiny
+        # square.
         x, y, z = eye / scene.size_in_metres
         corners = np.array(
             [(x - EYE_SIZE, y), (x, y - EYE_SIZE), (x + EYE_SIZE, y), (x, y + EYE_SIZE)]

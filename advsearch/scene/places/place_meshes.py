@@ -513,7 +513,8 @@ def _with_finish(
     entry = MaterialEntry() if index is None else header.materials[index]
     finish = _read_extension(path, _Finish, entry.extensions)
     # The fraction that is reflected of light along the normal is ((n - 1) / (n + 1))^2
-    # for an index of refraction n (Fresnel). A specular of 1 here reflects `REFLECTANCE`.
+    # for an index of refraction n (Fresnel). A specular of 1 here reflects
+    # `REFLECTANCE`.
     ior = finish.KHR_materials_ior.ior
     facing_reflectance = (
         finish.KHR_materials_specular.specularFactor * ((ior - 1.0) / (ior + 1.0)) ** 2

@@ -382,8 +382,8 @@ class Arrangement:
     def _find_buried(self, met_cells: Ints, side: int) -> BoolArray:
         """Return which texels (n,) of one side of the object lie inside something.
 
-        Inside of something, rays meet the backs of faces. A texel is buried if more than
-        `BURIED_FRACTION` of its rays do. If backs have texels too (two sides), the
+        Inside of something, rays meet the backs of faces. A texel is buried if more
+        than `BURIED_FRACTION` of its rays do. If backs have texels too (two sides), the
         object may be an open shell: then the texel also has to see no sky.
 
         Args:
@@ -448,8 +448,9 @@ class Arrangement:
         world_directions = directions @ self.world_to_map
         if not self._has_ground:
             return torch.zeros(texels.BLURRED_SHAPE, dtype=torch.bool), directions
-        # The ray from the center meets the ground at this distance. For a direction that
-        # does not go down the point means nothing, and the last line leaves it out.
+        # The ray from the center meets the ground at this distance. For a direction
+        # that does not go down the point means nothing, and the last line leaves it
+        # out.
         distance = float(center[2]) / (-world_directions[..., 2]).clamp_min(1e-6)
         points = (
             torch.from_numpy(center).float() + world_directions * distance[..., None]
@@ -537,8 +538,8 @@ class Arrangement:
     def _find_hot_cosines(self, sky: texels.SkyLight) -> Tensor | None:
         """Return the cosines (n, k) of n texels towards k directions of hot light.
 
-        Hot is the light far above the map's mean, such as that of the sun. A cosine is 0
-        if something hides the direction from the texel.
+        Hot is the light far above the map's mean, such as that of the sun. A cosine is
+        0 if something hides the direction from the texel.
 
         Args:
             sky: the environment, with the directions of its hot light.
@@ -639,8 +640,8 @@ class Arrangement:
     def _compute_ground_color(self, padded: Tensor) -> Tensor:
         """Return the base color (n, 3) of the ground's texels.
 
-        A photographed ground has the color with which it looks like its photograph under
-        the full sky: radiance = color E / pi, where E is the irradiance.
+        A photographed ground has the color with which it looks like its photograph
+        under the full sky: radiance = color E / pi, where E is the irradiance.
 
         Args:
             padded: (H, W + 2, 3) map of the environment.

@@ -197,7 +197,7 @@ class SurfaceRenderer(Predictor):
     def get_light(
         self, inputs: Mapping[str, Tensor]
     ) -> tuple[ArrangementLight, Tensor]:
-        """Return the light under the environment of some scene inputs, and a factor (3,).
+        """Return the light under the environment of scene inputs, and a factor (3,).
 
         Light is linear in the environment. So maps that differ only by exposure or tint
         share one stored light, and the factor turns it into that of `inputs`, for each

@@ -110,11 +110,12 @@ def make_mesh_texels(
         charts: rasterised texture coordinates of the mesh.
         vertices: (V, 3) in world space.
         normals: (V, 3) in world space.
-        side: side of the faces that the texels are on: 1 the front, -1 the back, 0 both.
+        side: side of the faces that the texels are on: 1 the front, -1 the back, 0
+            both.
     """
     position, normal = _interpolate(charts, vertices, normals)
-    # Texels are the covered cells, numbered row by row: the index of each. In cells that
-    # are not covered the number means nothing.
+    # Texels are the covered cells, numbered row by row: the index of each. In cells
+    # that are not covered the number means nothing.
     texel_of_covered = np.cumsum(charts.is_covered.ravel()) - 1
     rows, columns = np.nonzero(charts.is_covered)
     return LitTexels(

@@ -110,8 +110,8 @@ def find_lighting(renderer: Renderer) -> Lighting:
     with such lights, only groups that change nothing but the finished image are
     returned.
     """
-    # Other groups stay half way between the start and the center of the unit cube: there
-    # a value is rarely at a border, where a change may have no effect.
+    # Other groups stay half way between the start and the center of the unit cube:
+    # there a value is rarely at a border, where a change may have no effect.
     reference = 0.5 * renderer.start + 0.25
     groups = {}
     harmonic_groups = set()

@@ -737,8 +737,8 @@ def _trace_matrices(
         has_backdrop: whether a photograph takes the place of the environment.
 
     Returns:
-        (H, W, 3) linear radiance; with a backdrop also coverage and, where a plane takes
-        the shadow, the change of its radiance.
+        (H, W, 3) linear radiance; with a backdrop also coverage and, where a plane
+        takes the shadow, the change of its radiance.
     """
     with renderer.scene.limit_window(renderer.window):
         paths = _fill_transports(renderer, transports, scene_inputs, seed, tick, spp)
@@ -762,8 +762,8 @@ def _append_plane_change(
 ) -> Tensor:
     """Append to a base image the change of the plane that takes the shadow.
 
-    The channels are rendered once, since no base color changes them. If the scene has no
-    such plane, the image is returned as it is.
+    The channels are rendered once, since no base color changes them. If the scene has
+    no such plane, the image is returned as it is.
 
     Args:
         renderer: renderer of the scene.
@@ -841,7 +841,8 @@ def _make_smooth(
     )
     is_surface = paths.albedo.sum(dim=-1, keepdim=True) > 0.0
     # The denoiser keeps the edges of its guide image. The base color's pattern is not
-    # in a matrix's colors, so that the guide is 1 on all surfaces, whatever their color.
+    # in a matrix's colors, so that the guide is 1 on all surfaces, whatever their
+    # color.
     even_albedo = is_surface.to(torch.float32).expand(-1, -1, 3).contiguous()
 
     def smooth(image: Tensor) -> Tensor:
