@@ -67,22 +67,23 @@ class MovingMesh:
 
         Args:
             to_world: invertible affine map (4, 4); None for the base pose.
-            offsets: displacement (V, 3) in mesh coordinates, or None.
+            offsets: displacement (V, 3) of the vertices in mesh coordinates; None for
+                none.
         """
         moving = to_world if to_world is not None else offsets
         device = self.vertices.device if moving is None else moving.device
         matrix = self.to_world.to(device) if to_world is None else to_world
         vertices = self.vertices.to(device)
         normals = self.normals.to(device)
-        # The author's normals need not be those of the faces: they change by as much as
-        # the faces' normals do.
+        # The file's normals need not be those of its faces (they may be smoothed). So
+        # they are not computed anew, but changed by as much as those of the faces.
         if offsets is not None:
             original = self._original_area_normals.to(device)
             change = self._compute_area_normals(vertices + offsets) - original
             vertices = vertices + offsets
             normals = normals + change
         world_vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
-        # a row times the inverse: normals go by the inverse transpose
+        # Normals are transformed by the inverse transpose, here as rows: n M^-1.
         world_normals = normals @ torch.linalg.inv(matrix[:3, :3])
         lengths = world_normals.norm(dim=1, keepdim=True).clamp_min(1e-12)
         return world_vertices, world_normals / lengths
@@ -90,9 +91,12 @@ class MovingMesh:
     def _compute_area_normals(self, vertices: Tensor) -> Tensor:
         """Return the unit normals (V, 3) that follow from the faces, weighted by area.
 
-        Vertices at one position with one normal (a UV seam splits them) share the mean
-        of all their faces; those with different normals do not, so that creases stay
-        creases. `vertices` are (V, 3) positions of the mesh's vertices.
+        At a UV seam there are several vertices at one position with one normal. They
+        share the mean of all their faces. Vertices at one position with different
+        normals do not, so that creases stay sharp.
+
+        Args:
+            vertices: (V, 3) positions of the mesh's vertices.
         """
         # (F, 3) vertices of the faces, and (V,) the group of vertices that share a mean
         faces, groups = (indices.to(vertices.device) for indices in self._shared_groups)
@@ -134,9 +138,12 @@ class MovingMesh:
 
 
 def pose_mesh(part: MeshPart, inputs: Mapping[str, Tensor]) -> Shape:
-    """Return a mesh of a scene with its inputs set: in world space, z up.
+    """Return a mesh of a scene with its inputs applied, in world space, z up.
 
-    The inputs are those of `MitsubaScene` that differ from the base values.
+    Args:
+        part: the mesh as the scene describes it.
+        inputs: assembled inputs of all meshes by name, such as "object.vertices". What
+            is missing keeps its base value.
     """
     prefix = f"{part.name}."
     values = {
@@ -194,7 +201,13 @@ class Assembly:
         description: SceneDescription,
         resolution: tuple[int, int] | None = None,
     ) -> None:
-        """Keep the scene's meshes, its carried lamps and what its photograph adds."""
+        """Collect the scene's meshes, its carried lamps and what its photograph adds.
+
+        Args:
+            description: the scene.
+            resolution: height and width of the image; None if no image is made of it,
+                and so no inputs of a photograph are needed.
+        """
         self.meshes = {
             name: MovingMesh(part.mesh, part.to_world)
             for name, part in description.meshes.items()
@@ -205,8 +218,9 @@ class Assembly:
             if isinstance(part, (BeamLamp, LampGlass))
         ]
         self._photograph = description.photograph
-        # what the photograph that is chosen adds to the image, by its index; the light
-        # of the plane is always that of the scene itself
+        # A scene may be rendered into one of several photographs: the scene of each,
+        # and by its index what it adds to the image. The light of the plane is always
+        # that of the scene itself.
         self._views = [description]
         if description.photographs is not None:
             self._views = list(description.photographs.scenes.values())
@@ -222,16 +236,16 @@ class Assembly:
     def __call__(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the inputs with poses, displacements and maps applied.
 
-        `NAME.to_world` and `NAME.offsets` become `NAME.vertices` and `NAME.normals`;
-        `camera.shift` (2,) becomes two numbers; `environment.data` (H, W, 3) becomes a
-        map that is padded at its seam, and the reflectance of a photographed ground.
-        All are differentiable torch operations.
+        Some inputs are replaced by those that Mitsuba's scene has. `NAME.to_world` and
+        `NAME.offsets` become `NAME.vertices` and `NAME.normals`. `camera.shift` (2,)
+        becomes `camera.shift_x` and `camera.shift_y`. `environment.data` (H, W, 3)
+        becomes `environment.padded` (H, W + 2, 3) and, with a photographed ground,
+        `ground.reflectance`. All are differentiable torch operations.
         """
         if self.is_object_hidden:
             inputs = self._hide_object(inputs)
         parameters = dict(inputs)
-        # which of several photographs is chosen, by its index; without a choice the
-        # first
+        # index of the chosen photograph; 0 without a choice
         photograph = int(parameters.pop(PHOTOGRAPH_INPUT, torch.zeros(())))
         parameters |= self._get_image_inputs(photograph)
         for part in self._carried:  # what carries it may be moved or deformed
@@ -268,10 +282,13 @@ class Assembly:
         return {**inputs, name: pose}
 
     def _get_image_inputs(self, photograph: int) -> dict[str, Tensor]:
-        """Return what a photograph adds to the image; it is read once.
+        """Return the inputs that a photograph adds to the finished image.
+
+        They are computed on first use, and stored.
 
         Args:
-            photograph: its index among those of the scene's folder; 0 without one.
+            photograph: index of the photograph in the scene's folder; 0 if the scene
+                has no folder of photographs.
         """
         if self._resolution is None:
             return {}
@@ -299,10 +316,11 @@ class Assembly:
 def _move_carried(
     part: BeamLamp | LampGlass, inputs: Mapping[str, Tensor]
 ) -> dict[str, Tensor]:
-    """Return the inputs of a lamp that is moved with what carries it.
+    """Return the inputs that move a lamp with the car that carries it.
 
-    Glass is deformed with the vertices of its carrier that it lies on, and has the same
-    pose; a beam stays where it is on its carrier. Empty if nothing moves the carrier.
+    The glass of a lamp has the carrier's pose, and is deformed with the vertices that
+    it lies on. A beam keeps its place on the carrier. The result is empty if nothing
+    moves the carrier.
 
     Args:
         part: the beam or the glass.
@@ -334,12 +352,12 @@ def write_central_differences(
 ) -> None:
     """Write the central differences of a function into a derivative, in place.
 
-    Each is the rise of the function between two points, divided by their distance: at
-    the border of the box that is less than twice the step.
+    A difference is the rise of the function between two points, divided by their
+    distance. The distance is twice the step, or less at the border of the unit cube.
 
     Args:
-        value: from a configuration (d,) to a number.
-        group: the coordinates, and the half-width of the differences.
+        value: maps a configuration (d,) to a scalar.
+        group: the coordinates, and the step, which is half the distance.
         u: (d,) configuration.
         derivative: (d,) into which the slopes of the group are written.
     """
@@ -398,15 +416,21 @@ class Motion:
         resolution: tuple[int, int],
         assembly: Assembly,
     ) -> None:
-        """Choose the points that are followed; arguments are those of the class."""
+        """Choose the points whose motion in the image is followed.
+
+        Args:
+            description: the scene.
+            resolution: height and width of the image.
+            assembly: turns inputs into vertices.
+        """
         self._description = description
         self._resolution = resolution
         self._assembly = assembly
         aspect = resolution[1] / resolution[0]
         pose = camera_to_world(description, aspect)
         self._camera = torch.from_numpy(pose).double()
-        # Half the side of the square that the ground is, and points (n, 3) on its edge;
-        # of a photographed ground all of its vertices.
+        # `_ground` is half the side of the square ground, and `_edge` has points (n, 3)
+        # on its edge. Of a photographed ground all vertices are followed.
         if description.photograph is None:
             self._ground = description.get_number("ground.size") / 2.0
             self._edge = _sample_square_edge(self._ground)
@@ -426,8 +450,8 @@ class Motion:
     def project_points(self, inputs: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Return where the followed points lie in the image.
 
-        In the order of the meshes' vertices, the edge of the ground, the environment.
-        `inputs` are assembled ones.
+        First come the vertices of meshes, then the edge of the ground, then the
+        environment. `inputs` are assembled ones, as Mitsuba's scene has them.
 
         Returns:
             (N, 2) pixels from the center, and (N,) whether each is in or near the
@@ -449,7 +473,7 @@ class Motion:
         n_near = len(is_visible) - len(self._far)
         is_visible[n_near:] &= ~self._hidden_by_ground(eye)
         half_size = torch.tensor(self._resolution[::-1], dtype=torch.float64) / 2.0
-        # near: up to a fifth of half a side outside
+        # A point is near the frame if it is outside by at most a fifth of half a side.
         near_frame = (positions.abs() <= 1.2 * half_size).all(dim=1)
         return positions, is_visible & near_frame
 
@@ -478,9 +502,9 @@ class Motion:
         It is in pixels per unit of u, and 0 for coordinates that are not requested.
 
         Args:
-            inputs: maps u to assembled inputs.
-            u: (d,) configuration.
-            coordinates: those whose speed is measured.
+            inputs: maps a configuration to assembled inputs.
+            u: (d,) configuration at which speeds are measured, by small changes of it.
+            coordinates: indices of the coordinates whose speed is measured.
         """
         speeds = torch.zeros(len(u))
         with torch.no_grad():
@@ -488,14 +512,14 @@ class Motion:
             for coordinate in coordinates:
                 for nudge in NUDGES:
                     nudged = u.clone()
-                    # backwards at the upper border of the box
+                    # At the upper border of the unit cube the change goes backwards.
                     sign = 1.0 if float(u[coordinate]) + nudge <= 1.0 else -1.0
                     nudged[coordinate] += sign * nudge
                     new_positions, still_visible = self.project_points(inputs(nudged))
                     shifts = (new_positions - positions)[is_visible & still_visible]
                     distances = shifts.norm(dim=1)
-                    # If nothing moves, what moved may have left the frame: then a
-                    # smaller nudge is tried.
+                    # If no point moves, those that moved may have left the frame: then
+                    # a smaller change is tried.
                     if bool((distances > 0.0).any()):
                         speeds[coordinate] = float(distances.max()) / nudge
                         break

@@ -89,7 +89,11 @@ class Mesh:
         )
 
     def __post_init__(self) -> None:
-        """Check shapes and values. Raises InputError."""
+        """Check shapes and values.
+
+        Raises InputError: vertices, normals or UVs have different lengths, or values
+        that are not finite; or faces are no triangles of these vertices.
+        """
         count = len(self.vertices)
         for name, array, width in (
             ("vertices", self.vertices, 3),
@@ -349,15 +353,19 @@ TEXTURE_CELLS = 32
 
 
 def _merge_clusters(mesh: Mesh, cluster_of: IntArray) -> tuple[IntArray, IntArray]:
-    """Merge the vertices of each cluster that lie in one cell of the texture.
+    """Merge the vertices of each cluster that are in one cell of the texture.
+
+    The texture is divided into cells so that vertices on both sides of a seam, which
+    are far apart in it, stay distinct.
 
     Args:
         mesh: the full mesh.
         cluster_of: (V,) cluster of each vertex.
 
     Returns:
-        For each new vertex (N,) one of the vertices that it stands for; and the faces
-        (F, 3) of new vertices whose corners are in three clusters.
+        (N,) for each new vertex the index of one of the vertices that it replaces; and
+        the faces (F, 3) of new vertices. Faces with two corners in one cluster are left
+        out.
     """
     texture_cell = np.floor(mesh.uvs.astype(np.float64) * TEXTURE_CELLS).astype(
         np.int64
@@ -375,20 +383,23 @@ def _merge_clusters(mesh: Mesh, cluster_of: IntArray) -> tuple[IntArray, IntArra
 
 
 def make_simplifier(mesh: Mesh, max_faces: int) -> Callable[[Mesh], Mesh] | None:
-    """Return a function that simplifies a mesh, also once its vertices are elsewhere.
+    """Return a function that simplifies a mesh in any of its poses.
 
-    After Rossignac and Borrel (1993, "Multi-resolution 3D approximations for rendering
-    complex scenes"): vertices are clustered by a grid, and a face of which two corners
-    meet is left out. A cluster goes to the mean of its vertices. Both sides of a seam
-    of the texture move together, so that no gap opens: they are vertices of their own,
-    in one cluster. The grid is the finest that leaves few enough faces.
+    The method is that of Rossignac and Borrel (1993, "Multi-resolution 3D
+    approximations for rendering complex scenes"). The cells of a grid divide the
+    vertices into clusters, each of which moves to the mean of its vertices. A face is
+    left out if two of its corners are in one cluster. At a seam of the texture the
+    vertices of both sides stay distinct, but are in one cluster, so that no gap opens.
+    The grid is the finest that leaves at most `max_faces` faces.
 
     Args:
         mesh: the full mesh.
-        max_faces: faces that are left at most, or the fewest of a coarse grid.
+        max_faces: largest number of faces. If even the coarsest grid leaves more, that
+            grid is used.
 
     Returns:
-        None if the mesh has no more faces.
+        A function that takes the mesh with other positions of its vertices; None if the
+        mesh has at most `max_faces` faces, and need not be simplified.
     """
     if len(mesh.faces) <= max_faces:
         return None
@@ -531,12 +542,12 @@ def is_road_vehicle(asset: ObjectAsset) -> bool:
 
 
 def with_size(asset: ObjectAsset, size: float | None, unit: str | None) -> ObjectAsset:
-    """Return an object with the size in metres that its user states, if any.
+    """Return an object with the size in metres that the user states, if any.
 
     Args:
         asset: the object.
-        size: its longest side in metres; or None.
-        unit: unit of its file, one of `METRES_PER_UNIT`; or None.
+        size: its longest side in metres; None if the user does not state it.
+        unit: unit of its file, "mm", "cm", "m" or "in"; None likewise.
 
     Raises:
         InputError: both are given, the size is out of range, or the object comes
@@ -584,20 +595,23 @@ def describe_size_doubts(
 ) -> tuple[str, ...]:
     """Return a remark where an object's size is unusual for its name, or unknown.
 
-    A size that is unknown matters if something is in metres, or if the name and the
-    file's extent tell which unit would fit. The user's own size is never doubted.
-    Empty, or one remark.
+    An unknown size matters if something in the scene is in metres, or if the name and
+    the file's extent tell which unit would fit: a "car" of extent 450 is in
+    centimetres. A size that the user has given is never doubted.
 
     Args:
         asset: the object.
-        has_user_size: whether its user gave its size.
+        has_user_size: whether the user has given its size.
         needs_metres: whether something in the scene is in metres, such as the road.
+
+    Returns:
+        One remark, or none.
     """
     kind = _find_usual_kind(asset.name)
     usual_sizes = PLAUSIBLE_SIZES if kind is None else USUAL_SIZES[kind]
     min_size, max_size = usual_sizes
     size = asset.size_in_metres
-    # without a kind, what the file states tells nothing
+    # Whether an extent fits can be told only for a kind of object with a usual size.
     extent = None if kind is None else asset.extent
     is_unusual = size is not None and not min_size <= size <= max_size
     is_missing = size is None and (needs_metres or extent is not None)
@@ -630,7 +644,7 @@ def _find_usual_kind(name: str) -> str | None:
 def _describe_size_remedy(
     extent: float | None, usual_sizes: tuple[float, float]
 ) -> str:
-    """Return what to give so that an object's size is known, to follow "give".
+    """Return the end of a remark: what the user may give to state an object's size.
 
     Args:
         extent: longest side of the object in the unit of its file, if that is known.

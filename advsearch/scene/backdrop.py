@@ -16,8 +16,9 @@ Its change, light of the object minus that of the environment behind it, is adde
 as much of the photograph as the coat reflects of the environment takes no shadow.
 
 The photograph is read as a viewer shows it, decoded from sRGB, and averaged over the
-area of each pixel of the film. A part of it may be cut out, `photo.jpg#X,Y,WIDTH,HEIGHT`
-in pixels from its top left corner; the intrinsics of the camera follow.
+area of each pixel of the film. A part of it may be cut out,
+`photo.jpg#X,Y,WIDTH,HEIGHT` in pixels from its top left corner; the intrinsics of the
+camera follow.
 """
 
 from __future__ import annotations
@@ -99,7 +100,8 @@ def read_backdrop(spec: str | Path) -> BackdropPhotograph:
     """Read a photograph that a scene is to be rendered into.
 
     Args:
-        spec: a picture file; with the part to use behind it, ``#X,Y,WIDTH,HEIGHT``.
+        spec: path of a picture. A part of it is named behind the path, in pixels from
+            the top left corner: ``photo.jpg#X,Y,WIDTH,HEIGHT``.
 
     Raises:
         FileFormatError: the file is missing, no picture, too large, corrupt, too small
@@ -138,9 +140,12 @@ def find_photograph_file(photograph: object) -> Path | None:
 
 
 def find_photographed_light(photograph: object) -> Path | None:
-    """Return the environment map that lies beside a photograph, or None.
+    """Return the environment map beside a photograph, or None if there is none.
 
-    It is called as the photograph, with the suffix .hdr or .exr.
+    The map of "kitchen.jpg" is "kitchen.hdr" or "kitchen.exr" in the same folder.
+
+    Args:
+        photograph: path of the photograph, or what else a user may give as one.
     """
     path = find_photograph_file(photograph)
     if path is None:
@@ -148,6 +153,7 @@ def find_photographed_light(photograph: object) -> Path | None:
     for suffix in LIGHT_SUFFIXES:
         light = path.with_suffix(suffix)
         if light != path and light.is_file():
+            # the map counts as opened for the photograph, with which it belongs
             with track_opened_files(path):
                 record_opened(light)
             return light
@@ -159,13 +165,13 @@ def with_front(photograph: BackdropPhotograph, spec: str | Path) -> BackdropPhot
 
     Args:
         photograph: the photograph.
-        spec: a picture file of the full photograph's size, white where something is
-            before the object, black elsewhere; or one of depth, as `read_depth` takes
-            it.
+        spec: a mask: a picture file of the full photograph's size, white where
+            something is in front of the object, black elsewhere. Or a picture of the
+            photograph's depth: an .exr or .npy file, or "depth.png#0.001".
 
     Raises:
         FileFormatError: the file cannot be used.
-        InputError: it has another size.
+        InputError: it has another size than the photograph.
     """
     if is_depth(spec):
         depth = read_depth(spec)
@@ -200,14 +206,21 @@ def make_image_inputs(
 ) -> dict[str, Tensor]:
     """Return the inputs by which a rendered image becomes a part of its photograph.
 
-    Empty for a scene that is rendered into none.
+    The result is empty if the scene is not rendered into a photograph.
 
     Returns:
-        ``backdrop.color`` (H, W, 3) the photograph; and if there is any
-        ``backdrop.plane`` (3,), see `compute_plane_radiance`; ``backdrop.front`` (H, W,
-        1) what is before the object; ``backdrop.depth`` (H S, W S) of the photograph,
-        object sizes; ``backdrop.noise`` (H, W, 3) display-referred noise, and
-        ``backdrop.blur`` (1,) in pixels, of what is rendered.
+        Tensors by name. ``backdrop.color`` (H, W, 3) is the photograph, display-linear.
+        The others are there only where they apply:
+
+        - ``backdrop.plane`` (3,): radiance of the plane without the object;
+        - ``backdrop.front`` (H, W, 1): fraction of each pixel that something before the
+          object covers;
+        - ``backdrop.depth`` (H S, W S): depth of the photograph in object sizes, at S x
+          S points of each pixel;
+        - ``backdrop.noise`` (H, W, 3): noise that is added to what is rendered,
+          display-referred;
+        - ``backdrop.blur`` (1,): standard deviation in pixels by which what is rendered
+          is blurred.
 
     Raises:
         InputError: there is depth, and the object's size in metres is not known.
@@ -241,17 +254,19 @@ def make_image_inputs(
 def compose(rendered: Tensor, behind: Tensor, inputs: Mapping[str, Tensor]) -> Tensor:
     """Lay rendered radiance over a photograph.
 
-    The photograph shows where the coverage is below 1, darker or brighter by what the
-    object takes from the plane's light or adds to it, and where something is before
-    the object or the plane.
+    The photograph is visible where the object does not cover the pixel, and where
+    something is in front of the object. On the plane it is darkened by the object's
+    shadow, and brightened by light that the object reflects.
 
     Args:
-        rendered: (H, W, 4, 7 or 13), the object's radiance times its coverage, its
-            coverage, the change of the plane's radiance, that of what its coat
-            reflects, and the environment in the coat without the object.
+        rendered: (H, W, C). Channels 0 to 2 are the object's radiance times its
+            coverage, and 3 is the coverage. With a plane, 4 to 6 are the change of its
+            radiance by the object. With a glossy plane, 7 to 9 are the change of what
+            its coat reflects, and 10 to 12 the environment in the coat without the
+            object. So C is 4, 7 or 13.
         behind: (H, W, 3) radiance of the photograph.
-        inputs: as by `make_image_inputs`; the last channel of ``backdrop.front`` is
-            what is before the plane.
+        inputs: result of `make_image_inputs`. The first channel of ``backdrop.front``
+            is the fraction of the object that is hidden, the last that of the plane.
 
     Returns:
         Radiance (H, W, 3).
@@ -273,7 +288,9 @@ def compose(rendered: Tensor, behind: Tensor, inputs: Mapping[str, Tensor]) -> T
         uncovered = shade
         shade = (shade + change).clamp_min(0.0)
         if reflection.shape[-1]:
-            # what the photograph shows of the environment in the coat takes no shadow
+            # A shadow takes light from the plane's color, but not from the reflection
+            # of the environment in its coat: that part of the photograph is added
+            # again.
             coat = rendered[..., 10:] / (1.0 - rendered[..., 3:4]).clamp_min(1e-3)
             unshaded = (uncovered - shade) * torch.minimum(coat, behind)
             return radiance + (shade * behind + unshaded + reflection).clamp_min(0.0)
@@ -285,18 +302,19 @@ def compute_front(
 ) -> Tensor:
     """Return the fractions of object and ground that the photograph's depth hides.
 
-    A point is hidden where the photograph is nearer by more than `DEPTH_TOLERANCE`. A
-    pixel with no point of the object takes the fraction around it, for the faint edges
-    of a smooth or blurred outline; so does one with no point of the ground.
+    A point is hidden if the photograph there is nearer than the point by more than
+    `DEPTH_TOLERANCE`. If none of a pixel's points is on the object, the fraction is
+    that of the pixels around it, since a blurred outline may reach into the pixel. The
+    same holds for the ground.
 
     Args:
-        surfaces: what is seen first at n x n points of each pixel.
+        surfaces: surface that is seen first at n x n points of each pixel.
         photograph_depth: (H n, W n) at the same points, in the unit of `surfaces`.
         n_points: n.
         radius: radius of the surroundings, pixels.
 
     Returns:
-        (H, W, 2) float32 in [0, 1].
+        (H, W, 2) float32 in [0, 1]: fraction of the object, and of the ground.
     """
     is_hidden = photograph_depth < surfaces.z_depth * (1.0 - DEPTH_TOLERANCE)
     is_ground = torch.zeros_like(is_hidden)
@@ -314,7 +332,12 @@ def compute_front(
 
 
 def _decode_photograph(image: Image.Image, path: Path) -> npt.NDArray[np.uint8]:
-    """Return the levels (H, W, 3) of an opened photograph, as a viewer shows it."""
+    """Return the 8-bit levels (H, W, 3) of an opened photograph.
+
+    It is rotated upright, as its EXIF data state.
+
+    Raises FileFormatError: it is damaged, too large, or transparent in some pixels.
+    """
     check_decodable(image, path)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of large images and odd metadata
@@ -339,7 +362,7 @@ def make_backdrop(
 
     Args:
         levels: levels of the full photograph.
-        spec: how it is called.
+        spec: its name for messages.
         crop: left, top, width and height in pixels of the part to use; None: all.
 
     Raises:
@@ -364,8 +387,9 @@ def compute_photograph_gain(
 ) -> float:
     """Return the factor from a scene's radiance to a photograph's display-linear values.
 
-    By it a level surface of reflectance `GREY_CARD`, lit by the environment, gets the
-    mean luminance of the photograph. 1 where no environment lights the scene.
+    With it a level surface of the reflectance `GREY_CARD`, lit by the environment, has
+    the mean luminance of the photograph. The factor is 1 if no environment lights the
+    scene.
     """
     irradiance = float(compute_level_irradiance(description) @ LUMINANCE)
     if not irradiance > 0.0:
@@ -387,18 +411,20 @@ def compute_photograph_gain(
 def compute_level_irradiance(description: SceneData) -> Float64Array:
     """Return the irradiance (3,) of a level surface under the environment alone.
 
-    It is that of the map, before `environment.exposure`.
+    It is that of the map itself: the setting `environment.exposure` does not count. It
+    is 0 without an environment.
     """
     environment = description.environment
     if environment is None:
         return np.zeros(len(CHANNELS))
     rows = environment.radiance.shape[0]
-    # of the angle from straight up at the edges of rows, 0 below the horizon
+    # cosines of the angle from straight up at the borders between rows
     edge_cosines = np.cos(np.arange(rows + 1) * math.pi / rows)
     upper_cosines = np.maximum(edge_cosines[:-1], 0.0)
     lower_cosines = np.maximum(edge_cosines[1:], 0.0)
     row_means = environment.radiance.mean(axis=1, dtype=np.float64)
-    # the integral of cosine times solid angle over each row
+    # the integral of cosine times solid angle over each row: 2 pi times that of
+    # cos(t) sin(t) dt. It is 0 below the horizon.
     weights = math.pi * (upper_cosines**2 - lower_cosines**2)
     # by a sum, not by BLAS, whose last bits depend on the number of threads
     return np.asarray((weights[:, None] * row_means).sum(axis=0))
@@ -429,7 +455,8 @@ def compute_refractive_index(gloss: float) -> float:
 def compute_plane_radiance(description: SceneData) -> Tensor | None:
     """Return the radiance (3,) float32 of the plane without the object.
 
-    None if a scene has no plane.
+    A diffuse plane has the radiance albedo * irradiance / pi. The result is None if the
+    scene has no plane.
     """
     if not has_plane(description):
         return None
@@ -445,9 +472,9 @@ def measure_plane_color(
 ) -> dict[str, float]:
     """Return the settings of the plane's color, sRGB, measured around the object.
 
-    The albedo is the median of the photograph there, divided by what a white plane
-    would show. Empty if the user stated a color, the scene has no plane, or the
-    photograph shows none of it.
+    The albedo is the median color of the photograph around the object, divided by the
+    color that a white plane would have there. The result is empty if the user has set
+    the color, the scene has no plane, or the photograph shows none of it.
 
     Args:
         description: the scene, with the camera of the full photograph.
@@ -488,8 +515,12 @@ def _look_up_levels(
 ) -> npt.NDArray[np.uint8]:
     """Return the levels (M, 3) of the pixels of a photograph that show points (N, 3).
 
-    The points are in world space; those outside of the photograph are left out, so that
-    M is at most N. The scene has the camera of the full photograph, not of a part.
+    Points outside of the photograph are left out, so that M is at most N.
+
+    Args:
+        description: the scene with the camera of the full photograph, not of a part.
+        photograph: the photograph.
+        points: (N, 3) in world space.
     """
     height, width = photograph.full_size
     camera = camera_to_world(description, width / height)
@@ -522,7 +553,7 @@ def make_matrix_camera(
         size: height and width in pixels of the photographs that it is for.
 
     Raises:
-        InputError: it is no such matrix.
+        InputError: it is not of the form [[fx, skew, cx], [0, fy, cy], [0, 0, 1]].
     """
     matrix = np.asarray(camera_matrix, np.float64)
     is_camera_matrix = (
@@ -562,6 +593,9 @@ def fit_to_photograph(
 ) -> AnyScene:
     """Return a scene with the camera of the part of a photograph that is used.
 
+    The color of the plane is measured as well, with the camera of the full photograph,
+    since points around the object may be outside of the part.
+
     Args:
         description: the scene, whose camera took the full photograph.
         photograph: photograph that it is rendered into.
@@ -578,6 +612,7 @@ def fit_to_photograph(
     full_aspect = full_width / full_height
     model = description.camera_model
     if model is not None:
+        # bundled models, such as the fisheye, depend on the shape of the image
         model = make_bundled_models(full_aspect).get(model.name, model)
         _check_camera_shape(photograph, model)
     uncropped = replace(description, camera_model=model)
@@ -598,9 +633,15 @@ def fit_to_photograph(
 def crop_camera(model: CameraModel, photograph: BackdropPhotograph) -> CameraModel:
     """Return the camera that sees the used part of a photograph.
 
-    Focal lengths, skew and center are fractions of the image's width or height, so that
-    they grow as the image shrinks; the center moves by the part's top left corner too.
-    `model` is the camera of the full photograph. Raises InputError: it is a panorama.
+    Focal lengths, skew and center are fractions of the image's width or height. Those
+    of a part are larger fractions, since the part is smaller. The center also moves by
+    the part's top left corner.
+
+    Args:
+        model: camera of the full photograph.
+        photograph: the photograph, with the part that is used.
+
+    Raises InputError: the camera is a panorama, which has no parts.
     """
     if model.kind == EQUIRECTANGULAR:
         raise InputError(
@@ -631,7 +672,8 @@ def _check_film(photograph: BackdropPhotograph, resolution: tuple[int, int]) -> 
     """
     height, width = photograph.size
     film_height, film_width = resolution
-    # pixels of the photograph in one of the film: what rounding to whole pixels explains
+    # A pixel of the film has that many pixels of the photograph: by so much the width
+    # may differ if the film's sides were rounded.
     rounding = max(width / film_width, height / film_height)
     if abs(film_width / film_height * height - width) <= rounding:
         return
@@ -654,7 +696,11 @@ def _check_film(photograph: BackdropPhotograph, resolution: tuple[int, int]) -> 
 
 
 def _check_gloss(description: SceneData) -> None:
-    """Raise InputError if a coat of the ground was requested that nothing would have."""
+    """Check that a gloss of the ground that the user requests has an effect.
+
+    Raises InputError: a roughness is given without a gloss, or a gloss without a plane
+    that could reflect the object.
+    """
     is_glossy = description.get_number("ground.gloss") > 0.0
     if "ground.roughness" in description.requested and not is_glossy:
         raise InputError(
@@ -675,7 +721,11 @@ def _check_gloss(description: SceneData) -> None:
 
 
 def _check_camera_shape(photograph: BackdropPhotograph, model: CameraModel) -> None:
-    """Raise InputError if a camera takes pictures of another shape."""
+    """Check that a photograph has the shape of its camera's pictures.
+
+    Raises InputError: their ratios of width and height differ by more than
+    `SHAPE_TOLERANCE`. A camera without a size fits any photograph.
+    """
     if model.size is None:
         return
     height, width = photograph.full_size
@@ -723,7 +773,7 @@ def compute_view_settings(
     mesh_to_camera = _check_and_map(asset, object_to_camera)
     vertices = asset.mesh.vertices.astype(np.float64)
     middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
-    # of the object, in the camera's coordinates: its z is the depth
+    # center of the object in the camera's coordinates; its z is the depth
     center = mesh_to_camera[:3, :3] @ middle + mesh_to_camera[:3, 3]
     distance = float(center[2])
     if distance <= 0.0:
@@ -741,7 +791,7 @@ def compute_view_settings(
         **_decompose_rotation(rotation),
         "pose.x": float(offset[0]),
         "pose.y": float(offset[1]),
-        # from where its lowest vertex would be at the height 0
+        # Without a shift the object stands with its lowest vertex at the height 0.
         "pose.z": float(offset[2] + middle[2]) + lowest,
         "ground.level": float(offset[2] + middle[2]) + lowest,
     }
@@ -767,9 +817,10 @@ def compute_mesh_to_camera(
     """Return the rigid map (4, 4) from a mesh to camera coordinates, in object sizes.
 
     Args:
-        file_to_mesh: (4, 4), see `ObjectAsset.file_to_mesh`.
+        file_to_mesh: (4, 4) from coordinates of the object's file to those of its mesh,
+            whose longest side is 1.
         pose: rigid (4, 4) from the file's coordinates to the camera's, in the file's
-            unit, hence the division by the size of the object in that unit.
+            unit. The result is divided by the object's size in that unit.
     """
     mesh_to_file = np.linalg.inv(file_to_mesh)
     # the scale of a map of uniform scale is the cube root of its determinant
@@ -783,8 +834,9 @@ def _compute_orbit(world_axes: Float64Array) -> dict[str, float]:
     """Return the settings of a camera on an orbit, by world axes (3, 3).
 
     The rows are the axes x, y and z of the world in the camera's coordinates (x right,
-    y down, z ahead). Angles in degrees. Raises InputError: it looks straight up or
-    down.
+    y down, z ahead). The angles are in degrees.
+
+    Raises InputError: the camera looks straight up or down.
     """
     # from the object to the camera, in the axes of the world: the camera looks along
     # its own z
@@ -796,7 +848,7 @@ def _compute_orbit(world_axes: Float64Array) -> dict[str, float]:
             f"{MAX_ELEVATION:g} degrees from level, which no camera does that orbits "
             "the object; give another `up`"
         )
-    # to the left and up of a camera without roll
+    # directions to the left and up of a camera without roll, in the world's axes
     level_left = np.array([outwards[1], -outwards[0], 0.0])
     level_left /= np.linalg.norm(level_left)
     upright = np.cross(-outwards, level_left)
@@ -810,7 +862,10 @@ def _compute_orbit(world_axes: Float64Array) -> dict[str, float]:
 
 
 def _check_rigid(pose: npt.ArrayLike) -> Float64Array:
-    """Return a pose (4, 4) as float64. Raises InputError: it is not rigid."""
+    """Return a pose (4, 4) as float64.
+
+    Raises InputError: it is not rigid, that is a rotation and a translation alone.
+    """
     matrix = np.asarray(pose, np.float64)
     is_rigid = (
         matrix.shape == (4, 4)
@@ -831,8 +886,12 @@ def _check_rigid(pose: npt.ArrayLike) -> Float64Array:
 def _make_world_axes(up: Float64Array) -> Float64Array:
     """Return world axes (3, 3), rows in camera coordinates, with z along `up`.
 
-    +x points from the object to the camera as far as that is level. `up` is a direction
-    (3,) in camera coordinates: x to the right, y down, z ahead.
+    +x is the level part of the direction from the object to the camera.
+
+    Args:
+        up: (3,) direction in camera coordinates: x to the right, y down, z ahead.
+
+    Raises InputError: it is no direction.
     """
     if up.shape != (3,) or not np.isfinite(up).all() or not up.any():
         raise InputError(f"up: expected a direction of three numbers, got {up!r}")
@@ -849,14 +908,15 @@ def _make_world_axes(up: Float64Array) -> Float64Array:
 def _decompose_rotation(rotation: Float64Array) -> dict[str, float]:
     """Return the settings that make a rotation (3, 3), degrees.
 
-    It is taken apart as `Rz(yaw) Ry(pitch) Rx(roll)`.
+    The rotation is `Rz(yaw) Ry(pitch) Rx(roll)`.
     """
     # the entry (2, 0) is -sin pitch; (0, 0), (1, 0) and (2, 1), (2, 2) are cosines and
     # sines of yaw and roll times cos pitch
     pitch = math.asin(min(max(-float(rotation[2, 0]), -1.0), 1.0))
     yaw = math.atan2(rotation[1, 0], rotation[0, 0])
     roll = math.atan2(rotation[2, 1], rotation[2, 2])
-    # At a pitch of 90 degrees yaw and roll turn about one axis: all goes to the yaw.
+    # At a pitch of 90 degrees yaw and roll are about the same axis, and only their sum
+    # or difference is known: the roll is set to 0.
     if abs(rotation[2, 0]) > 1.0 - 1e-9:
         yaw = math.atan2(-rotation[0, 1], rotation[1, 1])
         roll = 0.0

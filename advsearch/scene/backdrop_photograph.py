@@ -71,9 +71,12 @@ class BackdropPhotograph:
     def resample_depth(self, resolution: tuple[int, int]) -> Tensor | None:
         """Return the depth (H S, W S) float32 in metres at S x S points of each pixel.
 
-        S is how many pixels of the depth a pixel has along a side, so that edges are
-        followed, within `MIN_DEPTH_POINTS` and `MAX_DEPTH_POINTS`. None if there is no
-        depth.
+        So edges of the depth are followed inside a pixel. S is the number of pixels of
+        the depth along a side of a pixel of the image, cut to `MIN_DEPTH_POINTS` and
+        `MAX_DEPTH_POINTS`. The result is None if the photograph has no depth.
+
+        Args:
+            resolution: height and width of the image in pixels.
         """
         if self.depth is None:
             return None
@@ -120,8 +123,12 @@ class BackdropPhotograph:
 def _resample_image(image: Float32Array, resolution: tuple[int, int]) -> Tensor:
     """Resample an image (H, W, C) to (height, width) pixels.
 
-    Along an axis with more pixels it is averaged down, along one with fewer it is then
-    interpolated.
+    Each axis is treated by itself: one with too many pixels is averaged down, and one
+    with too few is interpolated.
+
+    Args:
+        image: (H, W, C).
+        resolution: height and width of the result in pixels.
     """
     height, width = image.shape[:2]
     averaged = average_area(

@@ -169,12 +169,13 @@ def translate_entries(
 ) -> dict[str, Any] | None:
     """Translate the entries of one camera to those of OpenCV's files.
 
-    The tool is found by its entries: ORB-SLAM, KITTI, OpenSfM, stella_vslam, RealSense
-    or Metashape. The last three have one camera only, which has no name.
+    The names of the entries tell which tool wrote the file: ORB-SLAM, KITTI, OpenSfM,
+    stella_vslam, RealSense or Metashape. Files of the last three have one camera only,
+    which has no name.
 
     Args:
         path: the file.
-        camera_name: the name of the camera, "" if none is named.
+        camera_name: the name of the camera; "" if the user has not named one.
         data: all entries of the file.
 
     Returns:
@@ -196,6 +197,7 @@ def translate_entries(
         for entry in data.values()
     ):
         return _translate_opensfm(path, select_camera(path, camera_name, data))
+    # the other tools write a single camera, which has no name
     if camera_name:
         return None
     stella_camera = data.get("Camera")
@@ -237,7 +239,7 @@ def _translate_orbslam(
         path: the file, for messages.
         camera_name: "" if none is named.
         data: all entries of the file.
-        cameras: names of its cameras: what stands before the dot.
+        cameras: names of its cameras, the part before the dot, such as "Camera1".
     """
     camera_group = select_camera(
         path, camera_name, dict(zip(cameras, cameras, strict=True))
@@ -301,15 +303,16 @@ def _translate_kitti(
 ) -> dict[str, Any]:
     """Translate a camera of KITTI: a raw one with distortion, or a rectified one.
 
-    A raw one has K_nn (3, 3), D_nn (5 coefficients) and S_nn (the size of the image).
-    A rectified one has P_rect_nn or Pn, a projection (3, 4) without distortion, and
-    perhaps S_rect_nn. Other entries of KITTI are left out.
+    A raw camera has K_nn (3, 3), D_nn (5 coefficients) and S_nn (the size of the
+    image), where nn is its number. A rectified camera has P_rect_nn or Pn, a projection
+    (3, 4) without distortion, and perhaps S_rect_nn. Other entries of KITTI are left
+    out.
 
     Args:
         path: the file, for messages.
         camera_name: "" if none is named.
         data: all entries of the file.
-        cameras: names of the matrices of its cameras, by the cameras' names.
+        cameras: for each name of a camera the name of its matrix, such as "P_rect_02".
 
     Raises:
         FileFormatError: the file has no size of the image, or numbers are missing.
@@ -327,8 +330,8 @@ def _translate_kitti(
             path, data, f"D_{raw_match[1]}", 5
         )
     else:
-        # a rectified camera: K [R | t] with R = 1, so that the first three columns are
-        # K
+        # The projection is K [R | t]. A rectified camera has R = 1, so that the first
+        # three columns are K.
         rows = _read_numbers(path, data, matrix_name, 12)
         entries["camera_matrix"] = [*rows[0:3], *rows[4:7], *rows[8:11]]
     size_name = re.sub(r"^[KP]_", "S_", matrix_name)
@@ -346,8 +349,8 @@ def _translate_kitti(
 def _translate_realsense(data: Mapping[str, Any]) -> dict[str, Any]:
     """Translate the intrinsics of RealSense.
 
-    Two models that we do not have count as "none" where all coefficients are 0: there
-    they are the same as a pinhole.
+    Two of its models are not supported. If all their coefficients are 0 they are the
+    same as a pinhole, and are translated to "none".
     """
     entries = {REALSENSE_NAMES.get(name, name): value for name, value in data.items()}
     kind = re.sub(
@@ -372,8 +375,12 @@ def _translate_realsense(data: Mapping[str, Any]) -> dict[str, Any]:
 def _translate_opensfm(path: str, camera: Mapping[str, Any]) -> dict[str, Any]:
     """Translate a camera of OpenSfM, whose lengths are fractions of the larger side.
 
-    For a camera of an unknown kind, or a panorama, no lengths are translated. `path` is
-    the file, for messages.
+    Lengths of a panorama are not needed, and those of an unknown kind are not
+    translated, since the camera is rejected later.
+
+    Args:
+        path: the file, for messages.
+        camera: entries of the camera.
     """
     stated_type = str(camera["projection_type"])
     kind = OPENSFM_KINDS.get(stated_type)  # None if it is unknown
@@ -408,7 +415,7 @@ def _scale_opensfm_lengths(
         path: the file, for messages.
         camera: the camera's entries, in which lengths are fractions of the larger side.
         width: width of the image in pixels.
-        height: likewise.
+        height: height of the image in pixels.
     """
     focal_x = parse_number(path, "focal_x", camera.get("focal_x", camera.get("focal")))
     focal_y = parse_number(path, "focal_y", camera.get("focal_y", focal_x))
@@ -426,12 +433,12 @@ def _scale_opensfm_lengths(
 def _translate_metashape(path: str, data: Mapping[str, Any]) -> dict[str, Any]:
     """Translate a camera of Agisoft Metashape (manual, appendix "Camera models").
 
-    p1 and p2 are swapped against OpenCV. k4 is the fourth coefficient of the radial
-    polynomial, which only a fisheye of OpenCV has.
+    Metashape's p1 is OpenCV's p2, and the other way round. k4 is the fourth coefficient
+    of the radial polynomial. OpenCV has such a term only for a fisheye.
 
     Args:
         path: the file, for messages.
-        data: its entries; those of numbers are 0 if they are missing.
+        data: entries of the file; a number that is missing is 0.
 
     Raises:
         FileFormatError: it has a k4 and is no fisheye, or no size.

@@ -101,10 +101,10 @@ class Entries:
         """Return a finite number, or a default if there is no such entry.
 
         Args:
-            name: the entry.
-            default: the default; None if the entry is required.
-            aliases: plain names for the entry, see `normalize_key`, if there are
-                several; otherwise that of `name`.
+            name: name of the entry.
+            default: value if there is no such entry; None if the entry is required.
+            aliases: other names for the entry, as `normalize_key` writes them; by
+                default the entry has one name.
 
         Raises:
             FileFormatError: it is no number, or is required and missing.
@@ -127,6 +127,7 @@ class Entries:
         Raises:
             FileFormatError: it has another length, or other values.
         """
+        # OpenCV writes a matrix as a mapping; keys that are not of its format are noted
         if isinstance(entry, Mapping):
             self._unread_matrix_keys += [
                 f"{name}.{key}" for key in entry if key not in MATRIX_KEYS
@@ -142,11 +143,12 @@ class Entries:
         return [parse_number(self.path, name, value) for value in values]
 
     def find_unread(self, prefix: str = "") -> list[str]:
-        """Return the entries that were not read and need a note, as the file spells
-        them.
+        """Return the names of entries that were not read and need a note.
+
+        They are spelled as in the file. Entries that change nothing need no note.
 
         Args:
-            prefix: name, with a dot, of the entry that all of these stand in.
+            prefix: for entries inside another one, its name with a dot, such as "roi.".
 
         Raises:
             FileFormatError: one of them changes the image.
@@ -186,7 +188,7 @@ class Entries:
 
 
 def select_camera(path: str, camera_name: str, cameras: Mapping[str, Any]) -> Any:
-    """Return the camera of a name out of those of a file, or the only one.
+    """Return the camera that is named, or the only one of a file.
 
     Args:
         path: the file, for messages.
@@ -216,9 +218,9 @@ def select_camera(path: str, camera_name: str, cameras: Mapping[str, Any]) -> An
 
 
 def is_neutral(value: object) -> bool:
-    """Return whether an entry changes nothing: it is zero, empty or none.
+    """Return whether an entry changes nothing: it is zero, empty, false or "none".
 
-    Of a matrix, a list or a mapping all values have to be.
+    A matrix, a list or a mapping is neutral if all of its values are.
     """
     if isinstance(value, Mapping):
         # a matrix has its numbers as `data`
@@ -269,8 +271,8 @@ def add_notes(
 
     Args:
         model: the model.
-        unread_keys: entries of the camera.
-        rectified_keys: entries about rectified images.
+        unread_keys: names of entries that were not read.
+        rectified_keys: names of entries about rectified images, which were not read.
     """
     unread = [f"{join_names(unread_keys)}."] if unread_keys else []
     if rectified_keys:
@@ -293,16 +295,17 @@ def make_camera_model(
 ) -> CameraModel:
     """Make a camera model of numbers in pixels.
 
-    A panorama has the numbers of its size, whatever the file has. Lengths along x are
-    stored in image widths, those along y in heights.
+    The model stores lengths along x in widths of the image, and those along y in
+    heights. The numbers of a panorama follow from its size, whatever the file has.
 
     Args:
         spec: the file, and perhaps the camera in it.
         kind: the kind of model.
         size: height and width of the image.
         pixel_values: numbers by their names in `NUMBER_NAMES`; 0 by default.
-        pixel_offset: coordinate that the file's principal point needs added to count
-            from the corner of the image.
+        pixel_offset: coordinate of the image's corner in the file, with the sign
+            reversed: 0.5 if the file counts from the center of the first pixel. It is
+            added to the principal point.
 
     Raises:
         FileFormatError: no camera has such numbers.
@@ -338,8 +341,15 @@ def _check_numbers(
 ) -> None:
     """Raise FileFormatError if numbers in pixels are those of no camera.
 
-    Focal lengths within a factor of a thousand of the image's sides, a principal point
-    inside of the image, a skew up to fx, and coefficients up to `MAX_COEFFICIENT`.
+    Focal lengths have to be within a factor of `MAX_FOCAL_RATIO` of the image's sides,
+    the principal point inside of the image, the skew at most fx, and coefficients at
+    most `MAX_COEFFICIENT`, without their sign.
+
+    Args:
+        path: the file, for messages.
+        value_by_name: numbers by their names in `NUMBER_NAMES`.
+        width: width of the image in pixels.
+        height: height of the image in pixels.
     """
 
     def check(name: str, is_valid: bool, expected: str, hint: str = "") -> None:

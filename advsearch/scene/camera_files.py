@@ -170,17 +170,17 @@ def _list_lines(text: str) -> list[str]:
 def read_camera(spec: str) -> CameraModel:
     """Read a camera's model from a file.
 
-    The format is found by the content: COLMAP's text, a dialect of another tool,
-    nerfstudio, Kalibr with several cameras or one, or OpenCV and ROS.
+    The content tells the format: COLMAP's text, files of OpenCV, ROS, Kalibr,
+    nerfstudio, and of some other tools.
 
     Args:
-        spec: the file; of several cameras in it, that which is named, as in
-            ``camchain.yaml#cam1`` and ``cameras.txt#3``.
+        spec: the file. If it has several cameras, one is named behind a #:
+            ``camchain.yaml#cam1``, ``cameras.txt#3``.
 
     Raises:
-        FileFormatError: the file is missing, is of no known kind, has a model that is
-            not one of ours, numbers that no camera has, or an entry that changes the
-            image and is not read.
+        FileFormatError: the file is missing or of no known format; its projection is
+            not supported; it has numbers that no camera has; or an entry changes the
+            image, but is not supported.
     """
     path, _, camera_name = spec.partition("#")
     text = _read_camera_text(path)
@@ -192,14 +192,16 @@ def read_camera(spec: str) -> CameraModel:
 
 
 def make_camera(spec: str, entries: Mapping[str, Any]) -> CameraModel:
-    """Return the camera's model that the entries of a file describe.
+    """Return the camera model that the entries of a file describe.
 
     Args:
-        spec: as for `read_camera`; the file is not read.
-        entries: what is in the file, by name.
+        spec: path of the file, with the name of one of its cameras behind a #:
+            ``calib.yaml#cam1``. It is used for messages and names; nothing is read.
+        entries: contents of the file, by name.
 
     Raises:
-        FileFormatError: as for `read_camera`.
+        FileFormatError: the projection is another one, numbers are missing or those of
+            no camera, or the camera that is named is not there.
     """
     path, _, camera_name = spec.partition("#")
     data = {name: value for name, value in entries.items() if name not in VIEW_KEYS}
@@ -261,7 +263,8 @@ def _read_camera_text(path: str) -> str:
 def _flatten_groups(data: Mapping[str, Any]) -> dict[str, Any]:
     """Return entries with those of camodocal's groups on the top level.
 
-    The numbers of its fisheye lens get the names that other programs give them.
+    {"projection_parameters": {"fx": 400}} becomes {"fx": 400}. The numbers of its
+    fisheye lens (mu, mv, u0, v0) get the names that other programs use.
     """
     groups = {
         name: data[name]
@@ -280,8 +283,9 @@ def _flatten_groups(data: Mapping[str, Any]) -> dict[str, Any]:
 def _parse_file(path: str, text: str) -> dict[str, Any]:
     """Parse a camera file that is XML, JSON or YAML.
 
-    Of a YAML file with several documents the first counts. Raises FileFormatError if it
-    is no mapping of names.
+    If a YAML file has several documents, the first one counts.
+
+    Raises FileFormatError: it cannot be parsed, or is no mapping of names.
     """
     if text.lstrip().startswith("<"):
         return _parse_xml(path, text)
@@ -306,8 +310,11 @@ def _parse_file(path: str, text: str) -> dict[str, Any]:
 def _parse_xml(path: str, text: str) -> dict[str, Any]:
     """Parse a camera of OpenCV or Metashape in XML.
 
-    A matrix becomes the list of its words, an element with others in it a dictionary,
-    and any other its text. Raises FileFormatError for other XML.
+    An element with `data` is a matrix, and becomes the list of its words. Another
+    element with elements in it becomes a dictionary, and any other its text.
+
+    Raises FileFormatError: it is no XML of these two, or declares entities, by which a
+    small file could become very large.
     """
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise FileFormatError(
@@ -340,8 +347,14 @@ def _read_colmap(
 ) -> CameraModel:
     """Return the model of a camera of COLMAP's cameras.txt.
 
-    A line has CAMERA_ID, MODEL, WIDTH, HEIGHT and the model's parameters; one focal
-    length stands for both.
+    A line has CAMERA_ID, MODEL, WIDTH, HEIGHT and the model's parameters. Some models
+    have one focal length f for both axes.
+
+    Args:
+        spec: the file, and perhaps the camera in it.
+        path: the file, for messages.
+        camera_name: its CAMERA_ID; "" if the user has not named one.
+        lines: the lines of the file without comments.
     """
     words_by_id = {line.split()[0]: line.split() for line in lines if line.split()}
     if len(words_by_id) < len(lines):
@@ -380,8 +393,13 @@ def _read_nerfstudio(
 ) -> CameraModel:
     """Return the model of a transforms.json, or of one of its frames.
 
-    Entries of the frame win over those of all; the principal point is the center by
-    default.
+    An entry of the frame replaces the entry of the same name that holds for all frames.
+    A principal point that is missing is the center of the image.
+
+    Args:
+        spec: the file, and perhaps the frame in it.
+        camera_name: name of the frame; "" if the user has not named one.
+        data: all entries of the file.
     """
     path = spec.partition("#")[0]
     frames = _list_frames(data)
@@ -448,14 +466,14 @@ def _read_focal_lengths(
 ) -> dict[str, float]:
     """Return fx and fy in pixels, from lengths or from angles of view.
 
-    A length wins over an angle. fy is fx where the file has neither for y.
+    If the file has both, the length counts. If it has neither for y, fy is fx.
 
     Args:
         path: the file, for messages.
         data: all entries of the file, which may have the angles, radians.
-        entries: those of the camera, which may have the lengths.
+        entries: entries of the camera, which may have the lengths.
         width: width of the image in pixels.
-        height: likewise.
+        height: height of the image in pixels.
 
     Raises:
         FileFormatError: length and angle along x contradict each other, or both are
@@ -521,11 +539,11 @@ def _read_kalibr(
 
     Args:
         spec: the file, and perhaps the camera in it.
-        entries: those of the camera.
-        unread: further entries of the file that are to be noted.
+        entries: entries of the camera.
+        unread: other entries of the file that were not read: the user gets a note.
 
     Raises:
-        FileFormatError: it is no pinhole, or lacks numbers.
+        FileFormatError: the camera is no pinhole, or numbers are missing.
     """
     path = entries.path
     model = str(entries.get("cameramodel") or "pinhole")
@@ -553,10 +571,15 @@ def _read_kalibr(
 def _read_opencv(spec: str, entries: Entries) -> CameraModel:
     """Return the model of a camera of OpenCV or ROS.
 
-    The calibration is of the sensor's pixels; ROS may bin several of them into one
-    pixel of the image, and the model has the size of that image. A tilted sensor is
-    rejected, a region of interest too. `spec` is the file, and perhaps the camera in
-    it.
+    The calibration is of the sensor's pixels. ROS may bin several of them into one
+    pixel of the image; the model has the size of that image.
+
+    Args:
+        spec: the file, and perhaps the camera in it.
+        entries: entries of the camera.
+
+    Raises FileFormatError: the sensor is tilted, images are of a region of interest, or
+    numbers are missing.
     """
     path = entries.path
     kind = _find_opencv_kind(path, entries)
@@ -598,8 +621,8 @@ def _find_opencv_kind(path: str, entries: Entries) -> str:
 def _read_camera_matrix(path: str, entries: Entries) -> list[float]:
     """Return the camera matrix, nine numbers row by row.
 
-    It is made of fx, fy, cx and cy if only these are there. One that is written column
-    by column, with cx and cy in its last row, is transposed.
+    If the file has only fx, fy, cx and cy, the matrix is made of them. Some tools write
+    it column by column, with cx and cy in the last row: then it is transposed.
 
     Raises:
         FileFormatError: it is missing, all zeros, or no camera matrix.
@@ -617,7 +640,7 @@ def _read_camera_matrix(path: str, entries: Entries) -> list[float]:
             "as ROS says of one that is not calibrated; calibrate it, and give the "
             "file that this writes"
         )
-    # skew, cx and cy are 0, and the last row is not
+    # Written by columns, the skew, cx and cy are where a camera matrix has zeros.
     is_by_columns = not any(matrix[index] for index in (1, 2, 5)) and any(matrix[6:8])
     if is_by_columns:  # as Open3D and ARKit write it
         matrix = [matrix[3 * column + row] for row in range(3) for column in range(3)]
@@ -641,9 +664,13 @@ def _read_distortion(
     """Return the distortion coefficients, from a list or from single entries.
 
     Args:
-        entries: those of the camera.
-        names: the coefficients in the order of the list.
+        entries: entries of the camera.
+        names: names of the coefficients, in the order of the list.
         counts: the lengths that the list may have.
+
+    Raises:
+        FileFormatError: the list has another length, or there are coefficients though
+            the model is "none".
     """
     distortion = entries.get(*DISTORTION_KEYS)
     # a matrix (a mapping) is a list even if it is all zeros
@@ -691,8 +718,12 @@ def _read_optional_numbers(entries: Entries, names: Sequence[str]) -> dict[str, 
 def _find_rectified(entries: Entries, matrix: Sequence[float]) -> list[str]:
     """Return the names of matrices of rectified images that differ from the camera's.
 
-    Such a matrix changes nothing if its rotation is 1, or if its projection is the
-    camera matrix beside a column of zeros. `matrix` is the camera's, row by row.
+    A rectification matrix changes nothing if it is the identity. A projection changes
+    nothing if it is the camera matrix and a column of zeros.
+
+    Args:
+        entries: entries of the camera.
+        matrix: the camera matrix, nine numbers row by row.
     """
     fx, skew, cx, _, fy, cy = matrix[:6]
     differing_names = []
@@ -715,7 +746,11 @@ def _find_rectified(entries: Entries, matrix: Sequence[float]) -> list[str]:
 def _check_roi(entries: Entries, size: tuple[float, float]) -> list[str]:
     """Check that a region of interest of ROS is the full image.
 
-    Zeros mean the full image too. `size` is its height and width in pixels.
+    ROS writes zeros for the full image.
+
+    Args:
+        entries: entries of the camera.
+        size: height and width of the image in pixels.
 
     Returns:
         The entries of the region that were not read.

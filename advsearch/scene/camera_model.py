@@ -104,9 +104,10 @@ class CameraModel:
         """Project points (N, 3), to the right, down and ahead, to the image.
 
         Returns:
-            Coordinates (N, 2) float64 in image widths and heights, which may be outside
-            of the image; and which points are visible, (N,) bool: those behind a lens,
-            or beyond the angle at which it folds, are not.
+            Coordinates (N, 2) float64 in image widths and heights, (0, 0) at the top
+            left; they may be outside of the image. And (N,) bool, which points are
+            visible: those behind a lens, or beyond the angle at which it folds, are
+            not.
         """
         x, y, z = points.double().unbind(dim=-1)
         if self.kind == EQUIRECTANGULAR:
@@ -146,8 +147,9 @@ class CameraModel:
     def compute_rays(self, image_points: Tensor) -> tuple[Tensor, Tensor]:
         """Return the rays of image coordinates (N, 2).
 
-        The distortion is inverted step by step. Coordinates whose inversion has not
-        converged, before the angle at which the lens folds, are outside of the view.
+        The distortion is inverted by iteration. If that does not converge to a
+        direction within the angle at which the lens folds, the coordinates are outside
+        of the view.
 
         Returns:
             Directions (N, 3) float64, unit vectors for a fisheye and a panorama, else
@@ -163,14 +165,19 @@ class CameraModel:
         return self._compute_perspective_rays(distorted)
 
     def _compute_fisheye_rays(self, distorted: Tensor) -> tuple[Tensor, Tensor]:
-        """Return unit directions and margins of distorted points, see `compute_rays`.
+        """Return the rays of a fisheye for distorted points.
 
-        The points (N, 2) are in focal lengths.
+        Args:
+            distorted: (N, 2) points in focal lengths from the optical axis.
+
+        Returns:
+            Unit directions (N, 3), and a margin (N,) that is positive inside the view.
         """
         radius = distorted.norm(dim=-1)
         # 0 for the center, which has no direction
         radial_direction = distorted / radius.clamp_min(1e-300)[..., None]
-        # beyond the circle of the image too, so that the margin changes sign there
+        # Angles beyond the circle of the image are solved for too, so that the margin
+        # changes its sign at the circle.
         angle, converged = self._invert_radial(radius, min(self.fold_angle, math.pi))
         directions = torch.cat(
             [radial_direction * angle.sin()[..., None], angle.cos()[..., None]], dim=-1
@@ -181,9 +188,14 @@ class CameraModel:
     def _compute_perspective_rays(self, distorted: Tensor) -> tuple[Tensor, Tensor]:
         """Return directions with z = 1 and margins of distorted points.
 
-        The points (N, 2) are in focal lengths; for the result see `compute_rays`. The
-        radial distortion is inverted first; with decentering, an inversion in two
-        dimensions starts from there.
+        First the radial distortion is inverted. If the lens also has decentering, that
+        solution is the start of an inversion in two dimensions.
+
+        Args:
+            distorted: (N, 2) points in focal lengths from the optical axis.
+
+        Returns:
+            Directions (N, 3), and a margin (N,) that is positive inside the view.
         """
         radius = distorted.norm(dim=-1)
         # 0 for the center, which has no direction
@@ -233,9 +245,9 @@ class CameraModel:
     def _invert_radial(self, target: Tensor, max_value: float) -> tuple[Tensor, Tensor]:
         """Solve radial(x) = target for x within [0, max_value], where radial grows.
 
-        By Newton's method. Each solution has a bracket, two bounds between which it
-        lies, and which every step narrows; a step that would leave the bracket is
-        replaced by its middle.
+        The method is Newton's, guarded by bisection. Two bounds enclose each solution,
+        and every step narrows them. A step that would leave the bounds goes to their
+        middle instead.
 
         Args:
             target: (N,) distorted radii.
@@ -262,7 +274,8 @@ class CameraModel:
             is_within = (newton_radius > lower) & (newton_radius < upper)
             radius = torch.where(is_within, newton_radius, (lower + upper) / 2.0)
         residual = (self._distort_radius(radius) - target).abs()
-        # 1e3: a solution whose bracket was narrow has a larger residual
+        # A solution may also have been accepted because its bounds were close to each
+        # other. Its residual may be larger, hence the factor of 1e3.
         return radius, residual <= 1e3 * TOLERANCE * (1.0 + target)
 
     def _find_upper_bound(self, target: Tensor, max_value: float) -> float:
@@ -286,12 +299,12 @@ class CameraModel:
     ) -> tuple[Tensor, Tensor]:
         """Solve distort(x) = distorted for points x by Newton's method.
 
-        A step that leaves the circle of `max_radius` ends at its border, and one that
+        A step that leaves the circle of `max_radius` is cut at the circle, and one that
         is not finite is not taken.
 
         Args:
-            undistorted: (N, 2) where it starts.
-            distorted: (N, 2).
+            undistorted: (N, 2) points at which the iteration starts.
+            distorted: (N, 2) distorted points to which solutions are searched.
             max_radius: largest radius of a solution.
 
         Returns:
@@ -302,7 +315,8 @@ class CameraModel:
             values, jacobian_rows = _evaluate_with_jacobian(self._distort, undistorted)
             residual = values - distorted
             step, determinant = _solve_two_by_two(jacobian_rows, residual)
-            # the determinant of the distortion's derivative is 0 where the lens folds
+            # Where the determinant of the distortion's derivative is 0 the lens folds:
+            # beyond, two points have the same image. Such solutions do not count.
             is_inside = (determinant > 0.0) & (undistorted.norm(dim=-1) < max_radius)
             converged = is_inside & (
                 residual.norm(dim=-1) <= TOLERANCE * (1.0 + distorted.norm(dim=-1))
@@ -334,12 +348,12 @@ class CameraModel:
     def fold_angle(self) -> float:
         """Angle to the axis, radians, at which the radial distortion turns back.
 
-        It is infinite if it never does. Beyond it two directions have one image point,
-        so that no image tells them apart.
+        Beyond it the image point moves back towards the center, so that two directions
+        have the same image point. It is infinite if that never happens.
         """
         # radial(r) = r n(s) / d(s) with s = r^2. The numerator of its derivative, as a
-        # polynomial in s, is (n + 2 s n') d - 2 s n d'. It folds at the smallest root
-        # of that, or at a pole.
+        # polynomial in s, is (n + 2 s n') d - 2 s n d'. The lens folds at the smallest
+        # positive root of that, or at a pole, a root of d.
         numerator, denominator = self._polynomials
         double_square = Polynomial([0.0, 2.0])  # 2 r^2
         slope = (
@@ -401,11 +415,12 @@ class CameraModel:
 
     @cached_property
     def visible_tangents(self) -> tuple[float, float]:
-        """Half the sides, as tangents, of a rectangle around the axis inside the image.
+        """Half width and half height, as tangents, of a rectangle inside the image.
 
-        It is the rectangle of `_compute_edge_tangents`, shrunk in steps of 2 % until
-        all of its border is visible and in the image; if it never is, 2 % of it. A lens
-        bends the border, so that the corners may be outside at first.
+        The rectangle is centered on the optical axis. It reaches the image's edges, and
+        is then shrunk in steps of 2 % until all of its border is in the image: a lens
+        bends the border, so that the corners may be outside. If no step suffices, 2 %
+        of the size remain.
         """
         edges = self._compute_edge_tangents()
         # 17 points on each side of the rectangle
@@ -458,7 +473,8 @@ class CameraModel:
             float(center[0, axis]), border, BORDER_POINTS, dtype=torch.float64
         )
         directions, margin = self.compute_rays(line_points)
-        # 0.1: rays almost aside, at more than about 84 degrees, do not count
+        # A z of 0.1 is at about 84 degrees from the axis: rays farther out do not
+        # count, since their tangents would be huge.
         is_visible = (margin > 0.0) & (directions[:, 2] > 0.1)
         tangents = directions[:, axis].abs() / directions[:, 2].clamp_min(0.1)
         return float(
@@ -475,7 +491,11 @@ class CameraModel:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a user should know about the camera, in sentences."""
+        """Notes for the user, as sentences.
+
+        They are about entries of the file that were not read, and about a part of the
+        image that the lens leaves black.
+        """
         if self.black_fraction == 0.0:
             return self.reading_notes
         name = self.name or "the lens"
@@ -490,9 +510,13 @@ class CameraModel:
         return (*self.reading_notes, sentence)
 
     def describe_scaling(self, resolution: tuple[int, int]) -> tuple[str, ...]:
-        """Return a note if an image has another size (height, width) than the model.
+        """Return a note if an image has another size than the camera's pictures.
 
-        It says so too if the sizes differ in shape, by more than half a percent.
+        If their shapes differ by more than half a percent, the note has the stretch
+        too.
+
+        Args:
+            resolution: height and width of the image in pixels.
         """
         if self.size is None or self.size == resolution:
             return ()
@@ -553,8 +577,8 @@ def _solve_two_by_two(rows: Sequence[Tensor], right: Tensor) -> tuple[Tensor, Te
     """Solve N linear systems of two equations by Cramer's rule.
 
     Args:
-        rows: the two rows (N, 2) of the matrices.
-        right: (N, 2), their right-hand sides.
+        rows: the first and the second row of the matrices, each (N, 2).
+        right: (N, 2) right-hand sides.
 
     Returns:
         The solutions (N, 2), large where a matrix is nearly singular; and the
@@ -611,8 +635,8 @@ def _evaluate_with_jacobian(
 ) -> tuple[Tensor, list[Tensor]]:
     """Evaluate a function that maps each of N points separately, and differentiate it.
 
-    As no value depends on another point, the derivative of the sum over all points has
-    the derivative of each.
+    No value depends on another point. So one derivative of the sum over all points has
+    the derivatives of all.
 
     Args:
         function: function from points to values (N, k).

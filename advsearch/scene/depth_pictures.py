@@ -53,7 +53,7 @@ def read_depth(spec: str | Path) -> Float32Array:
             of its levels in metres behind its name, ``depth.png#0.001``.
 
     Returns:
-        (H, W) metres along the camera's axis; infinite where it is not known.
+        (H, W) float32 metres along the camera's axis; infinite where not known.
 
     Raises:
         FileFormatError: the file is missing, too large, corrupt, has several different
@@ -97,7 +97,14 @@ def _read_channels(path: Path) -> np.ndarray:
 
 
 def _read_array(path: Path) -> np.ndarray:
-    """Return the numbers (H, W) of an .npy file, whose size is checked before."""
+    """Return the numbers (H, W) of an .npy file.
+
+    The header is read by itself, so that shape, type and length are checked before any
+    memory is taken for the numbers, and pickled objects are never loaded.
+
+    Raises FileFormatError: it is no array of two axes of numbers, is too large, or does
+    not have the length that its header states.
+    """
     data = read_existing_bytes(path, EXPECTED, LARGEST_FILE)
     stream = io.BytesIO(data)
     try:

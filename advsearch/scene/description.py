@@ -119,7 +119,10 @@ class SceneDescription(SceneData):
     photographs: PhotographFolder | None = None
 
     def with_part(self, part: ScenePart) -> SceneDescription:
-        """Return the scene with one more part. Raises InputError: its name is taken."""
+        """Return the scene with one more part, such as a lamp that a control adds.
+
+        Raises InputError: the scene has a part of that name.
+        """
         part_by_name = {existing.name: existing for existing in self.parts}
         if part.name in (OBJECT, "environment", "ground", "camera", *part_by_name):
             is_plugin = isinstance(part_by_name.get(part.name), PluginPart)
@@ -158,14 +161,16 @@ class SceneDescription(SceneData):
     ) -> SceneDescription:
         """Return the scene as it is rendered into a photograph.
 
-        The camera of the scene is the one that took it. It hides the environment, which
-        keeps lighting the object, and the ground is a plane that takes the shadow.
+        The camera of the scene is the one that took the photograph. The photograph is
+        seen in place of the environment, which still lights the object, and the ground
+        is a plane of which only the shadow on it is seen.
 
         Args:
             photograph: a picture file; with the part to use behind its name,
                 ``photo.jpg#X,Y,WIDTH,HEIGHT`` in pixels from the top left corner.
-            occluder: a mask of the photograph's size, white where it shows what is
-                before the object; or its depth (`advsearch.scene.depth_pictures`).
+            occluder: a mask of the photograph's size, white where something is in front
+                of the object; or a picture of the photograph's depth
+                (`advsearch.scene.depth_pictures`).
 
         Raises:
             FileFormatError: the file can not be used.
@@ -186,9 +191,10 @@ class SceneDescription(SceneData):
         return with_requested_ground(scene)
 
     def _check_backdrop(self, photograph: BackdropPhotograph) -> None:
-        """Check that nothing that was requested contradicts a photograph as backdrop.
+        """Check that no setting contradicts a photograph as backdrop.
 
-        Raises InputError: a ground other than the plane, a rig, or drops on the lens.
+        Raises InputError: the user requests a ground other than the plane, several
+        cameras (a rig), or drops on the lens.
         """
         other_grounds = sorted(
             name
@@ -220,19 +226,23 @@ class SceneDescription(SceneData):
         object_to_camera: npt.ArrayLike,
         up: npt.ArrayLike | None = None,
     ) -> SceneDescription:
-        """Return the scene as the camera of its photograph was measured to see it.
+        """Return the scene with a measured camera and pose of the object.
 
-        Where the photograph shows the object itself, its shadow is in it already: leave
-        the plane out (``ground.size`` 0).
+        They are those of the photograph that the scene is rendered into. If it shows
+        the object itself, the object's shadow is in it already: then set
+        ``ground.size`` to 0, which leaves the plane out.
 
         Args:
             camera_matrix: intrinsics (3, 3) of the full photograph, in pixels, as
                 OpenCV has them.
-            object_to_camera, up: as for `backdrop.compute_view_settings`.
+            object_to_camera: rigid (4, 4) from coordinates of the object's file to
+                those of the camera: x right, y down, z ahead, in the file's unit.
+            up: (3,) direction in the camera's coordinates that is up in the world;
+                None: the object stands upright.
 
         Raises:
-            InputError: it is rendered into no photograph; or as for
-                `backdrop.compute_view_settings`.
+            InputError: the scene has no photograph; the object's file or size is not
+                known; or the pose is not rigid or puts the object behind the camera.
         """
         if self.backdrop_photograph is None:
             raise InputError(
@@ -254,8 +264,8 @@ class SceneDescription(SceneData):
     ) -> SceneDescription:
         """Return the scene as the camera of one of many photographs sees it.
 
-        The world of the camera file, with z up and in metres, is that of the scene: the
-        object stands at its origin until its pose is set.
+        The world of the camera file (z up, in metres) becomes that of the scene, with
+        the object at its origin until its pose is set.
 
         Args:
             photograph_cameras: cameras of many photographs.
@@ -278,8 +288,8 @@ class SceneDescription(SceneData):
         to_world = pose @ AXES
         to_world[:3, 3] /= self.object.size_in_metres
         model.check_no_fov(self.requested)
-        # of half the width and half the height; the larger one is that of the larger
-        # side
+        # Focal lengths are in widths and heights of the image, so that half a side's
+        # angle has the tangent 0.5 / focal. The field of view is along the larger side.
         tangents = (0.5 / model.values["fx"], 0.5 / model.values["fy"])
         fov = 2.0 * math.degrees(math.atan(max(tangents)))
         cameras = {**self.cameras, spec: PosedCamera(to_world, fov)}
@@ -298,9 +308,9 @@ class SceneDescription(SceneData):
         """Return the scene as one of its cameras sees it, or through another lens.
 
         Args:
-            camera: name of a camera of the scene, or of a mounted one; or, for the
-                camera around the object, the path of a camera file or the name of a
-                bundled camera model.
+            camera: name of a camera of the scene, or of a preset of a mounted camera.
+                Or a lens for the camera around the object: the path of a camera file,
+                or the name of a bundled camera model.
 
         Raises:
             InputError: a setting of the camera around the object was given, and another
@@ -328,7 +338,8 @@ class SceneDescription(SceneData):
     def _with_lens(self, camera: str) -> SceneDescription:
         """Return the scene with the lens of a camera file or a bundled camera model.
 
-        A file with several cameras makes it a rig, whose first camera is the scene's.
+        A file with several cameras makes the scene a rig, whose first camera becomes
+        that of the scene.
 
         Args:
             camera: path of the file, or name of the model.
@@ -367,9 +378,10 @@ class SceneDescription(SceneData):
     def _with_mounted_camera(self, name: str) -> SceneDescription:
         """Return the scene as a mounted camera sees it, by its name in `PRESETS`.
 
-        Its height counts from the floor: that of the place, or the floor that a table
-        with a small object stands on. Settings that were requested stay. The camera
-        stands at the preset's distance, or farther if the object would not fit.
+        A preset is a usual way to mount a camera, with its height in metres above the
+        floor. The floor is that of the place, or the one on which the table of a small
+        object stands. Settings that the user requested stay. The camera stands at the
+        preset's distance, or farther away if the object would not fit into the image.
 
         Raises InputError: the object's size in metres is not known.
         """
@@ -397,9 +409,10 @@ class SceneDescription(SceneData):
         return scene.with_values(camera__distance=distance)
 
     def _make_preset_values(self, preset: CameraPreset) -> dict[str, float]:
-        """Return the settings of a mounted camera, but its distance, by name.
+        """Return the settings of a mounted camera by name, without its distance.
 
-        A small object on a plain ground stands on a table, whose side is set too.
+        A small object on a plain ground stands on a table. The preset's height counts
+        from the floor, `TABLE_HEIGHT` below, and the ground gets the size of a table.
         """
         is_on_plain_ground = (
             self.get_number("ground.size") > 0.0
@@ -440,7 +453,11 @@ class SceneDescription(SceneData):
     def _has_plugin(self, *kinds: str) -> bool:
         """Return whether a Mitsuba plugin of one of these kinds is in the scene.
 
-        Plugins within others count, of surfaces in Mitsuba's words too.
+        Plugins inside other plugins count too, and so do those of surfaces that are
+        described as Mitsuba plugins.
+
+        Args:
+            *kinds: values of a plugin's "type", such as "thinlens".
         """
         surfaces = [
             mesh.surface for mesh in self.meshes.values() if mesh.surface is not None
@@ -476,8 +493,10 @@ class SceneDescription(SceneData):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a user should know of how the scene was read, and remarks of
-        controls.
+        """Notes for the user: how files were read, and what is doubtful in the scene.
+
+        Each is a sentence. They come from the object's file, its front and size, the
+        environment, the camera, the traffic, and from controls.
         """
         light_notes = () if self.environment is None else self.environment.warnings
         camera_notes = () if self.camera_model is None else self.camera_model.notes
@@ -513,9 +532,12 @@ class SceneDescription(SceneData):
         )
 
     def require_environment(self, requester: str) -> EnvironmentAsset:
-        """Return the environment for what cannot do without a map.
+        """Return the environment of the scene.
 
-        Raises InputError: the scene has none.
+        Args:
+            requester: the setting or control that needs it, for the message.
+
+        Raises InputError: the scene has no environment map.
         """
         if self.environment is None:
             check_single_environment(self.parts, requester)
@@ -577,9 +599,9 @@ class SceneDescription(SceneData):
     def gain(self) -> float:
         """Factor from scene radiance to display-linear values.
 
-        2 to the power of `camera.exposure`, times the exposure: by `camera.ev`, where
-        it is set; else that of the photograph that the scene is rendered into; else the
-        metered one, or 1 where exposure is not metered.
+        It is the exposure times 2 to the power of `camera.exposure`. The exposure is
+        the first of these that applies: that of the exposure value `camera.ev`; that of
+        the photograph that the scene is rendered into; the metered one; 1.
         """
         exposure_value = self.values.get("camera.ev")
         exposure = 1.0
@@ -594,9 +616,8 @@ class SceneDescription(SceneData):
     def _compute_exposure(self, exposure_value: float) -> float:
         """Return the factor from scene radiance to display-linear values of an EV.
 
-        A display value of 1 is where a sensor saturates: at a luminance of 1.2 times 2
-        to the power of the exposure value, in cd/m2 (Lagarde and de Rousiers 2014,
-        Moving Frostbite to PBR, section 5.1).
+        A sensor saturates, and the display value is 1, at a luminance of 1.2 * 2^EV in
+        cd/m2 (Lagarde and de Rousiers 2014, Moving Frostbite to PBR, section 5.1).
 
         Raises InputError: the radiance of the environment has no unit.
         """
@@ -624,20 +645,26 @@ def load_description(
 ) -> SceneDescription:
     """Find and read an object and an environment, bundled or from a file.
 
-    What stands around a node of a glTF scene or a shape of a Mitsuba scene stays there,
-    without the ground plane, and without a map if it has lights of its own. Arguments
-    and errors that are not listed are as of `advsearch.load_scene`.
+    The object may be one node of a glTF scene, or one shape of a Mitsuba scene. Then
+    the rest of that scene stays around it. There is no ground plane then, and no
+    environment map if the scene has lights of its own.
 
     Args:
         object_spec: name or file of the object; with `plugins` the id of a shape.
-        environment_spec: `NO_ENVIRONMENT` is no map at all.
-        setting_values: settings of the scene by name.
-        up: the up axis of a mesh file.
+        environment_spec: name or file of the environment; None chooses one, and
+            `NO_ENVIRONMENT` is no map at all.
+        setting_values: settings of the scene by name, such as "camera.fov".
+        up: the axis of a mesh file that points up, such as "z".
         facing: the axis of a mesh file that is its front.
         size: longest side of the object, metres.
-        unit: unit of the object's file.
-        plugins: a Mitsuba scene as its loader takes it.
-        things: what stands beside the object.
+        unit: unit of the object's file, such as "cm"; not together with `size`.
+        plugins: a Mitsuba scene as a dictionary, as `mitsuba.load_dict` takes it.
+        things: what stands beside the object, such as "car@12,3.5,heading=180".
+
+    Raises:
+        FileFormatError: a file cannot be used.
+        InputError: arguments or settings are out of range or contradict each other.
+        UnknownNameError: there is no object, environment or setting of such a name.
     """
     setting_values = setting_values or {}
     values = settings.resolve_settings(setting_values)
@@ -719,7 +746,15 @@ def _import_source(
     up: str | None,
     facing: str | None,
 ) -> ImportedScene:
-    """Read an object, and what stands around it; arguments as of `load_description`."""
+    """Read an object, and what stands around it.
+
+    Args:
+        source: which file and which node of it the object is.
+        object_spec: name or file of the object; with `plugins` the id of a shape.
+        plugins: a Mitsuba scene as a dictionary; None: the object is from a file.
+        up: the axis of a mesh file that points up.
+        facing: the axis of a mesh file that is its front.
+    """
     if plugins is not None:
         # Mitsuba is imported only for what it reads
         from advsearch.scene.mitsuba_backend.scene_files import import_mitsuba_scene
@@ -744,9 +779,14 @@ def _choose_environment(imported: ImportedScene, *, is_mitsuba: bool) -> str:
 
 
 def _check_not_turned(up: str | None, facing: str | None, *, is_mitsuba: bool) -> None:
-    """Check that a scene file is not to be turned.
+    """Check that the user gives no axes for a scene file, whose axes are known.
 
-    Raises InputError: an axis is given that is to point up, or to be the front.
+    Raises InputError: `up` or `facing` is given.
+
+    Args:
+        up: the axis that is to point up; None if none is given.
+        facing: the axis that is to be the front; None if none is given.
+        is_mitsuba: whether it is a Mitsuba scene; otherwise it is glTF.
     """
     if up is not None:
         reason = "glTF files have y up"
@@ -789,7 +829,12 @@ def _describes_orbit(requested: settings.SettingValues) -> bool:
 def _load_environment(
     lit_by: str | Path | EnvironmentAsset,
 ) -> EnvironmentAsset | None:
-    """Return an environment, bundled or from a file; None for `NO_ENVIRONMENT`."""
+    """Return an environment, bundled or from a file; None for `NO_ENVIRONMENT`.
+
+    Args:
+        lit_by: an environment, the name of a bundled one, the file of a map, or the
+            YAML file of a place.
+    """
     if isinstance(lit_by, EnvironmentAsset):
         return lit_by
     if lit_by == NO_ENVIRONMENT:
@@ -805,7 +850,11 @@ def _load_environment(
 def _check_material_settings(
     asset: ObjectAsset, requested: settings.SettingValues
 ) -> None:
-    """Check that settings of the material apply. Raises InputError: they do not."""
+    """Check that an object has the single material that settings change.
+
+    Raises InputError: "material." settings are given, but the object has several
+    materials or a surface that is described as a Mitsuba plugin.
+    """
     material_settings = [name for name in requested if name.startswith("material.")]
     if asset.surface is not None and material_settings:
         surface = "a surface of Mitsuba's own"
@@ -818,9 +867,13 @@ def _check_material_settings(
 
 
 def check_mesh_names(scene: SceneDescription, names: Iterable[str]) -> None:
-    """Check that a scene has the meshes whose settings are named.
+    """Check that a scene has the meshes around the object that settings name.
 
-    Raises UnknownNameError: it has not.
+    Args:
+        scene: the scene.
+        names: names of settings. Those of other things than meshes are ignored.
+
+    Raises UnknownNameError: there is no such mesh.
     """
     for name in names:
         mesh = settings.parse_mesh_name(name)
@@ -836,7 +889,7 @@ def check_mesh_names(scene: SceneDescription, names: Iterable[str]) -> None:
 def check_single_environment(parts: Iterable[ScenePart], requester: str) -> None:
     """Check that a Mitsuba scene has no environment of its own among its parts.
 
-    Raises InputError: it has, and another is requested.
+    Raises InputError: it has one. A scene can have only one environment.
 
     Args:
         parts: parts of the scene.
@@ -854,9 +907,14 @@ def check_single_environment(parts: Iterable[ScenePart], requester: str) -> None
 def check_ground(
     requested: settings.SettingValues, lit_by: str | Path | EnvironmentAsset
 ) -> None:
-    """Check the settings of a ground that is no table.
+    """Check the settings of a ground that is a photograph, a road or a place.
 
-    Raises InputError: there is no photograph to show, or a table is described as well.
+    Raises InputError: there is no environment map for a photographed ground, or a
+    setting of a table is given as well.
+
+    Args:
+        requested: the user's settings by name.
+        lit_by: the environment; `NO_ENVIRONMENT` for none.
     """
     kind = requested.get("ground.kind")
     if kind not in (settings.PHOTOGRAPH, *settings.ROAD_KINDS, *settings.PLACE_KINDS):
@@ -885,11 +943,19 @@ def _load_thing(spec: str, facing: str | None) -> ObjectAsset:
 def _load_object(
     spec: str | Path | ObjectAsset, up: str | None, facing: str | None
 ) -> ObjectAsset:
-    """Return an asset as it is, or load a bundled object or a mesh file."""
+    """Return an asset as it is, or load a bundled object or a mesh file.
+
+    Args:
+        spec: an asset, the name of a bundled object, or a mesh file.
+        up: "y" or "z", the axis of a mesh file that points up; None: its usual one.
+        facing: the axis of a mesh file that is its front; None: its usual one.
+
+    Raises InputError: an axis is given for a bundled object.
+    """
     if isinstance(spec, ObjectAsset):
         return spec
     if is_path(spec):
-        # any other `up` was refused with the settings
+        # Any other `up` was rejected before. The branches tell the type checker so.
         known_up: Literal["y", "z"] | None = None
         if up == "y":
             known_up = "y"

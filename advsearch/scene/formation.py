@@ -83,7 +83,11 @@ class ImageFormation:
     quick: bool = False
 
     def __post_init__(self) -> None:
-        """Check the fields; raises InputError for one that is not possible."""
+        """Check the fields.
+
+        Raises InputError: an unknown denoiser or sampler, or a resolution that is too
+        small or too large.
+        """
         if self.denoiser not in DENOISERS:
             raise InputError(
                 f"denoise: expected one of {', '.join(DENOISERS)}, got "
@@ -102,8 +106,10 @@ class ImageFormation:
     def display(self, radiance: Tensor) -> Tensor:
         """Map linear radiance (..., 3) to display-referred values in [0, 1].
 
-        By `gain`, and the curve of `transfer`; "linear" has no curve and does not clip.
-        It is differentiable, and flat where it is clipped.
+        Radiance is multiplied by `gain` and goes through the tone curve `transfer`:
+        "srgb", "gamma" (1 / 2.2) or "reinhard", which is x / (1 + x) before sRGB's
+        curve. "linear" has no curve and is not clipped. The result is differentiable;
+        clipped values have the derivative 0.
         """
         if self.transfer == "linear":
             return radiance * self.gain
@@ -127,7 +133,12 @@ class _SrgbDisplay(torch.autograd.Function):
     def forward(ctx: Any, radiance: Tensor, gain: float) -> Tensor:
         """Return the sRGB image of radiance times a gain.
 
-        As `linear_to_srgb`, but in place where that saves memory.
+        The result is that of `linear_to_srgb`. Operations are in place to save memory.
+
+        Args:
+            ctx: autograd's context, which stores the arguments for `backward`.
+            radiance: (..., 3) linear radiance.
+            gain: factor from radiance to display-linear values.
         """
         ctx.save_for_backward(radiance)
         ctx.gain = gain
@@ -160,14 +171,18 @@ class _SrgbDisplay(torch.autograd.Function):
 
 @lru_cache(maxsize=64)
 def round_sample_count(sampler: str, samples: float) -> int:
-    """Return the number of samples that a sampler takes when it needs at least some.
+    """Return the number of samples that a sampler takes if it is to take at least some.
 
-    Independent samples come in any number; stratified ones in squares, multi-jittered
-    ones in products of two near numbers, orthogonal arrays in squares of primes, the
-    low-discrepancy sequence in powers of four.
+    Samplers of Mitsuba take only certain numbers: "stratified" squares, "multijitter"
+    products of two similar numbers, "orthogonal" squares of primes, "ldsampler" powers
+    of four. "independent" takes any number.
+
+    Args:
+        sampler: name of the sampler.
+        samples: least number of samples per pixel.
     """
-    # less 1e-9, here and below: a number just above an integer by rounding is that
-    # integer, and needs no further sample
+    # Here and below 1e-9 is subtracted before rounding up: a number that is above an
+    # integer only by a rounding error needs no further sample.
     count = max(1, math.ceil(samples - 1e-9))
     root = math.isqrt(count - 1) + 1  # the square root of the count, rounded up
     if sampler == "stratified":
@@ -245,12 +260,13 @@ METERED_DEFAULTS = ("camera.", "pose.", "environment.")
 
 @cache_per_scene
 def compute_metered_gain(scene: SceneData) -> float:
-    """Return the factor on radiance by which a white card is `CARD_DISPLAY_VALUE`.
+    """Return the factor from radiance to display values, as an exposure meter would.
 
-    The card, of `CARD_REFLECTANCE`, is laid against all of the object that the camera
-    sees, with camera, pose and environment as they are by default. Where the camera
-    sees nothing of the object, the card lies on the ground; where no light arrives the
-    factor is 1.
+    With it a card of the reflectance `CARD_REFLECTANCE` has the display-linear value
+    `CARD_DISPLAY_VALUE`. The card has the orientation of each surface of the object
+    that the default camera sees, in the default pose and light, and the mean counts. If
+    the camera sees nothing of the object, the card lies flat on the ground. If no light
+    arrives, the factor is 1.
     """
     default = {
         name: value
@@ -265,9 +281,11 @@ def compute_metered_gain(scene: SceneData) -> float:
         camera_model=None,
     )
     normals = compute_visible_normals(scene)
+    # a card on the ground faces up
     if not len(normals):
         normals = np.array([[0.0, 0.0, 1.0]])
     metered = float(compute_irradiance(scene, normals).mean())
+    # the card's radiance is reflectance * irradiance / pi, as it is diffuse
     return (
         CARD_DISPLAY_VALUE * math.pi / (CARD_REFLECTANCE * metered)
         if metered > 0.0
@@ -278,13 +296,17 @@ def compute_metered_gain(scene: SceneData) -> float:
 def compute_irradiance(scene: SceneData, normals: Float64Array) -> Float64Array:
     """Return the irradiance (N, 3) on unshadowed surfaces at the object's center.
 
-    It is the light of environment and ground, of lamps, and of meshes around the object
-    that emit some. The surfaces have unit normals (N, 3).
+    It is the sum of the light of environment and ground, of lamps, and of meshes around
+    the object that emit light.
+
+    Args:
+        scene: the scene.
+        normals: (N, 3) unit normals of the surfaces.
     """
     vertices = scene.base_vertices
     center = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
-    # unit directions (W, 3) to the light, and radiance times solid angle (W, 3), which
-    # times the cosine is irradiance
+    # Unit directions (W, 3) to the light, and radiance times solid angle (W, 3). The
+    # latter times the cosine at the surface is irradiance.
     directions, power = _compute_distant_light(scene, center)
     cosines = np.maximum(np.einsum("nk,wk->nw", normals, directions), 0.0)
     # by `einsum`, not by BLAS, whose last bits depend on the number of threads
@@ -322,15 +344,16 @@ def _compute_distant_light(
     """
     directions, solid_angle, power = compute_environment_light(scene)
     is_up = directions[:, 2] > 0.0
-    # irradiance of level ground; the cosine is the direction's z
+    # irradiance of level ground, where the cosine is the z of the direction
     on_ground = (power[is_up] * directions[is_up, 2:]).sum(axis=0)
     albedo = srgb_to_linear(np.array(scene.ground_color, np.float32))
     reflected = albedo * on_ground / math.pi
-    # Where a direction meets the height 0, from the middle of the ground. For
-    # directions that point up it means nothing, and they are left out below.
+    # The offset from the middle of the ground at which a direction meets the height 0.
+    # For directions that point up it means nothing, and they are left out below.
     distance = center[2] / np.maximum(-directions[:, 2:], 1e-9)
     offset = np.abs(center[:2] + directions[:, :2] * distance)
-    # otherwise the map has what comes from below
+    # Over a photographed or paved ground, the lower half of the map has the light from
+    # below already.
     has_plain_ground = scene.photograph is None and not is_paved(scene)
     in_reach = (offset <= scene.get_number("ground.size") / 2.0).all(axis=1)
     hits = has_plain_ground & ~is_up & in_reach
@@ -356,8 +379,9 @@ def _compute_emitted_light(
 ) -> tuple[Float64Array, Float64Array]:
     """Return the light that arrives at a point (3,) from the faces of a mesh.
 
-    A face is taken for a disk of its mean radiance and its area, which shines on its
-    front alone. The form factor of a disk stays below 1 however near the point is.
+    A face is taken for a disk of the same area and of its mean radiance, which shines
+    on its front alone. Unlike area / distance^2, the form factor of a disk stays finite
+    however near the point is.
 
     Args:
         part: the mesh, in its base pose.
@@ -375,7 +399,7 @@ def _compute_emitted_light(
     direction = offset / np.maximum(np.sqrt(squared_distance), 1e-12)[:, None]
     # (F, P, 2) of P points on each face
     uv = np.einsum("pk,fkc->fpc", FACE_SAMPLE_WEIGHTS, part.mesh.uvs[part.mesh.faces])
-    # centers of texels have whole coordinates here; v points up, rows go down
+    # In columns and rows, which are whole at texel centers. v points up, rows go down.
     height, width = emission.shape[:2]
     column = uv[..., 0] * width - 0.5
     row = (1.0 - uv[..., 1]) * height - 0.5
@@ -400,8 +424,9 @@ def _find_nearest(
     """Return the index of the nearest sample in each pixel that has one.
 
     Args:
-        nearness: (S,) of each sample, larger for nearer ones.
-        row, column: (S,) the pixel of each sample.
+        nearness: (S,) one over the depth of each sample, larger for nearer ones.
+        row: (S,) row of the pixel of each sample.
+        column: (S,) column of the pixel of each sample.
         shape: height and width of the image.
     """
     order = np.argsort(nearness, kind="stable")
@@ -414,9 +439,10 @@ def _find_nearest(
 def compute_visible_normals(scene: SceneData) -> Float64Array:
     """Return the object's unit normals (N, 3) in the pixels of a small image.
 
-    N is the number of pixels that show the object, each by its nearest face; other
-    things do not hide it. Normals are in world space, turned to point towards the
-    camera. The image has `METERING_SIZE` pixels along its longer side.
+    N is the number of pixels that show the object. Other things do not hide it. A pixel
+    has the normal of the face nearest to the camera, in world space, and turned to
+    point towards the camera. The image has `METERING_SIZE` pixels along its longer
+    side.
     """
     camera = camera_to_world(scene)
     # in the camera's coordinates: left, up and ahead
@@ -426,7 +452,8 @@ def compute_visible_normals(scene: SceneData) -> Float64Array:
     frame = Frame.of(scene.get_number("camera.fov"), scene.aspect)
     pixel_width, shape = _choose_metering_shape(frame)
     tangents = points[faces][..., :2] / points[faces][..., 2:]
-    # the raster has the center of its first pixel at 0
+    # minus half a pixel, since the raster's coordinates are 0 at the center of its
+    # first pixel
     face, row, column, weights = rasterize_triangles(
         (tangents - (frame.left, frame.low)) / pixel_width - 0.5, shape
     )
@@ -449,7 +476,7 @@ def _interpolate_normals(
     Args:
         scene: scene with the object.
         corners: (N, 3) vertices of the face that each point is on.
-        weights: (N, 3) of the corners.
+        weights: (N, 3) barycentric weights of the corners at the point.
     """
     normals = (weights[:, :, None] * scene.object.mesh.normals[corners]).sum(axis=1)
     normals = normals @ object_to_world(scene)[:3, :3].T
@@ -464,17 +491,20 @@ def _compute_unrotated_light(
     """Return an environment's light without its rotation; z is up.
 
     The map is divided into blocks of texels, and the light of each block is summed up.
-    The results are those of `compute_environment_light`, one for each block.
+
+    Returns:
+        For N blocks: unit directions (N, 3), solid angles (N,) in steradians, and
+        radiance times solid angle (N, 3). N is 0 without an environment.
     """
     if environment is None:
         return np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3))
     height, width = environment.radiance.shape[:2]
     rows = _find_block_starts(height, METERING_ROWS)
     columns = _find_block_starts(width, 2 * METERING_ROWS)
-    # Angle from straight up at the border above each row, and below the last. The
-    # first and the last row have their centers at the poles: half of each is missing.
+    # The angle from straight up at the borders between rows. The first and the last row
+    # have their centers at the poles, so that half of each is missing.
     polar = np.clip((np.arange(height + 1) - 0.5) / (height - 1), 0.0, 1.0) * math.pi
-    # of a texel in each row
+    # solid angle (H,) of a texel in each row
     solid_angle = -np.diff(np.cos(polar)) * (2.0 * math.pi / width)
     # a fourth channel of ones sums up the solid angles
     ones = np.ones((height, width, 1))
@@ -500,7 +530,8 @@ def _compute_block_directions(
     height, width = shape
     row_ends = np.append(rows[1:], height)
     column_ends = np.append(columns[1:], width)
-    # middle row (first + last) / 2 and middle column, as angles
+    # The middle row is (first + last) / 2, and a row is pi / (height - 1). Columns have
+    # their centers half a column further: there the middle is (start + end) / 2.
     theta = (rows + row_ends - 1)[:, None] * (0.5 * math.pi / (height - 1))
     azimuth = 0.5 * math.pi - (columns + column_ends) * (math.pi / width)
     z = np.broadcast_to(np.cos(theta), (len(rows), len(columns)))
@@ -555,13 +586,15 @@ def divide_exposure(
 ) -> tuple[Tensor, Tensor, float]:
     """Divide an exposure into moments.
 
-    The exposure lasts from the first row's opening to the last row's closing, shutter +
-    rolling seconds, and is cut into moments of equal length. A row takes of each moment
-    the fraction that overlaps with its own exposure.
+    The exposure lasts shutter + rolling seconds, from the first row's opening to the
+    last row's closing. It is cut into moments of equal length, and a row of the image
+    is a weighted mean of them. A moment's weight is proportional to the time for which
+    it overlaps with the row's own exposure.
 
     Args:
         shutter: seconds for which each row is exposed, at least 0.
-        rolling: seconds within which rows are read, from the bottom if below 0.
+        rolling: seconds within which rows are read one after the other. If it is
+            negative, the lowest row comes first.
         height: height of the image.
         count: M, number of moments. With as many as rows and no shutter, each row has a
             moment of its own.
@@ -577,7 +610,9 @@ def divide_exposure(
     starts = torch.arange(count, dtype=torch.float64) * duration
     # (H,) when each row opens, seconds after the first
     opens = rolling * (torch.arange(height, dtype=torch.float64) + 0.5) / height
-    if shutter < duration:  # a row has the one moment that the middle of it lies in
+    # A row that is exposed for less than a moment has the moment in which the middle of
+    # its exposure lies.
+    if shutter < duration:
         moment = ((opens + shutter / 2.0) / duration).long().clamp_max(count - 1)
         fractions = torch.nn.functional.one_hot(moment, count).T.double()
     else:
@@ -624,10 +659,13 @@ CHANNELS: Mapping[str, str] = {
 
 
 def parse_aovs(text: str | None) -> tuple[str, ...]:
-    """Return the names in a list separated by commas, each once.
+    """Parse a list of layers such as "depth,normal"; each is returned once.
+
+    Args:
+        text: names separated by commas; None or empty for no layers.
 
     Raises:
-        UnknownNameError: one is not of `AOVS`.
+        UnknownNameError: a name is not in `AOVS`.
     """
     stripped = [name.strip() for name in (text or "").split(",")]
     names = tuple(dict.fromkeys(name for name in stripped if name))

@@ -80,10 +80,10 @@ class Frame:
         Args:
             fov: field of view along the larger side, degrees.
             aspect: width over height.
-            shift: shift of the image to the right in its widths and downwards in its
-                heights: what it shows moves the other way.
+            shift: shift of the frame to the right, in widths of the image, and
+                downwards, in heights. What it shows moves the other way.
         """
-        # of the larger side; the other one is smaller by the aspect
+        # the tangent of half the larger side; the smaller side follows by the aspect
         half_tangent = math.tan(math.radians(fov) / 2.0)
         half_width = half_tangent * min(1.0, aspect)
         half_height = half_tangent * min(1.0, 1.0 / aspect)
@@ -123,7 +123,7 @@ def _compute_edge_tangents(
         return torch.tensor(
             model.visible_tangents, dtype=torch.float64, device=fov.device
         )
-    # half-width and half-height, as fractions of half the larger side
+    # half the width and half the height, as fractions of half the larger side
     shape = torch.tensor(
         [min(1.0, aspect), min(1.0, 1.0 / aspect)],
         dtype=torch.float64,
@@ -135,13 +135,15 @@ def _compute_edge_tangents(
 def compute_framing_distance(
     description: SceneData, fov: Tensor, aspect: float
 ) -> Tensor:
-    """Return the distance () of the camera to the middle of a scene's object.
+    """Return the distance () at which a camera frames the object by default.
 
-    It is the smallest at which the object fills the image by no more than `FRAME_FILL`
-    from the default direction, is in the image from every azimuth, and at which the
-    camera stays outside of the sphere around it; see above. In object sizes, float64;
-    differentiable in the field of view. With a lens of the user's, the field of view
-    does not count.
+    It is the smallest distance from the middle of the object that meets three
+    conditions. From the default direction, the object fills at most `FRAME_FILL` of the
+    image's width and height. From every azimuth, all of it is in the image. And the
+    camera is outside of the sphere around the object.
+
+    The distance is in object sizes, float64, and differentiable in the field of view.
+    If the user has given a lens, that counts in place of the field of view.
 
     Args:
         description: the scene.
@@ -159,8 +161,8 @@ def compute_framing_distance(
     axes = torch.from_numpy(compute_camera_axes(azimuth, elevation, roll)).T.to(offsets)
     (left, up, outwards) = offsets.matmul(axes).unbind(dim=1)
     (half_width, half_height) = edge_tangents * FRAME_FILL
-    # A vertex is in the image from the distance at which its tangent, which is left /
-    # (distance - outwards), is no more than the edge's.
+    # A vertex is seen at the tangent left / (distance - outwards). That is at most the
+    # edge's if distance >= outwards + left / edge.
     from_default_view = (
         outwards + torch.maximum(left.abs() / half_width, up.abs() / half_height)
     ).max()
@@ -173,7 +175,9 @@ def compute_framing_distance(
 
 
 def compute_camera_axes(azimuth: float, elevation: float, roll: float) -> Float64Array:
-    """Return the axes of a camera on an orbit: rows left, up and from the object to it.
+    """Return the axes (3, 3) of a camera on an orbit.
+
+    The rows are its directions left and up, and that from the object to the camera.
 
     Args:
         azimuth: azimuth of the camera around the object, degrees.
@@ -218,7 +222,7 @@ def _compute_framing_distance_all_around(
     the unit of the offsets.
 
     Args:
-        offsets: (V, 3) of the vertices from the middle of the object.
+        offsets: (V, 3) from the middle of the object to its vertices.
         elevation: elevation of the camera, degrees.
         tangents: (2,) of the angles to the edges of the image.
     """
@@ -228,9 +232,10 @@ def _compute_framing_distance_all_around(
     sine = math.sin(math.radians(elevation))
     inverse_width = 1.0 / tangents[0]
     inverse_height = 1.0 / tangents[1]
-    # A vertex at azimuth a of the circle is `outwards` towards the camera, `left` and
-    # `up` in its image. An edge needs outwards + side / tangent, of which the terms
-    # with cos(a) and sin(a) add up to the norm of their factors.
+    # A vertex at azimuth a of the circle is `outwards` towards the camera, and at
+    # `left` and `up` in its image. It is inside an edge if the distance is at least
+    # outwards + side / tangent, where side is left or up. The largest value of the
+    # terms with cos(a) and sin(a) is the norm of their two factors.
     # outwards = rho cosine cos(a) + z sine, left = rho sin(a)
     for_sides = rho * torch.sqrt(inverse_width**2 + cosine**2) + z * sine
     # up = z cosine - rho sine cos(a), and its negative for the bottom edge
@@ -260,8 +265,9 @@ def camera_to_world(
     By default it is on an orbit around the middle of the object, looking at it. The
     camera looks along its own +z with +y up and +x to the left, as Mitsuba's sensors
     do. It frames the object in its default pose, so that a shifted or scaled object
-    moves in the image. `camera.distance` wins over framing, and `camera.height` over
-    `camera.elevation`: the camera stays at its distance, no steeper than 89 degrees.
+    moves in the image. If `camera.distance` is set, it replaces the framing distance.
+    If `camera.height` is set, the elevation is the one at which the camera has this
+    height at its distance, but no steeper than 89 degrees.
 
     Args:
         description: the scene.
@@ -281,7 +287,7 @@ def camera_to_world(
     height = description.values.get("camera.height")
     if height is not None:
         center_height = float(compute_center(description)[2])
-        # of the elevation at which the camera has the height, at this distance
+        # sine of the elevation: height above the center, over distance
         sine = (height / description.size_in_metres - center_height) / distance
         sine = min(max(sine, -MAX_ELEVATION_SINE), MAX_ELEVATION_SINE)
         elevation = math.degrees(math.asin(sine))
@@ -302,8 +308,9 @@ def project_points(
 ) -> tuple[Tensor, Tensor]:
     """Return where the camera of scene inputs sees points.
 
-    By its lens if it has one; otherwise it is a pinhole, with the field of view and the
-    shift of the inputs, or the scene's field of view.
+    Points are projected by the camera's lens if it has one. Otherwise the camera is a
+    pinhole. Its field of view and shift are those of the inputs; without any, the field
+    of view is the scene's.
 
     Args:
         description: the scene.
@@ -373,10 +380,10 @@ def compute_car_pose(camera: Tensor) -> Tensor:
 
 
 def get_positioned_part(scene: SceneData, part: ScenePart) -> Any:
-    """Return one of a scene's parts as the settings and the camera have it.
+    """Return one of a scene's parts where the settings and the camera put it.
 
-    A mesh has the pose and the material of its settings. A beam stands where its
-    carrier, a mesh or the camera's car, takes it. Other parts are as they are.
+    A mesh gets the pose and the material of its settings. A beam gets its pose from its
+    carrier, which is a mesh or the camera's car. Other parts are returned as they are.
     """
     if not isinstance(part, BeamLamp):
         return scene.meshes.get(part.name, part)
@@ -451,9 +458,11 @@ def make_euler_rotation(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
 def make_vector_rotation(degrees: Tensor) -> Tensor:
     """Return the rotation (3, 3) about a vector (3,) by its length in degrees.
 
-    Rodrigues' formula with guarded series, so that value and derivative are right at
-    zero, where the plain formula is NaN: `torch.where` would pass on the NaN of the
-    side that it does not take, so that side gets an angle of 1 instead.
+    This is Rodrigues' formula, R = 1 + sin(a) / a K + (1 - cos(a)) / a^2 K^2, where K
+    is the matrix of the cross product with the vector. Near a = 0, where the quotients
+    are NaN, they are replaced by series, so that value and derivative are right.
+    `torch.where` passes on the NaN derivative of the branch that it does not take: in
+    that branch the angle is 1 instead.
     """
     vector = degrees * (math.pi / 180.0)
     squared_angle = vector.square().sum()
@@ -524,9 +533,10 @@ def find_overlap_interval(
 ) -> tuple[float, float]:
     """Return between which shifts along a direction one footprint overlaps another.
 
-    By separating axes (Ericson 2005, Real-Time Collision Detection, section 5.2.1): on
-    the normal of each edge both footprints are intervals, which overlap for an interval
-    of the shift; the footprints overlap where all of these do. Touching is no overlap.
+    The method is that of separating axes (Ericson 2005, Real-Time Collision Detection,
+    section 5.2.1). Projected on the normal of an edge, both footprints are intervals,
+    and they overlap for an interval of the shift. The footprints overlap if their
+    projections on all normals do. Touching is no overlap.
 
     Args:
         first: the footprint that is shifted.
@@ -544,9 +554,10 @@ def find_overlap_interval(
             for points in (first.outline, second.outline)
         ]
     )
-    # (k, 2); corners at the same point have no edge
+    # normals (k, 2) of the edges, without those between two corners at one point
     normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1)[edges.any(axis=1)]
-    # corners along each axis, (corners, k); and how far a shift of 1 moves along it
+    # positions (corners, k) of the corners along each normal, and how far a shift of 1
+    # moves the first footprint along it
     moving_range = first.outline @ normals.T
     fixed_range = second.outline @ normals.T
     shift_speeds = normals @ direction
@@ -558,13 +569,14 @@ def find_overlap_interval(
             fixed_range.max(axis=0) - moving_range.min(axis=0),
         ]
     )
-    # The shift does not move it along such an axis: they are apart always or never.
-    # Apart means that 0 is not within their separations.
+    # A shift does not move the first footprint along an axis at a right angle to it. On
+    # such an axis the two are always apart, if 0 is not between the separations, or
+    # never.
     is_parallel = shift_speeds == 0.0
     if (is_parallel & ((separations[0] >= 0.0) | (separations[1] <= 0.0))).any():
         return math.inf, -math.inf
-    # divided: the shifts at which it begins and ends; sorted, since a negative speed
-    # swaps the two
+    # Distance over speed is the shift at which an overlap begins and ends. A negative
+    # speed swaps the two, and so they are sorted.
     intervals = np.sort(
         separations[:, ~is_parallel] / shift_speeds[~is_parallel], axis=0
     )

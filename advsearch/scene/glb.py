@@ -79,7 +79,8 @@ class GlbBuffer:
         Args:
             values: (N,) or (N, width), float32, uint32 or uint16.
             kind: glTF's type of a row, such as "VEC3".
-            bounds: whether minimum and maximum are written too.
+            bounds: whether minimum and maximum are written too, which glTF requires of
+                positions.
         """
         integer_types = {
             np.dtype(np.uint32): UNSIGNED_INT,
@@ -101,9 +102,10 @@ class GlbBuffer:
         return len(self.accessors) - 1
 
     def to_bytes(self, header: dict[str, Any]) -> bytes:
-        """Return the complete file.
+        """Return the complete .glb file: a header, then JSON, then binary data.
 
-        The entries of the buffer are added to the header.
+        Args:
+            header: the glTF document. The entries that describe the buffer are added.
         """
         header |= {
             "accessors": self.accessors,
@@ -113,7 +115,8 @@ class GlbBuffer:
         text = json.dumps(header).encode()
         text += b" " * (-len(text) % 4)
         binary = bytes(self.data)
-        # 12 bytes of the file's header, and 8 of each of both chunks
+        # The file's header has 12 bytes, and that of each of the two chunks 8. The two
+        # numbers below are the chunk types "JSON" and "BIN".
         size = 28 + len(text) + len(binary)
         file_header = struct.pack("<4sIIII", b"glTF", 2, size, len(text), 0x4E4F534A)
         chunk_header = struct.pack("<II", len(binary), 0x004E4942)
@@ -146,9 +149,9 @@ def encode_web_glb(
     camera: Float64Array,
     note: str = "",
 ) -> bytes:
-    """Return a small file with two scenes, "adversarial" and "clean".
+    """Return a small .glb file with two scenes, "adversarial" and "clean".
 
-    What is the same in both is stored once.
+    Data that are the same in both scenes are stored once.
 
     Args:
         adversarial: meshes of the first scene.
@@ -188,13 +191,13 @@ def _make_document(
 ) -> dict[str, Any]:
     """Return the glTF document (the JSON part) of a file of meshes.
 
-    Their data and their images are appended to the buffer. Nodes, meshes and materials
-    have the order of the shapes; every node is in the one scene.
+    Nodes, meshes and materials are in the order of the shapes. All nodes are in one
+    scene.
 
     Args:
-        buffer: gets the data.
-        meshes: one node each.
-        encode_image: encodes an image (H, W, 3).
+        buffer: the binary part; geometry and image files are appended to it.
+        meshes: meshes, each of which gets a node.
+        encode_image: encodes an image (H, W, 3) as a JPEG or PNG file.
     """
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "advsearch"},
@@ -235,8 +238,9 @@ def _make_document(
 def _add_geometry(buffer: GlbBuffer, shape: Shape) -> dict[str, Any]:
     """Add the mesh of a shape to a buffer, and return its primitive.
 
-    Axes are turned to glTF's, and v is turned over, since glTF's is 0 at the top. A
-    normal of length 0 becomes upright. Indices have 16 bits where these suffice.
+    The mesh is converted to glTF's axes, with y up. v becomes 1 - v, since glTF's is 0
+    at the top. glTF requires unit normals, so that a normal of length 0 becomes +z.
+    Indices have 16 bits if that suffices.
     """
     mesh = shape.mesh
     lengths = np.linalg.norm(mesh.normals, axis=1, keepdims=True)
@@ -265,10 +269,10 @@ def _add_material(
     """Return the material of a shape; its images go to the buffer and the document.
 
     Args:
-        document: gets entries of images and textures.
-        buffer: gets the image files.
-        shape: whose surface it is.
-        encode_image: encodes an image (H, W, 3); one with opacity is always PNG.
+        document: the glTF document; entries of images and textures are appended.
+        buffer: the binary part; image files are appended.
+        shape: the mesh with its surface.
+        encode_image: encodes an image (H, W, 3). An image with opacity is always PNG.
     """
     color = _to_bytes(shape.base_color)
     if shape.opacity is None:
@@ -280,7 +284,8 @@ def _add_material(
         normals = encode_image(_to_bytes(shape.normal_map))
         material["normalTexture"] = _add_texture(document, buffer, normals)
     if shape.emission is not None:
-        # A texture is at most 1, so the strength is an extension.
+        # A texture's values are at most 1: the texture has the emission divided by its
+        # maximum, and an extension has the maximum.
         strength = float(shape.emission.max())
         material["emissiveFactor"] = [1.0, 1.0, 1.0]
         relative = linear_to_srgb(shape.emission / np.float32(strength))
@@ -312,9 +317,13 @@ def _add_texture(
 def _make_material(shape: Shape, texture: dict[str, int]) -> dict[str, Any]:
     """Return the material of a shape with a texture of its base color.
 
-    An opacity of 0 and 1 alone is a mask; another one is blended. Extensions are
-    written only where the surface differs from glTF's default; a specular above
-    `DEFAULT_SPECULAR` is cut to it, since glTF's factor is at most 1.
+    If all opacities are 0 or 1, they are written as a mask, otherwise as blending.
+    Extensions are written only if the surface differs from glTF's default. A specular
+    above `DEFAULT_SPECULAR` is cut to it, since glTF's factor is at most 1.
+
+    Args:
+        shape: the mesh with its surface.
+        texture: glTF's reference to the texture, such as {"index": 0}.
     """
     surface = shape.material
     material: dict[str, Any] = {"name": shape.name, "doubleSided": True}

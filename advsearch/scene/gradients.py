@@ -274,9 +274,9 @@ def make_first_plan(
     spp: int | None = None,
     image_size: float = math.inf,
 ) -> GradientPlan:
-    """Return the plan before anything was measured.
+    """Return the plan of derivatives before anything was measured.
 
-    Each group has its preferred estimator, or the forced one.
+    Each group of coordinates has its preferred estimator, or the one that is forced.
 
     Args:
         groups: groups of the space.
@@ -284,7 +284,7 @@ def make_first_plan(
         forced: estimators by "control.parameter", "control", or "*" for all groups
             where it is valid.
         spp: samples per pixel of differences.
-        image_size: pixels of the longer side of the image.
+        image_size: pixels of the longer side of the image, which limits steps.
 
     Raises:
         InputError: an estimator is unknown, or not valid where it was forced by name.
@@ -306,12 +306,20 @@ def make_first_plan(
 def _plan_group(
     group: Group, steps: Tensor, forced: Mapping[str, str], image_size: float
 ) -> Group:
-    """Return a group with its preferred or forced estimator; see `make_first_plan`.
+    """Return a group with its preferred or forced estimator.
 
-    An estimator forced for the group wins over one for its control, and that over one
-    for all groups, which holds only where it is valid.
+    An estimator forced for the group ("pose.yaw") wins over one for its control
+    ("pose"), and that over one for all groups ("*"). The last is ignored for groups for
+    which it is not valid; the others are errors then.
+
+    Args:
+        group: the group; its valid estimators are in order of preference.
+        steps: (d,) half-widths of differences in u over which outlines move by a pixel.
+        forced: estimators by the name of a group, of a control, or "*".
+        image_size: pixels of the longer side of the image.
     """
-    # the smallest: no coordinate of the group moves an outline by more than a pixel
+    # With the smallest step, no coordinate of the group moves an outline by more than a
+    # pixel.
     pixel_step = float(steps[group.coordinates].min()) if group.size else 0.0
     group = replace(group, pixel=pixel_step)
     if not group.valid:
@@ -392,7 +400,8 @@ def forbid_second_derivatives(backward: Backward) -> Backward:
         # gradients are enabled here only with `create_graph`, for a second derivative
         if not torch.is_grad_enabled():
             return derivatives
-        # a guarded value depends on all that the derivative depends on
+        # A guarded value depends, for autograd, on all that the derivative depends on:
+        # differentiating it again reaches the guard, which raises the error.
         arguments = (cotangent, *ctx.saved_tensors)
         guarded = []
         for value in derivatives:

@@ -43,11 +43,15 @@ MAX_CAR_CAMERA_HEIGHT = 2.5
 
 
 def is_against_traffic(scene: SceneData, camera: Float64Array) -> bool:
-    """Return whether a camera (4, 4) drives in the object's lane towards its front.
+    """Return whether a camera would drive against the traffic, towards the object.
 
-    It does if it is before the object, at most half a lane aside and no higher than a
-    car's camera, if the object is one that drives and stands in a lane. Lanes run along
-    x, and the object faces +x.
+    That is so if the object is a vehicle in a lane, and the camera is in front of it,
+    at most half a lane to the side, and no higher than the camera of a car. Lanes run
+    along x, and the object faces +x.
+
+    Args:
+        scene: the scene.
+        camera: (4, 4) pose of the camera.
     """
     if not (scene.object.drives and (scene.is_in_lane or has_lanes(scene))):
         return False
@@ -100,11 +104,11 @@ PLACE_BY_GROUND_KIND: Mapping[str, tuple[str, str | None]] = {
 
 
 def find_ground_kind(scene: SceneData) -> str | None:
-    """Return the kind of ground that a scene's environment and its settings ask for.
+    """Return the kind of ground that settings or the environment require.
 
-    None where the ground has a size of 0. Otherwise the setting `ground.kind` wins, and
-    then the environment's own kind, which does not count where settings describe a
-    table. None where neither names one.
+    It is None if the ground has the size 0. Otherwise the setting `ground.kind` counts,
+    and without it the environment's own kind. The latter is ignored if settings
+    describe a table. It is None if neither names a kind.
     """
     requested = scene.values.get("ground.kind")
     if scene.get_number("ground.size") <= 0.0:
@@ -131,10 +135,11 @@ def find_place(scene: SceneData) -> Place | None:
 
 
 def load_requested_place(scene: SceneData) -> Place | None:
-    """Return the place that a scene's environment and its settings ask for.
+    """Return the place that settings or the environment require; None for none.
 
-    A kind of ground wins, which may be no place; else it is the environment's own,
-    unless settings describe the ground. None where they ask for none.
+    If there is a kind of ground, that decides: it is a bundled place or none. Otherwise
+    the environment may have a place, which is ignored if settings describe a table or
+    the ground has the size 0.
     """
     kind = find_ground_kind(scene)
     if kind is not None:
@@ -154,8 +159,8 @@ def load_requested_place(scene: SceneData) -> Place | None:
 def with_requested_ground(scene: AnyScene) -> AnyScene:
     """Return the scene with the road or the place that its settings request.
 
-    Another one that it had is left out. The place's lamps are on where the light is
-    dark, see `_is_dark`.
+    A road or place that the scene has already is replaced. The place's lamps are on if
+    the environment is dark.
     """
     other_parts = tuple(
         part
@@ -264,12 +269,19 @@ class CameraView(NamedTuple):
 def find_valid_range(
     surroundings: Surroundings, camera: CameraView
 ) -> tuple[float, float]:
-    """Return up to which distance and height an environment's picture fits a camera.
+    """Return the largest distance and height of a camera for an environment's picture.
 
-    In the lengths of `surroundings`, infinite without a bound; `NO_RANGE` where the
-    picture is turned against the ground. The distance has two bounds, as said above:
-    what stands around becomes too large, or the end of the ground comes into sight. The
-    camera's own distance does not count, its height and angles do.
+    The distance has two bounds: beyond the first, things in the picture look too large
+    by the factor `MAX_SCALE_ERROR`; beyond the second, the end of the ground comes into
+    sight. They depend on the camera's height and direction, not on its own distance.
+
+    Args:
+        surroundings: the place that the picture shows.
+        camera: position and direction of the camera.
+
+    Returns:
+        Distance and height in the unit of `surroundings`, infinite if there is no
+        bound; `NO_RANGE` if the picture is rotated against the ground.
     """
     # from -180 to 180 degrees
     rotation = (surroundings.rotation + 180.0) % 360.0 - 180.0
@@ -278,7 +290,7 @@ def find_valid_range(
     max_scale_distance = (MAX_SCALE_ERROR - 1.0) * _reach_of_area(
         surroundings.nearest_distance, camera.towards
     )
-    # how much of the ground below the camera its image does not show
+    # length of the ground in front of the camera that is below the image's lower border
     hidden_ground_distance = math.inf
     if camera.lower_angle > 0.0:
         lower_angle = math.radians(min(camera.lower_angle, 179.0))
@@ -307,10 +319,12 @@ def _reach_of_area(area: Box | float, azimuth: float) -> float:
 def find_surroundings(scene: SceneData) -> Surroundings | None:
     """Return what is known of the place that a scene's environment is a picture of.
 
-    In metres. None if nothing of the picture has to fit a ground.
+    A picture looks right only from near the point where it was taken. The result has
+    the height from which that was, the distance of the nearest things in it, and where
+    the ground ends, in metres. It is None if no ground has to fit the picture.
     """
     environment = scene.environment
-    # what encloses the object is geometry, true from everywhere
+    # An enclosing place is geometry, which looks right from everywhere.
     if environment is None or scene.backdrop or is_enclosed(scene):
         return None
     place = find_place(scene)
@@ -321,7 +335,8 @@ def find_surroundings(scene: SceneData) -> Surroundings | None:
         environment.place if bundled is None else load_bundled_place(*bundled)
     )
     picture = None if captured_site is None else captured_site.file.picture
-    # the place stands around as geometry too: the limits of its picture hold
+    # The near part of the place is geometry, and the far part a picture, whose limits
+    # the place's file states.
     if place is not None and picture is not None:
         return Surroundings(
             height=picture.height,
@@ -329,8 +344,8 @@ def find_surroundings(scene: SceneData) -> Surroundings | None:
             ground_extent=extent,
             rotation=scene.get_number("environment.rotation"),
         )
-    # a photograph over a ground, with the limits of its camera's height and of the
-    # empty floor around it
+    # A photographed map over a ground: the limits are the height of its camera, and the
+    # radius of the empty floor around it.
     if environment.photographed and (is_paved(scene) or scene.photograph is not None):
         height = scene.capture_height * scene.size_in_metres
         radius = scene.values.get("ground.radius")
@@ -339,7 +354,7 @@ def find_surroundings(scene: SceneData) -> Surroundings | None:
         return Surroundings(height, radius, extent)
     if not is_paved(scene):
         return None
-    # only the end of the ground counts
+    # Any other map is taken for infinitely far: only the end of the ground counts.
     return Surroundings(math.inf, math.inf, extent)
 
 
@@ -358,10 +373,9 @@ def make_camera_view(
     to_world: Float64Array | None = None,
     fov: float | None = None,
 ) -> CameraView:
-    """Return how a scene is looked at, in metres.
+    """Return where a camera is, in metres, and in which direction it looks.
 
-    That is by its own camera, or by one with another pose. A camera that looks straight
-    down counts as looking to the object.
+    A camera that looks straight down counts as looking towards the object.
 
     Args:
         scene: the scene.
@@ -374,7 +388,8 @@ def make_camera_view(
     if fov is None:
         fov = scene.get_number("camera.fov")
     half_fov = math.radians(fov) / 2.0
-    # the height of an image is its larger side, or smaller than that by the aspect
+    # The field of view is along the larger side: that is the height, or else the height
+    # is smaller by the aspect.
     half_height_angle = math.degrees(
         math.atan(math.tan(half_fov) * min(1.0, 1.0 / scene.aspect))
     )
@@ -420,16 +435,15 @@ def _describe_views_beyond(n_beyond: int, n_views: int) -> str:
 def list_view_remarks(
     scene: SceneData, views: Sequence[CameraView], *, rotates_map: bool = False
 ) -> tuple[str, ...]:
-    """Return remarks where views go past what an environment's picture is valid for.
+    """Return a remark if views go beyond what an environment's picture is valid for.
 
-    A remark on views outside of the place wins; the next is that the map is rotated
-    against the road; the last that views are too far or too high. At most one is
-    returned.
+    At most one remark is returned, the first of these that applies: views are outside
+    of the place; the map is rotated against the road; views are too far or too high.
 
     Args:
-        scene: scene that is looked at.
-        views: at least one.
-        rotates_map: whether the map is rotated from view to view.
+        scene: the scene.
+        views: positions and directions of its camera, at least one.
+        rotates_map: whether the map's rotation differs from view to view.
     """
     surroundings = find_surroundings(scene)
     place = find_place(scene)
@@ -437,7 +451,8 @@ def list_view_remarks(
     if outside or surroundings is None:
         return outside
     is_against_road = find_valid_range(surroundings, views[0]) == NO_RANGE
-    # houses are a box beside the road, other surroundings are equally far all around
+    # Houses along a road are at different distances in x and y, which are a tuple.
+    # Other surroundings are equally far in all directions.
     has_houses = isinstance(surroundings.nearest_distance, tuple)
     if is_against_road or (rotates_map and has_houses):
         return (
@@ -453,7 +468,12 @@ def _list_range_remarks(
 ) -> tuple[str, ...]:
     """Return a remark if views are too far or too high for an environment's picture.
 
-    Arguments are as for `list_view_remarks`; empty if no view is.
+    The result is empty if all views are within the limits.
+
+    Args:
+        scene: the scene.
+        surroundings: the place that the environment is a picture of.
+        views: positions and directions of its camera, at least one.
     """
     limits = [find_valid_range(surroundings, view) for view in views]
     views_beyond = [
@@ -480,8 +500,8 @@ def _describe_limits(limits: Sequence[tuple[float, float]], unit: str) -> str:
     """Return up to where an environment's picture fits a camera, for a message.
 
     Args:
-        limits: distance and height of each view, see `find_valid_range`.
-        unit: unit of these.
+        limits: largest distance and height of each view.
+        unit: their unit, such as "m".
     """
     distances = [distance for distance, _ in limits]
     smallest = min(distances)
@@ -506,12 +526,12 @@ def _describe_position(position: Float64Array) -> str:
 def list_outside_remarks(
     scene: SceneData, place: Place, views: Sequence[CameraView]
 ) -> tuple[str, ...]:
-    """Return a remark where views are outside of what the place is valid for.
+    """Return a remark if views are outside of the box that a place is valid for.
 
     Args:
-        scene: scene that is looked at.
-        place: place of the scene.
-        views: at least one.
+        scene: the scene.
+        place: its place, whose file states the box.
+        views: positions and directions of its camera, at least one.
     """
     axis_limits = [
         (axis, limits) for axis, limits in place.file.valid if limits is not None

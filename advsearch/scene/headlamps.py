@@ -86,19 +86,20 @@ BEAM_OFFSET = 5.0 * GLASS_OFFSET
 
 
 def compute_candela(kind: str, h: Float64Array, v: Float64Array) -> Float64Array:
-    """Return the luminous intensity of one headlamp, "low" or "high"; see above.
+    """Return the luminous intensity of one headlamp in some directions, in candela.
 
-    In candela. The low beam is a narrow and a wide Gaussian to the sides, which fade
-    from the cut-off downwards, times a sigmoid that darkens what is above the cut-off.
-    The high beam adds a Gaussian around straight ahead.
+    The low beam is the sum of a narrow and a wide beam. Each is a Gaussian to the
+    sides, and fades exponentially from the cut-off downwards. A sigmoid darkens what is
+    above the cut-off. The high beam adds a Gaussian around straight ahead.
 
     Args:
         kind: "low" or "high".
-        h: degrees aside, of any shape.
+        h: degrees to the side, of any shape.
         v: degrees above the horizon, of the same shape.
     """
     below_cut_off = CUT_OFF - v
-    # candela, and the beams' widths in degrees
+    # 14500 and 4000 are candela. The standard deviations to the side (5 and 16) and the
+    # angles in which a beam falls by the factor e (1.5 and 5) are in degrees.
     narrow_beam = 14500.0 * np.exp(
         -((h / 5.0) ** 2) / 2.0 - below_cut_off.clip(0.0) / 1.5
     )
@@ -119,9 +120,13 @@ def compute_candela(kind: str, h: Float64Array, v: Float64Array) -> Float64Array
 def make_candela_table(kind: str) -> Float32Array:
     """Return the intensities (ROWS, COLUMNS) of one headlamp on a plane before it.
 
-    In candela; row 0 on top. The plane is at a distance of 1: a texel's position on it
-    is the tangent of its angle, up to `TABLE_HALF_WIDTH` to the side. Over the outer
-    tenth at each border they fade to zero.
+    Intensities are in candela, and row 0 is on top. The plane is at a distance of 1, so
+    that a texel's position on it is the tangent of its angle. It reaches to
+    `TABLE_HALF_WIDTH` on each side. In the outer tenth at each border the intensities
+    fade to zero, so that no edge is seen.
+
+    Args:
+        kind: "low" or "high".
     """
     half_height = TABLE_HALF_WIDTH * ROWS / COLUMNS
     side_tangent, up_tangent = np.meshgrid(
@@ -144,9 +149,9 @@ def make_candela_table(kind: str) -> Float32Array:
 def add_lamps(scene: AnyScene) -> AnyScene:
     """Return the scene with the lamps that are on, and no others.
 
-    Its object, its things and the car of its camera may carry lamps. Lamps that the
-    scene has already are replaced. The same scene is returned if it has none and gets
-    none.
+    The object, the things beside it and the camera's own car may carry lamps. Lamps
+    that the scene has already are replaced. If no lamp is on and none was there, the
+    same scene is returned.
 
     Raises:
         InputError: the light of the environment has no unit, the object's size is not
@@ -171,7 +176,8 @@ def add_lamps(scene: AnyScene) -> AnyScene:
         return replace(scene, parts=other_parts) if had_lamps else scene
     radiance_unit = _check_units(scene, next(iter(kind_by_lit_carrier)))
     scene = replace(scene, parts=other_parts)
-    # Two beams of each car: together they are sampled as often as the environment.
+    # Each car has two beams. With this weight all beams together are sampled as often
+    # as the environment.
     weight = 1.0 / (2 * len(kind_by_lit_carrier))
     lamps: list[ScenePart] = []
     for carrier, kind in kind_by_lit_carrier.items():
@@ -188,8 +194,12 @@ def add_lamps(scene: AnyScene) -> AnyScene:
 def _check_units(scene: SceneData, carrier: str) -> float:
     """Return the luminance of a radiance of 1, cd/m2, in the scene's environment.
 
-    `carrier` is what has lamps, for the message. Raises InputError: the environment has
-    no unit, or the object's size in metres is not known.
+    Args:
+        scene: the scene.
+        carrier: name of what has lamps, for the message.
+
+    Raises InputError: the environment's light has no unit, or the object's size in
+    metres is not known.
     """
     settings = {"object": "`set` object.lamps", CAMERA: "`set` camera.lamps"}
     setting = settings.get(carrier, "things: lamps")
@@ -231,8 +241,8 @@ def _make_lamps(
         scene: scene in which they shine.
         carrier: the mesh that carries them, or `CAMERA`.
         kind: beam, "low" or "high".
-        radiance_unit: luminance of a radiance of 1, cd/m2.
-        weight: weight of each beam, see `BeamLamp`.
+        radiance_unit: luminance in cd/m2 of a radiance of 1 in the scene.
+        weight: how often each beam is sampled; the environment has 1.
     """
     if carrier == CAMERA:
         # in the coordinates of the camera's car, see `compute_car_pose`
@@ -253,8 +263,8 @@ def _make_lamps(
         yield headlamp_glass
         yield _make_glass(part, "taillamps", -1.0, units_per_metre, rear_power)
         positions = _find_beam_positions(headlamp_glass.mesh.vertices, units_per_metre)
-    # candela to the light's unit; lengths are in object sizes, and intensity is
-    # radiance times squared length
+    # From candela to the scene's unit. Intensity is radiance times squared length, and
+    # lengths are in object sizes.
     red, green, blue = map(float, WHITE / (radiance_unit * scene.size_in_metres**2))
     for name, position in zip(("left", "right"), positions, strict=True):
         yield BeamLamp(
@@ -283,14 +293,15 @@ def _count_units_per_metre(scene: SceneData, part: MeshPart) -> float:
 def _find_beam_positions(
     vertices: Float32Array, units_per_metre: float
 ) -> list[Float64Array]:
-    """Return where the left and the right beam start, before the glass of a car.
+    """Return where the left and the right beam of a car start.
 
-    The glass is one mesh: what lies to the left of its mean is the left lamp. A beam
-    starts `BEAM_OFFSET` before the middle of its lamp. The car drives along +x.
+    The glass of both lamps is one mesh. Its vertices to the left of their mean are the
+    left lamp. A beam starts `BEAM_OFFSET` in front of the middle of its lamp, so that
+    the glass does not hide it. The car drives along +x.
 
     Args:
-        vertices: (V, 3) of the glass.
-        units_per_metre: a metre in the car's coordinates.
+        vertices: (V, 3) of the glass, in the car's coordinates.
+        units_per_metre: length of a metre in the car's coordinates.
     """
     positions = []
     for side in (1.0, -1.0):  # +y is left
@@ -313,16 +324,17 @@ def _make_glass(
 ) -> LampGlass:
     """Return the glass of a car's two headlamps or tail lamps.
 
-    It is the faces of a material with such a name, moved out along their normals, or
-    else two disks before what is foremost there. It moves with the car's nearest
-    vertices.
+    If the car has a material with such a name, the glass is a copy of its faces, moved
+    out along their normals. Otherwise it is two disks in front of the car's body. The
+    glass moves with the car's nearest vertices.
 
     Args:
         part: the car.
-        lamp_type: lamp type of `MATERIAL_NAMES`.
+        lamp_type: "headlamps" or "taillamps", a key of `MATERIAL_NAMES`.
         facing: 1 for lamps that shine along +x, -1 along -x.
-        units_per_metre: a metre in the car's coordinates.
-        power: (3,) the radiance times square metres that each of the two sends there.
+        units_per_metre: length of a metre in the car's coordinates.
+        power: (3,) radiance times square metres, as seen from straight ahead, of each
+            of the two lamps.
     """
     mesh = part.mesh
     named_faces = [
@@ -337,7 +349,7 @@ def _make_glass(
     else:
         glass = _make_disks(mesh, lamp_type, facing, units_per_metre)
     corners = glass.vertices[glass.faces] / units_per_metre
-    # square metres, as seen from where the lamps shine to
+    # Square metres as seen from straight ahead: the x of the faces' area vectors.
     facing_area = facing * compute_area_vectors(corners)[:, 0] / 2.0
     glass_mesh = Mesh(
         vertices=glass.vertices.astype(np.float32),
@@ -345,7 +357,8 @@ def _make_glass(
         normals=glass.normals.astype(np.float32),
         uvs=mesh.uvs[glass.vertex_of_carrier],
     )
-    # the color of the light, not quite as bright as a base color may be
+    # The base color has the light's color, with 0.8 as its largest channel: no surface
+    # reflects all light.
     glass_color = (0.8 * power / power.max()).astype(np.float32)
     # two lamps send the power over the area of both
     radiance = 2.0 * power / max(float(facing_area.clip(0.0).sum()), 1e-9)
@@ -382,17 +395,17 @@ def _lift_faces(mesh: Mesh, face: IntArray, offset: float) -> _Glass:
 def _make_disks(
     mesh: Mesh, lamp_type: str, facing: float, units_per_metre: float
 ) -> _Glass:
-    """Make two disks before what is foremost of a car, for lamps without a material.
+    """Make two disks at the front or rear of a car, for lamps without a material.
 
-    They lie at the height and to the sides that `LAMP_HEIGHTS` and `LAMP_OFFSET` have,
-    and stand out from the car by `GLASS_OFFSET`. The first is that on the left (+y).
-    They belong to the car's nearest vertices and faces.
+    `LAMP_HEIGHTS` and `LAMP_OFFSET` tell how high and how far to the sides they are.
+    They stand out from the body by `GLASS_OFFSET`. The first is on the left (+y). Each
+    belongs to the car's nearest vertices and faces.
 
     Args:
         mesh: mesh of the car.
-        lamp_type: lamp type of `MATERIAL_NAMES`.
+        lamp_type: "headlamps" or "taillamps", a key of `LAMP_HEIGHTS`.
         facing: 1 for lamps that shine along +x, -1 along -x.
-        units_per_metre: a metre in the car's coordinates.
+        units_per_metre: length of a metre in the car's coordinates.
     """
     # mirrored for tail lamps, so that they look along +x too
     corners = mesh.vertices[mesh.faces].astype(np.float64) * [facing, 1.0, 1.0]
@@ -427,12 +440,12 @@ def _attach_disks(mesh: Mesh, disks: Sequence[Float64Array], facing: float) -> _
 
     Args:
         mesh: mesh of the car.
-        disks: vertices (1 + `N_SPOKES`, 3) of each: its center, and those on the rim.
+        disks: vertices (1 + `N_SPOKES`, 3) of each disk: its center, then its rim.
         facing: 1 for disks whose front is towards +x, -1 towards -x.
     """
     vertices = np.concatenate(disks)
     disk_faces = _make_disk_faces()
-    # those of the second disk count on behind the vertices of the first
+    # The vertices of the second disk follow those of the first.
     faces = np.concatenate([disk_faces, (1 + N_SPOKES) + disk_faces])
     normals = np.tile([[facing, 0.0, 0.0]], (len(vertices), 1))
     vertex_of_carrier = cKDTree(mesh.vertices).query(vertices)[1]
@@ -457,14 +470,14 @@ def _make_disk_faces() -> IntArray:
 
 
 def _find_foremost(corners: Float64Array, disk: Float64Array, default: float) -> float:
-    """Return the largest x of triangles where a disk covers them, seen along x.
+    """Return the largest x at which a line through a disk's vertex meets a face.
 
-    Only the triangles at the disk's vertices count, by their y and z, not their x.
+    The lines are along x, so that a disk at this x is in front of the car's body.
 
     Args:
-        corners: (F, 3, 3) of the triangles.
-        disk: (V, 3) vertices of the disk.
-        default: returned where none of them has a triangle before or behind it.
+        corners: (F, 3, 3) corners of the faces.
+        disk: (V, 3) vertices of the disk, whose x does not count.
+        default: result if no such line meets a face.
     """
     # (F, 3): per axis, whether the boxes of triangle and disk lie apart; x is not used
     is_disjoint = (corners.min(axis=1) > disk.max(axis=0)) | (

@@ -43,6 +43,9 @@ CALIBRATION_ANGLES = (10.0, 35.0, 65.0, 80.0)  # of these edges, degrees
 def measure_noise(levels: npt.NDArray[np.uint8]) -> Float64Array:
     """Return the standard deviation (3,) of the noise of an image, in levels.
 
+    A high-pass filter removes what is smooth. Blocks of pixels are compared, and those
+    with the smallest residuals count, since the others have texture.
+
     Args:
         levels: (H, W, 3) 8-bit sRGB.
     """
@@ -59,7 +62,7 @@ def measure_noise(levels: npt.NDArray[np.uint8]) -> Float64Array:
         if len(usable):
             medians = np.median(usable, axis=1)
             sigma = MEDIAN_TO_SIGMA * float(np.quantile(medians, QUIET_FRACTION))
-        # without what rounding to levels adds
+        # The rounding to whole levels adds a variance of its own, which is subtracted.
         sigmas.append(np.sqrt(max(0.0, sigma**2 - ROUNDING_VARIANCE)))
     return np.array(sigmas)
 
@@ -105,27 +108,31 @@ def measure_blur(image: Float32Array) -> float:
 def _measure_edges(image: Float64Array) -> float | None:
     """Return the blur of the sharper edges of an image (H, W); None if it has too few.
 
-    In pixels, a standard deviation, by the ratio of an edge's slopes in two copies that
-    are blurred by `NARROW` and `WIDE`: the sharper an edge is, the more it loses.
+    The blur is the standard deviation of a Gaussian, in pixels. Two copies of the image
+    are blurred, by `NARROW` and by `WIDE`. The sharper an edge is, the more of its
+    slope the wide blur takes away: so the ratio of the two slopes tells the edge's own
+    blur.
     """
     row_slope = np.abs(ndimage.gaussian_filter(image, NARROW, order=(1, 0)))
     column_slope = np.abs(ndimage.gaussian_filter(image, NARROW, order=(0, 1)))
     narrow = np.hypot(row_slope, column_slope)
     wide = ndimage.gaussian_gradient_magnitude(image, WIDE)
-    # the steepest pixel across the edge
+    # An edge counts at its steepest pixel, in the direction across it.
     is_steepest_row = narrow >= ndimage.maximum_filter(narrow, size=(3, 1))
     is_steepest_column = narrow >= ndimage.maximum_filter(narrow, size=(1, 3))
     is_edge = np.where(row_slope > column_slope, is_steepest_row, is_steepest_column)
-    # relative to the steepest of the image, but for a few outliers
+    # Weak edges are left out. The quantile stands for the steepest slope of the image,
+    # without outliers.
     is_edge &= narrow > MIN_SLOPE * float(np.quantile(narrow, 0.995))
-    # the filters reach over the border there
+    # So near to the border the filters reach beyond it.
     margin = int(3 * WIDE)
     is_edge[:margin] = is_edge[-margin:] = False
     is_edge[:, :margin] = is_edge[:, -margin:] = False
     if is_edge.sum() < MIN_EDGES:
         return None
     ratio = (narrow[is_edge] / np.maximum(wide[is_edge], 1e-12)) ** 2
-    # 1.01: so blurred that both copies are alike; the upper end: not blurred at all
+    # The ratio of an edge without blur is the upper bound. That of a very blurred edge
+    # goes to 1, where the solution below would be infinite: hence 1.01.
     ratio = np.clip(ratio, 1.01, (WIDE / NARROW) ** 2)
     # An edge blurred by s has the ratio (s^2 + WIDE^2) / (s^2 + NARROW^2): solved for
     # s^2.
@@ -135,10 +142,11 @@ def _measure_edges(image: Float64Array) -> float | None:
 
 @lru_cache(maxsize=1)
 def _calibrate() -> tuple[Float64Array, Float64Array]:
-    """Return blurs (N,), and what is measured on edges that are blurred so, pixels.
+    """Return blurs (N,), and what `_measure_edges` gives for edges with these blurs.
 
-    The edges are straight, at several angles, and averaged over pixels as a renderer
-    does: what is measured on an edge without further blur is not 0.
+    Both are in pixels. The edges are straight, at several angles, and averaged over
+    pixels as a renderer does. That blurs an edge already, so that the measurement of an
+    edge without further blur is not 0: a measurement is corrected by this table.
     """
     oversampling = 8
     size = CALIBRATION_SIZE

@@ -42,11 +42,18 @@ MATERIAL_MAP_SIDE = 256  # texels along the maps of roughness, metal and clear c
 def make_finished_surface(
     mesh: Mesh, finishes: Mapping[str, Material], main: Material
 ) -> dict[str, object]:
-    """Return a principled surface, in Mitsuba's words, as `ObjectAsset.surface` has it.
+    """Return Mitsuba's description of a principled surface with several finishes.
 
-    Some materials of the mesh are as `finishes` say, by name, and all other faces like
-    `main`, whose `specular` holds for all. Roughness, metallic and clear coat become
-    textures whose texels are not interpolated.
+    Roughness, metallic and clear coat become textures. Their texels are not
+    interpolated, so that the border between two materials stays sharp.
+
+    Args:
+        mesh: mesh whose faces have materials by name.
+        finishes: numbers of some materials, by name.
+        main: numbers of all other faces. Its `specular` holds for all faces.
+
+    Returns:
+        A dictionary as `ObjectAsset.surface` has it.
     """
     face_values = np.tile(
         [main.roughness, main.metallic, main.clearcoat], (len(mesh.faces), 1)
@@ -132,6 +139,9 @@ def _read_environment_facts() -> dict[str, dict[str, Any]]:
 def load_object(name: str) -> ObjectAsset:
     """Return a bundled object, its largest extent 1, standing on z = 0.
 
+    Args:
+        name: its name, such as "mug".
+
     Raises:
         FileFormatError: the installation is damaged.
         UnknownNameError: there is no such object.
@@ -180,8 +190,8 @@ def _read_mesh(
     Args:
         name: name of the object, for messages.
         directory: directory of its files.
-        material_runs: names of materials, each with how many faces in a row have it;
-            empty: the mesh has no materials by name.
+        material_runs: in the order of the faces, a material's name and how many
+            successive faces have it. It is empty if the mesh has no named materials.
     """
     # (F,) name of each face's material
     material_of_face = np.repeat(
@@ -223,6 +233,11 @@ def make_person(defaults: Mapping[str, float] = MappingProxyType({})) -> Person:
 
 def load_environment(name: str) -> EnvironmentAsset:
     """Return a bundled environment.
+
+    Several environments may share one map, with different grounds.
+
+    Args:
+        name: name of the environment.
 
     Raises:
         FileFormatError: the installation is damaged.
@@ -281,10 +296,17 @@ class LightImage:
 def read_light(path: Path, label: str = "environment") -> LightImage:
     """Read an ``.hdr`` or ``.exr`` image of any shape.
 
-    Its rows become floats only when they are read, so that a large one takes less
-    memory. Errors are those of `import_environment`; radiance that is not finite, or
-    negative, is one, of which the message names the first texel. `label` is what the
-    image is, for messages.
+    Its rows become floats only when they are read, so that a large image takes less
+    memory.
+
+    Args:
+        path: the file.
+        label: what the image is, for messages.
+
+    Raises:
+        FileFormatError: the file is missing, of another kind, damaged, or lacks
+            channels.
+        InputError: values are negative, NaN or infinite.
     """
     data = read_bytes(path, label, ENVIRONMENT_SUFFIXES)
     if path.suffix.lower() == ".hdr":
@@ -342,7 +364,7 @@ def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
 
     Raises:
         FileFormatError: the file is missing, of another kind, damaged, or lacks
-            channels; the message names it.
+            channels.
         InputError: values are negative, NaN or infinite; the message counts them and
             gives the first position.
     """
@@ -375,8 +397,12 @@ def _resize_map(
 ) -> Float32Array:
     """Bring a map to a size from `MIN_MAP_SIZE` to `MAX_MAP_SIZE`.
 
-    A larger one is averaged down, both sides by the same factor; the texels of a
-    smaller one are repeated. `read_rows` and `size` are as in `LightImage`.
+    A larger map is averaged down, both sides by the same factor. The texels of a
+    smaller one are repeated.
+
+    Args:
+        read_rows: returns the rows (n, W, 3) from a first row to an end.
+        size: height and width of the map.
     """
     height, width = size
     shrink = min(1.0, MAX_MAP_SIZE[0] / height, MAX_MAP_SIZE[1] / width)
@@ -401,9 +427,13 @@ def _average_map(
 ) -> Float32Array:
     """Average a map down to a shape, weighted by the solid angles of its texels.
 
-    These go by the sine of the angle between their row and straight up. The weighted
-    texels are averaged, and divided by the averaged weights. `read_rows` and `size` are
-    as in `LightImage`.
+    The solid angle is proportional to the sine of the angle between a texel's row and
+    straight up. The weighted texels are averaged, and divided by the averaged weights.
+
+    Args:
+        read_rows: returns the rows (n, W, 3) from a first row to an end.
+        size: height and width of the map.
+        target_shape: height and width of the result.
     """
     height = size[0]
     polar = (np.arange(height, dtype=np.float32) + np.float32(0.5)) * np.float32(

@@ -57,10 +57,14 @@ class VisibleMesh:
 def find_visible_meshes(
     renderer: Renderer, u: Tensor, names: Collection[str] | None = None
 ) -> list[VisibleMesh]:
-    """Return the meshes that the image of a configuration (d,) shows.
+    """Return the meshes that are visible in the image of a configuration.
 
-    A mesh counts if it is seen first in a pixel. With `names` only those are
-    considered.
+    A mesh is visible if it is the nearest surface in at least one pixel.
+
+    Args:
+        renderer: renderer of the scene.
+        u: (d,) configuration.
+        names: the meshes that are considered; None for all.
     """
     description = renderer.scene.definition[0]
     surfaces = renderer.surfaces(u)
@@ -87,11 +91,12 @@ def _compare_outline(
         renderer: renderer of the scene.
         inputs: inputs of the scene, assembled.
         name: name of the mesh.
-        mask: (H, W) the pixels in which it is seen first.
+        mask: (H, W) bool, the pixels in which the mesh is the nearest surface.
 
     Returns:
         The fraction of the outline that is visible, and whether the outline goes on
-        beyond the image. Both are None where the outline is not known.
+        beyond the image. Both are None if the outline is not known: the faces do not
+        tell it, or it does not cover the visible pixels.
     """
     height, width = mask.shape
     corners = _project_faces(renderer, inputs, name, (height, width))
@@ -126,8 +131,9 @@ def _project_faces(
 ) -> Float64Array | None:
     """Project the corners of a mesh's faces to pixels (F, 3, 2) from the top left.
 
-    None where the faces do not tell the outline: with cut-outs, at the seam of a
-    panorama, or where the mesh reaches behind the camera.
+    The result is None if the faces do not tell the outline: the mesh has cut-outs or
+    reaches behind the camera, or the image is a panorama, at whose seam a face is
+    divided.
 
     Args:
         renderer: renderer of the scene.

@@ -180,14 +180,15 @@ class SpotLamp(_Point):
     def to_world(self) -> Float64Array:
         """(4, 4) pose of the lamp, which shines along its own +z.
 
-        How it is turned about that axis does not matter.
+        The cone is round, so that any rotation about that axis will do.
         """
         forward = (
             np.array(self.direction)
             if any(self.direction)
             else np.array([0.0, 0.0, -1.0])
         )
-        # perpendicular to the axis of the world that is the least parallel to it
+        # The cross product with the axis of the world that is least parallel to the
+        # direction: with a parallel one it would be 0.
         right = np.cross(np.eye(3)[np.abs(forward).argmin()], forward)
         right /= np.linalg.norm(right)
         return make_pose(
@@ -275,9 +276,12 @@ class BeamLamp(ScenePart):
     ) -> tuple[Float64Array, Float64Array]:
         """Return the vector (3,) from a position to the lamp, and its irradiance (3,).
 
-        The irradiance is that of a surface that faces the lamp: the intensity in that
-        direction, from the table, over the squared distance. It is 0 behind the lamp
-        and outside of its table.
+        The irradiance is that of a surface that faces the lamp: the intensity in its
+        direction, which the table has, divided by the squared distance. It is 0 behind
+        the lamp and outside of the table.
+
+        Args:
+            position: (3,) in world space.
         """
         to_lamp = self.to_world[:3, 3] - position
         # the position in the lamp's axes: x to the table's right, y up, z ahead
@@ -425,10 +429,11 @@ def make_polygon(corners: int) -> Mesh:
 def make_sphere(rows: int, columns: int) -> Mesh:
     """Return a sphere of diameter 1 around the origin.
 
-    It has `rows` bands from pole to pole and `columns` around. Each cell between them
-    is two faces, and one at the poles, where the other would have no area: 2 (rows - 1)
-    times `columns` in all. v is 1 at the top; u goes around from +x to +y. Vertices
-    lie row by row from the bottom, `columns` + 1 in each, as a seam needs both ends.
+    A grid of `rows` bands from pole to pole and `columns` around divides it into cells.
+    A cell has two faces, but only one at a pole, where the other would have no area. So
+    there are 2 (rows - 1) columns faces. The texture coordinate v is 1 at the top, and
+    u goes around from +x to +y. Vertices are in rows from the bottom, with columns + 1
+    in each: the first and the last are at one position, where u is 0 and 1.
     """
     v, u = (
         array.ravel()

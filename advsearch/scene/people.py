@@ -194,6 +194,10 @@ class Person:
 
         Lengths become metres. Weights, which are stored as integers, are divided so
         that those of a point sum to 1.
+
+        Args:
+            data: arrays of the file of a body, by name.
+            defaults: values of parameters that differ from their usual defaults.
         """
         default_by_name = {
             parameter.name: float(parameter.default) for parameter in PARAMETERS
@@ -241,8 +245,8 @@ class Person:
         The pelvis is above the origin, and the lowest vertex on z = 0.
 
         Args:
-            values: scalar tensors by the names of `PARAMETERS`; this person's default
-                if one is missing.
+            values: scalar tensors by the names of `PARAMETERS`, such as "left_knee" in
+                degrees. Those that are missing have this person's defaults.
         """
         number_by_name = self._complete_values(values)
         device = number_by_name["height"].device
@@ -264,16 +268,19 @@ class Person:
     def _compute_leg_corrections(
         self, points: Tensor, joints: Tensor, number_by_name: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return by how many metres each foot has to rise, "l" and "r".
+        """Return the metres by which each foot has to rise to walk on the ground.
 
-        Then a foot in stance touches the ground. The heights are those of the shoes'
-        lowest points with the walk alone: joint angles that a user sets on top are left
-        as they are, so a raised foot stays raised.
+        With the correction, a foot in stance touches the ground. It is computed for the
+        walk alone, without the joint angles that a user sets in addition: a foot that
+        the user raises stays raised.
 
         Args:
-            points: (P, 3) in the rest pose, without the joints.
-            joints: (J, 3) in the rest pose.
-            number_by_name: the values of all parameters.
+            points: (P, 3) points of the body in the rest pose.
+            joints: (J, 3) positions of the joints in the rest pose.
+            number_by_name: scalar tensors of all parameters.
+
+        Returns:
+            The rise of the left foot, "l", and of the right one, "r".
         """
         zero = torch.zeros_like(number_by_name["walk"])
         without_joints = {parameter.name: zero for parameter in (*SPINE, *_JOINTS)}
@@ -300,18 +307,19 @@ class Person:
         joints: Tensor,
         foot_rises: Mapping[str, Tensor],
     ) -> Tensor:
-        """Return posed points (P, 3) with feet risen, and legs stretched in proportion.
+        """Return posed points (P, 3) with raised feet and legs stretched to them.
 
         A point of the foot rises by all of the foot's rise. A point of the leg rises by
-        the fraction of the way from hip (0) to ankle (1) at which it is. Points count
-        by their skinning weights for these bones, so that the body stays as it is.
+        a fraction of it, from 0 at the hip to 1 at the ankle. Each rise is multiplied
+        by the point's skinning weight for these bones, so that the rest of the body
+        stays as it is.
 
         Args:
             posed: (P, 3) points after skinning.
-            rotations, translations: rotations and translations of the bones, see
-                `_pose_bones`.
-            joints: (J, 3) in the rest pose.
-            foot_rises: how much each foot rises, "l" and "r".
+            rotations: (J, 3, 3) rotations of the bones.
+            translations: (J, 3): a point p of a bone moves to rotation p + translation.
+            joints: (J, 3) positions of the joints in the rest pose.
+            foot_rises: metres by which the left ("l") and the right foot ("r") rise.
         """
         weights = self._get_tensor("weights", posed.device)
         rise = torch.zeros_like(posed[:, 2])
@@ -366,6 +374,10 @@ class Person:
     ) -> tuple[Tensor, Tensor]:
         """Return the mixture of extreme bodies, and the scale that it still needs.
 
+        Args:
+            number_by_name: scalar tensors of the parameters; gender, age, weight and
+                height are read.
+
         Returns:
             (G, A, W, H) weights of the extremes of gender, age, weight and height,
             which sum to 1; and the factor to the requested height.
@@ -381,7 +393,8 @@ class Person:
             number_by_name["weight"],
             number_by_name["weight"].new_tensor([0.0, 0.5, 1.0]),
         )
-        # (G, A, W); and heights (H,) of bodies so mixed, at the three extremes
+        # The mixture (G, A, W) without the height, and the heights (H,) in metres of
+        # the shortest, the average and the tallest body of that mixture.
         mixture = torch.einsum(
             "g,a,w->gaw", gender_weights, age_weights, weight_weights
         )
@@ -400,8 +413,12 @@ class Person:
     def _shape_body(self, mixture: Tensor) -> tuple[Tensor, Tensor]:
         """Return the points (P, 3) and the joints (J, 3) of a body at rest.
 
-        `mixture` (G, A, W, H) are the weights of the extremes of gender, age, weight
-        and height, see `_mix_phenotype`. Joints are in the order of bones.
+        Args:
+            mixture: (G, A, W, H) weights of the extreme bodies of each gender, age,
+                weight and height, which sum to 1.
+
+        Returns:
+            The points, and the joints in the order of bones.
         """
         device = mixture.device
         # the factors of R shapes, each of which moves all points
@@ -419,14 +436,15 @@ class Person:
     ) -> tuple[Tensor, Tensor]:
         """Return the rotation (J, 3, 3) and translation (J, 3) of each bone.
 
-        A point p moves to `rotation @ p + translation`. A bone's rotation is first the
-        one that makes it straight, from the rest pose to all angles 0; then its own
-        joint's and those of its ancestors' joints. Its joint goes where the parent bone
-        puts it. Bones come after their parents, which is why one pass is enough.
+        A point p moves to `rotation @ p + translation`. A bone is rotated first from
+        the rest pose to the pose with all angles 0, in which limbs are straight; then
+        by its own joint and by those of all its ancestors. Its joint goes where the
+        parent bone moves it. Bones come after their parents, so that one pass is
+        enough.
 
         Args:
-            joints: (J, 3) positions in the rest pose.
-            angle_by_joint: degrees.
+            joints: (J, 3) positions of the joints in the rest pose.
+            angle_by_joint: degrees by parameter, such as "left_knee".
         """
         straight_rotations = self._compute_straight_turns(joints)
         rotation_by_bone = compute_joint_turns(angle_by_joint)
@@ -447,7 +465,8 @@ class Person:
             rotations.append(rotation @ straight_rotations.get(bone, identity))
             positions.append(position)
         all_rotations = torch.stack(rotations)
-        # so that the joint itself moves to its position
+        # The translation is position - rotation joint, so that the joint itself moves
+        # to its position.
         return all_rotations, torch.stack(positions) - torch.einsum(
             "jik,jk->ji", all_rotations, joints
         )
@@ -455,9 +474,15 @@ class Person:
     def _compute_straight_turns(self, joints: Tensor) -> dict[str, Tensor]:
         """Return the rotations (3, 3) of limbs from the rest pose to all angles 0.
 
-        They are by bone, such as "thigh_l"; each turns the bone, which leads from its
-        joint to the next, to its direction in `STRAIGHT`. Hands follow the forearm, and
-        are turned by 60 degrees about the vertical in addition. `joints` are (J, 3).
+        A bone goes from its joint to the next one. Its rotation is the smallest that
+        turns it to its direction in `STRAIGHT`. Hands follow the forearm, and are also
+        rotated by 60 degrees about the vertical.
+
+        Args:
+            joints: (J, 3) positions in the rest pose.
+
+        Returns:
+            The rotations by bone, such as "thigh_l".
         """
         rotations = dict[str, Tensor]()
         for side, sign in (("l", 1.0), ("r", -1.0)):
@@ -488,8 +513,12 @@ def load_body() -> Mapping[str, np.ndarray]:
 def compute_interpolation_weights(value: Tensor, nodes: Tensor) -> Tensor:
     """Return the weights (n,) of linear interpolation between rising nodes (n,).
 
-    They sum to 1 from the first node to the last, and beyond these the nearest node has
-    all of the weight.
+    Between two nodes these have weights that sum to 1, and all others 0. Before the
+    first and after the last node, that node has the weight 1.
+
+    Args:
+        value: () where to interpolate.
+        nodes: (n,) rising positions of the nodes.
     """
     # how far the value is through each of the n - 1 intervals
     fraction = (value - nodes[:-1]) / (nodes[1:] - nodes[:-1])
@@ -507,9 +536,13 @@ def compute_interpolation_weights(value: Tensor, nodes: Tensor) -> Tensor:
 def add_walk(angle_by_name: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return the angles of joints with those of a walk added, within their limits.
 
-    A walk swings each joint by `GAIT`, scaled by the stride; the right side is half a
-    cycle behind the left. All are scalar tensors by parameter, degrees; other
-    parameters are returned as they are.
+    `GAIT` has the angles of each joint over one cycle, which the stride multiplies. The
+    right side is half a cycle behind the left.
+
+    Args:
+        angle_by_name: scalar tensors by parameter, degrees: "walk" is the phase of the
+            cycle, and "stride" the factor. Other parameters, which are no angles, are
+            returned as they are.
     """
     angle_by_joint = dict(angle_by_name)
     phase = torch.deg2rad(angle_by_name["walk"])
@@ -540,9 +573,9 @@ def _compute_gait_angle(
 ) -> Tensor:
     """Return an angle of the gait, degrees, at a phase.
 
-    The ten samples of a cycle are interpolated by their Fourier series, smooth and
-    periodic. Of its waves 0 to 5 the highest is left out: ten samples do not tell its
-    phase.
+    The ten samples of a cycle are interpolated by their Fourier series, which is smooth
+    and periodic. It has waves of the orders 0 to 5. The last is left out, since ten
+    samples do not determine its phase.
 
     Args:
         tenths: degrees at each tenth of the cycle.
@@ -578,16 +611,16 @@ def compute_contact(phase: Tensor) -> Tensor:
 def skin_points(
     points: Tensor, weights: Tensor, rotations: Tensor, translations: Tensor
 ) -> Tensor:
-    """Return points (P, 3) moved with bones: linear blend skinning.
+    """Return points (P, 3) moved with bones, by linear blend skinning.
 
-    A point moves by the weighted mean of the maps of all bones, `rotation @ p +
-    translation`.
+    A bone moves a point p to `rotation @ p + translation`. The result is the weighted
+    mean over all bones.
 
     Args:
-        points: (P, 3).
-        weights: (P, J) of the bones, which sum to 1 for each point.
-        rotations: (J, 3, 3) of the bones.
-        translations: (J, 3).
+        points: (P, 3) points at rest.
+        weights: (P, J) weight of each bone; they sum to 1 for each point.
+        rotations: (J, 3, 3) rotations of the bones.
+        translations: (J, 3) translations of the bones.
     """
     # (P, 12): the weighted mean of the bones' rotations and translations
     blended = torch.einsum(
@@ -604,12 +637,13 @@ def _correct_heights(
 ) -> dict[str, Tensor]:
     """Return how much each foot has to rise to touch the ground, "l" and "r".
 
-    The ground is taken to lie at the mean height of both feet, weighted by contact. A
-    foot with full contact goes there; one without keeps its height above it, but is not
-    below it; between them in proportion. A negative rise lowers the foot.
+    The ground is assumed at the mean height of both feet, weighted by contact. A foot
+    with full contact is moved to the ground. A foot without contact keeps its height
+    above the ground, but is not left below it. In between it is in proportion. A
+    negative rise lowers the foot.
 
     Args:
-        lowest: height of the lowest point of each foot, "l" and "r".
+        lowest: height in metres of the lowest point of each foot, "l" and "r".
         contact: contact of each foot with the ground, 0 to 1.
         amount: () fraction of the correction that is made.
     """
@@ -626,8 +660,11 @@ def _correct_heights(
 def compute_joint_turns(angle: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return each bone's rotation (3, 3) against its parent, by the bone's name.
 
-    About the body's axes: x ahead, y to its left, z up. Bones without a parameter are
-    left out. `angle` are degrees by parameter.
+    Rotations are about the body's axes: x ahead, y to its left, z up. Bones that no
+    parameter rotates are left out.
+
+    Args:
+        angle: degrees by parameter, such as "left_knee".
     """
     # The back bends in three equal parts; neck and head have a half each.
     spine, side, turn = (
@@ -656,10 +693,11 @@ def compute_joint_turns(angle: Mapping[str, Tensor]) -> dict[str, Tensor]:
 def _compute_limb_turns(
     angle_by_joint: Mapping[str, Tensor], side: str, sign: float
 ) -> dict[str, Tensor]:
-    """Return the turns (3, 3) of the bones of arm and leg of a side, by bone.
+    """Return the rotations (3, 3) of the bones of one arm and one leg, by bone.
 
-    With all angles 0 a limb hangs down. About y (to the left) a negative angle raises
-    it ahead; about x (ahead) a positive one raises the left one to its side.
+    With all angles 0 a limb hangs down. A rotation about y (to the left) by a negative
+    angle raises it to the front. One about x (ahead) by a positive angle raises the
+    left limb to its side.
 
     Args:
         angle_by_joint: degrees by parameter, such as "left_knee".

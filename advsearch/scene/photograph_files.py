@@ -96,8 +96,9 @@ def read_photograph_view(spec: str | Path) -> PhotographView:
     The photograph itself is not read.
 
     Args:
-        spec: a picture file, perhaps with the part to use, which is used in the place
-            of the file's.
+        spec: a picture file, perhaps with the part to use,
+            ``photo.jpg#X,Y,WIDTH,HEIGHT``, which replaces the part that the camera file
+            states.
 
     Raises:
         FileFormatError: the file cannot be used.
@@ -128,7 +129,7 @@ def read_photograph_folder(
 ) -> dict[str, PhotographView]:
     """Read the camera files of all photographs of a folder.
 
-    Other files, hidden ones and folders in it are not looked at.
+    Other files, hidden files and subfolders are ignored.
 
     Args:
         folder: the folder.
@@ -140,9 +141,9 @@ def read_photograph_folder(
 
     Raises:
         FileFormatError: there are no photographs or too many, or they have too many
-            pixels; one needs a camera file and has none, or its file states other
-            things than that of the first; a file leads out of the folder or cannot be
-            used.
+            pixels; a camera file is missing, or does not state the same kinds of
+            things as the first one; a link leads out of the folder; or a file cannot
+            be used.
     """
     directory = Path(folder)
     views: dict[str, PhotographView] = {}
@@ -224,8 +225,8 @@ def _parse_view(
 
     Args:
         file: path of the camera file.
-        photograph: path of the photograph that it stands beside.
-        entries: entries of the file, by name.
+        photograph: path of its photograph, in the same folder.
+        entries: entries of the camera file, by name.
     """
     stated = {name: entries[name] for name in VIEW_KEYS & entries.keys()}
     has_lens = bool(entries.keys() - VIEW_KEYS)  # all else is about the lens
@@ -263,11 +264,11 @@ def _parse_numbers(
     Args:
         file: path of the camera file, for messages.
         name: name of the entry.
-        stated: entries of the file.
-        counts: how many numbers it may have.
+        stated: entries of the file, by name.
+        counts: how many numbers it may have, such as (12, 16).
 
     Raises:
-        FileFormatError: it has others.
+        FileFormatError: it has another number of numbers, or other values.
     """
     value = stated[name]
     if isinstance(value, Mapping):  # a matrix as OpenCV writes it
@@ -287,7 +288,15 @@ def _parse_numbers(
 
 
 def _parse_settings(file: Path, stated: object) -> dict[str, float]:
-    """Return the settings of the scene that a camera file states as `set`."""
+    """Return the settings of the scene that a camera file has in its entry `set`.
+
+    Args:
+        file: path of the camera file, for messages.
+        stated: the entry: settings by name, such as {"ground.level": 0.2}.
+
+    Raises FileFormatError: it has other settings than those of the view, or values out
+    of their range.
+    """
     if not isinstance(stated, Mapping):
         raise FileFormatError(f"{file}: set: expected settings by name")
     for name in stated:
@@ -332,8 +341,9 @@ def put_into_photograph(
     Args:
         description: the scene.
         view: the photograph, and what its camera file states.
-        camera: a camera in the place of the file's, or the cameras of many photographs.
-        occluder: a mask in the place of the file's.
+        camera: replaces the camera of the camera file: a camera file or a name, or the
+            cameras of many photographs, of which that of this photograph is taken.
+        occluder: replaces the mask of what is before the object.
 
     Raises:
         FileFormatError: a file cannot be used.
@@ -344,8 +354,8 @@ def put_into_photograph(
         for name, value in view.settings.items()
         if name not in description.requested
     }
-    # As if the user had requested them: a control may not vary the ground, say. It may
-    # vary the pose.
+    # What the file states counts as requested by the user, so that a control may not
+    # vary the ground, for example. Camera and pose may be varied.
     fixed = {name for name in stated if not name.startswith(("camera.", "pose."))}
     scene = replace(
         description,

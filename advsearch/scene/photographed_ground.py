@@ -67,10 +67,10 @@ class Photograph:
     def _make_mesh(self, height: float, rotation: float) -> Mesh:
         """Make rings of faces around the point below the camera.
 
-        Radii are in heights of the camera: a ring at radius r is seen atan(r) away from
-        straight down, and that angle is its row in the map. The plane's texture is the
-        lower half of the map, `compute_reflectance`; texture coordinates are a point's
-        column and row in it.
+        Radii are in heights of the camera. The camera sees a ring of radius r at the
+        angle atan(r) from straight down, and that angle is its row in the map. The
+        plane's texture is the lower half of the map, and the texture coordinates of a
+        vertex are its column and row in it.
 
         Args:
             height: height of the camera, object sizes.
@@ -89,8 +89,8 @@ class Photograph:
         # The map's first row is straight up, its last one straight down.
         angle_from_up = math.pi - np.arctan(radius)
         map_row = angle_from_up / math.pi * (self._map_rows - 1)
-        # the texture's rows begin at the horizon, and v is 1 at its upper border, half
-        # a row above the middle of row 0
+        # The texture's rows begin at the horizon. v is 1 at its upper border, which is
+        # half a row above the center of row 0.
         texture_row = map_row - self._horizon_row
         n_texture_rows = self._map_rows - self._horizon_row
         v = 1.0 - (texture_row + 0.5) / n_texture_rows
@@ -108,18 +108,18 @@ class Photograph:
     def compute_reflectance(self, radiance: Tensor) -> Tensor:
         """Return the plane's texture (h, W, 3) for a map (H, W, 3) of any size.
 
-        Row 0 is the horizon, the last one is straight down, and columns are those of
-        the map. The height h is that of the lower half of the map that the plane was
-        made of: a map of another size is interpolated to these rows. A reflectance is
-        pi times radiance over irradiance, and 0 where no light comes from above.
-        Differentiable.
+        Row 0 is the horizon, the last row is straight down, and columns are those of
+        the map. The plane was made for a map of some height, and h is half of that: the
+        rows of another map are interpolated. The reflectance is pi * radiance /
+        irradiance, with which the plane looks like the map; it is 0 if no light comes
+        from above. The result is differentiable.
         """
         rows = radiance.shape[0]
         # where the rows of the plane's own map lie in this one
         map_row = torch.arange(
             self._horizon_row, self._map_rows, device=radiance.device
         ) * ((rows - 1) / (self._map_rows - 1))
-        # at most the last but one, so that there is a next row
+        # The row above is at most the last but one, so that there is a next row.
         upper = map_row.floor().long().clamp_max(rows - 2)
         fraction = (map_row - upper)[:, None, None].to(radiance.dtype)
         lower_half = radiance[upper] + fraction * (

@@ -16,7 +16,8 @@ from advsearch.scene.settings import POSE
 def make_rotation(yaw: float, pitch: float, roll: float) -> Float64Array:
     """Return `Rz(yaw) Ry(pitch) Rx(roll)`, angles in degrees, as a (3, 3) matrix.
 
-    That is first a turn about x by the roll, then about y, then about z.
+    It rotates first about x by the roll, then about y by the pitch, then about z by the
+    yaw.
     """
     # cosine and sine of each
     (cz, sz), (cy, sy), (cx, sx) = (
@@ -30,11 +31,15 @@ def make_rotation(yaw: float, pitch: float, roll: float) -> Float64Array:
 
 
 def apply_settings(part: MeshPart, values: Mapping[str, float | None]) -> MeshPart:
-    """Return a mesh around the object as the settings have it.
+    """Return a mesh around the object with its settings applied.
 
-    It is posed about its own middle, where it stands, by the settings `pose:NAME.yaw`
-    and so on, and stays on the height that it stands on; without any it stays as it is.
-    Its material is set by `material:NAME.roughness` and so on.
+    Settings such as `pose:NAME.yaw` pose it about its own middle, and its lowest point
+    stays at the same height. Settings such as `material:NAME.roughness` change its
+    material. Without settings of its own the mesh stays as it is.
+
+    Args:
+        part: the mesh.
+        values: all settings of the scene by name.
     """
     parameters = {}
     for parameter in POSE:
@@ -70,14 +75,14 @@ def compute_pose(
 ) -> Float64Array:
     """Return the pose (4, 4) that parameters of `settings.POSE` give to vertices.
 
-    It scales and rotates about the middle of their bounding box, puts the lowest at the
-    height `floor`, and then shifts by x, y and z. Without the shift the middle stays
-    above the same point of the ground.
+    It scales and rotates the vertices about the middle of their bounding box. Then it
+    moves them up or down until the lowest is at the height `floor`, and shifts them by
+    x, y and z. Without the shift the middle stays above the same point of the ground.
 
     Args:
-        positions: (V, 3) of the vertices.
+        positions: (V, 3) positions of the vertices.
         floor: height of what they stand on.
-        parameters: parameters by name; angles in degrees.
+        parameters: "scale", "yaw", "pitch" and "roll" in degrees, "x", "y" and "z".
     """
     center = (positions.min(axis=0) + positions.max(axis=0)) / 2.0
     linear = parameters["scale"] * make_rotation(
@@ -89,6 +94,7 @@ def compute_pose(
         np.array([parameters["x"], parameters["y"], floor + parameters["z"] - lowest])
         - linear @ center
     )
-    # back above the same point; the height follows from the floor instead
+    # In x and y the middle goes back to where it was; its height follows from the
+    # floor.
     translation[:2] += center[:2]
     return make_pose(linear, translation)

@@ -54,7 +54,8 @@ def rasterize_triangles(
         For each pixel of each triangle, triangle by triangle, the triangle, row and
         column (N,), and the corners' barycentric weights (N, 3).
     """
-    # Candidates from a wider range, as their weights decide which lie in a triangle.
+    # The candidates are from a wider range, so that none is missed by rounding. Their
+    # weights decide.
     face, row, column = find_candidate_pixels(corners, shape, 10.0 * PIXEL_TOLERANCE)
     weights = compute_barycentric(corners[face], row, column)
     inside = (weights >= -tolerance).all(axis=1)
@@ -64,10 +65,15 @@ def rasterize_triangles(
 def find_candidate_pixels(
     corners: Float64Array, shape: tuple[int, int], tolerance: float = PIXEL_TOLERANCE
 ) -> tuple[IntArray, IntArray, IntArray]:
-    """List the pixels whose centers lie in triangles, also flat ones, or nearly.
+    """List the pixels whose centers lie in triangles, or almost.
 
-    They may miss a triangle by `tolerance` pixels along their row or column. Other
-    arguments as for `rasterize_triangles`.
+    A triangle without area has pixels too: those along its line.
+
+    Args:
+        corners: (F, 3, 2) columns and rows of the triangles' corners, whole at pixel
+            centers.
+        shape: height and width of the raster.
+        tolerance: pixels along the row or column by which a center may miss a triangle.
 
     Returns:
         Triangle, row and column (N,).
@@ -83,18 +89,18 @@ def find_candidate_pixels(
 def find_read_texels(corners: Float64Array, shape: tuple[int, int]) -> BoolArray:
     """Return the texels (h, w) that bilinear look-ups in triangles read.
 
-    A look-up at a point reads the four texels around it: with its row and its column
-    rounded down, and the next ones. The square between these four is a cell here, and
-    has the index of the first. So the cells that a triangle touches are found, and then
-    their texels. Beyond the border the texture repeats.
+    A look-up at a point reads the four texels around it: those at its row and column
+    rounded down, and the next ones. The square between the centers of these four is
+    called a cell here, and has the index of the first. First the cells that a triangle
+    touches are found, then the four texels of each. The texture repeats at its border.
 
     Args:
-        corners: (F, 3, 2) as for `rasterize_triangles`, at most half a texel outside of
-            the texture.
+        corners: (F, 3, 2) column and row of each corner, whole at texel centers, and at
+            most half a texel outside of the texture.
         shape: height and width of the texture.
     """
-    # The first cell begins at texel -1, which is the last one again. All is shifted by
-    # 1, so that the indices of cells begin at 0.
+    # The first cell begins at texel -1, which is the last texel again, since the
+    # texture repeats. A shift by 1 lets the indices of cells begin at 0.
     shifted = corners + 1.0
     lowest_row = np.floor(shifted[..., 1].min(axis=1) - PIXEL_TOLERANCE)
     highest_row = np.floor(shifted[..., 1].max(axis=1) + PIXEL_TOLERANCE)
@@ -121,9 +127,9 @@ def _find_column_span(
 ) -> tuple[Float64Array, Float64Array]:
     """Return the smallest and largest column of triangles between two rows.
 
-    Each triangle (N, 3, 2) is cut to the strip from its row (N,) to the next. What is
-    left of it reaches farthest at one of its corners inside the strip, or where an edge
-    crosses one of the two rows.
+    Each triangle (N, 3, 2) is cut to the strip between its row (N,) and the next. The
+    smallest and the largest column of the part that remains are at a corner inside the
+    strip, or where an edge crosses one of the two rows.
 
     Returns:
         (N,) smallest and (N,) largest column; (inf, -inf) where nothing is left.
@@ -134,7 +140,8 @@ def _find_column_span(
     left = np.where(is_between, corners[..., 0], np.inf).min(axis=1)
     right = np.where(is_between, corners[..., 0], -np.inf).max(axis=1)
     for offset in (0, 1):
-        # no crossing is an empty range, the first column above the last
+        # A triangle that does not cross the row has an empty range: its first column is
+        # larger than its last.
         first_column, last_column = _cross_rows(corners, row + offset, PIXEL_TOLERANCE)
         left = np.where(
             first_column <= last_column, np.minimum(left, first_column), left
@@ -150,13 +157,14 @@ def compute_barycentric(
 ) -> Float64Array:
     """Return the barycentric weights (N, 3) of points in triangles (N, 3, 2).
 
-    A corner's weight is the share of the triangle's area that lies between the point
-    and the opposite side: all three are in [0, 1] inside, and one is negative outside.
-    They are NaN or infinite where a triangle has no area.
+    A corner's weight is the area between the point and the opposite side, as a fraction
+    of the triangle's. Inside all three are in [0, 1]; outside at least one is negative.
+    The weights in a triangle without area are NaN or infinite.
 
     Args:
-        corners: columns and rows of the corners.
-        row, column: (N,) where the points are.
+        corners: (N, 3, 2) columns and rows of the corners.
+        row: (N,) rows of the points.
+        column: (N,) columns of the points.
     """
     ax, ay = corners[:, 0].T
     bx, by = corners[:, 1].T
@@ -178,11 +186,12 @@ def compute_doubled_areas(corners: Float64Array) -> Float64Array:
 def _list_integers_within(
     lower: Float64Array, upper: Float64Array, size: int, tolerance: float
 ) -> tuple[IntArray, IntArray]:
-    """List the integers of N intervals, those of the first, then those of the second.
+    """List the integers in each of N intervals, one interval after the other.
 
     Args:
-        lower, upper: (N,) ends of the intervals; one with `lower` above `upper` has no
-            integer.
+        lower: (N,) lower ends of the intervals.
+        upper: (N,) upper ends. An interval whose upper end is below its lower end is
+            empty.
         size: integers outside of [0, size - 1] are left out.
         tolerance: by how much each interval is wider on both sides.
 
@@ -204,9 +213,10 @@ def _cross_rows(
 ) -> tuple[Float64Array, Float64Array]:
     """Return the first and last column (N,) of triangles (N, 3, 2) on rows (N,).
 
-    They are where the triangle's edges cross its row. An edge that ends up to
-    `tolerance` before the row crosses it at that end. Level edges do not count. Where
-    no edge crosses, the range is empty: 0 to -1.
+    They are where the triangle's edges cross its row. An edge that ends less than
+    `tolerance` before the row counts as crossing it at that end. Level edges are left
+    out, since the other two edges end where they do. If no edge crosses the row, the
+    range is empty: the first column is 0 and the last -1.
     """
     left = np.full(len(row), np.inf)
     right = np.full(len(row), -np.inf)
@@ -278,8 +288,8 @@ class Charts:
     def compute_areas(self) -> Float32Array:
         """Return the surface area (h, w) of each texel, in squared mesh units.
 
-        It is the area of the texel's face over the number of texels that the face has
-        on the texture; 0 where no chart is.
+        It is the area of the texel's face, divided by the number of texels that the
+        face covers in the texture. It is 0 outside of all charts.
         """
         corners = self.mesh.vertices[self.mesh.faces].astype(np.float64)
         face_areas = np.linalg.norm(compute_area_vectors(corners), axis=1)
@@ -299,7 +309,7 @@ class Charts:
 def find_exclusive_texels(
     mesh: Mesh, faces: IntArray, shape: tuple[int, int]
 ) -> tuple[BoolArray, float]:
-    """Return the texels that bilinear look-ups on some faces alone read.
+    """Return the texels that bilinear look-ups read on some faces and on no others.
 
     Args:
         mesh: the mesh.
@@ -320,8 +330,8 @@ def find_exclusive_texels(
 def rasterize_charts(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
     """Find the face and the barycentric weights of every texel of a texture.
 
-    Where charts overlap, the last of their faces wins. A texel in no chart has the
-    values of the nearest one that is.
+    Where charts overlap, the last of their faces wins. A texel outside of all charts
+    has the values of the nearest texel inside one.
 
     Args:
         mesh: mesh with texture coordinates.
@@ -354,12 +364,12 @@ def rasterize_charts(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
 def _compute_clipped_weights(corners: Float64Array, points: IntArray) -> Float64Array:
     """Return the barycentric weights (N, 3) of points, clipped to their triangles.
 
-    Negative weights, of points outside, become 0, and the others are scaled so that
-    they add up to 1. A triangle without area gets weights of 1 / 3.
+    A point outside of its triangle has negative weights. They become 0, and the others
+    are scaled so that they add up to 1. In a triangle without area all are 1 / 3.
 
     Args:
-        corners: (N, 3, 2) of the triangles.
-        points: (N, 2).
+        corners: (N, 3, 2) columns and rows of the corners of each point's triangle.
+        points: (N, 2) columns and rows of the points.
     """
     doubled = compute_doubled_areas(corners)
     # Without an area all three are 0 here, and 1 / 3 at the end.
@@ -381,9 +391,9 @@ def look_up_texture(
     """Look a repeating texture up with bilinear interpolation.
 
     Args:
-        texels: (H, W, C).
-        x, y: columns and rows (...), integers at texel centers; they may be any number
-            of textures away.
+        texels: (H, W, C) the texture.
+        x: columns (...), whole at texel centers; outside of the texture it repeats.
+        y: rows (...), likewise.
 
     Returns:
         (..., C) float32.
@@ -422,14 +432,15 @@ class MeshSurface:
     def __init__(self, mesh: Mesh) -> None:
         """Compute boxes and normals of the faces, and which faces are neighbours.
 
-        Neighbours have an edge in common, by the positions of its ends: across a UV
-        seam too, where the vertices are not the same.
+        Faces are neighbours if they share an edge. Edges are compared by the positions
+        of their ends: at a UV seam the faces on both sides have different vertices at
+        the same positions.
         """
         self._corners = mesh.vertices[mesh.faces].astype(np.float64)
         self.normals = _compute_face_normals(mesh)
         self._lower = self._corners.min(axis=1)
         self._upper = self._corners.max(axis=1)
-        # (F, 3) the same index for vertices at one position
+        # (F, 3) corners of the faces, with one index for all vertices at one position
         corners = weld_vertices(mesh)[0][mesh.faces]
         # (3 F, 2) edges in three blocks, each with one edge of all faces
         edges = np.concatenate(
@@ -450,12 +461,12 @@ class MeshSurface:
         """Find the first face that a ray meets, from either side.
 
         Args:
-            origin: (3,) outside of the mesh.
+            origin: (3,) start of the ray, outside of the mesh.
             direction: (3,) unit vector.
 
         Returns:
-            The face, and the point (3,) where the ray meets it. If it meets none: the
-            face with the corner nearest to the ray's line, and that corner.
+            The face, and the point (3,) where the ray meets it. If the ray meets no
+            face, they are that corner which is nearest to the ray's line, and its face.
         """
         distance = self._intersect(origin, direction)
         if np.isfinite(distance).any():
@@ -473,7 +484,11 @@ class MeshSurface:
         The method is that of Moeller and Trumbore 1997, for all faces at once. As in
         the paper t goes from the face's corner a to the origin, and u and v are the
         barycentric weights of b and c where the ray meets the plane of the face. A ray
-        in that plane does not meet the face; nor does what lies behind the origin.
+        in that plane does not meet the face. Faces behind the origin do not count.
+
+        Args:
+            origin: (3,) start of the ray.
+            direction: (3,) its direction.
         """
         a = self._corners[:, 0]
         b = self._corners[:, 1]
@@ -491,7 +506,7 @@ class MeshSurface:
         q = np.cross(t, b - a)
         v = (q @ direction) * inverse
         distance = ((c - a) * q).sum(axis=1) * inverse
-        # so that no ray slips through between two faces
+        # With some slack, no ray goes between two neighbouring faces by rounding.
         slack = 1e-9
         is_hit = (inverse != 0.0) & (u >= -slack) & (v >= -slack)
         is_hit &= (u + v <= 1.0 + slack) & (distance > 0.0)
@@ -500,12 +515,20 @@ class MeshSurface:
     def find_region(
         self, face: int, point: Float64Array, normal: Float64Array, radius: float
     ) -> BoolArray:
-        """Return the faces (F,) around a point that are connected to a face.
+        """Return the faces around a point that are connected to a face.
 
-        Their bounding boxes reach within a radius of the point (3,), they face a
-        direction (3,), and are reached from the face, which always counts, over edges
-        between such faces. So the other wall of a cup is not among them, and neither is
-        the next slat of a chair.
+        A face is one of them if its bounding box is within the radius, it faces the
+        direction `normal`, and a chain of such faces, neighbour by neighbour, leads to
+        it. So the opposite wall of a cup is left out, and the next slat of a chair.
+
+        Args:
+            face: index of the face from which the chains begin; it always counts.
+            point: (3,) center.
+            normal: (3,) direction.
+            radius: radius in the unit of the mesh.
+
+        Returns:
+            (F,) bool.
         """
         box_gap = np.maximum(np.maximum(self._lower - point, point - self._upper), 0.0)
         is_near = np.linalg.norm(box_gap, axis=1) <= radius

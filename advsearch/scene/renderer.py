@@ -148,7 +148,18 @@ class Renderer:
         estimators: Mapping[str, str] | None = None,
         moments: Sequence[Moment] = (),
     ) -> None:
-        """Plan how each coordinate is differentiated; arguments are the class's."""
+        """Plan how each coordinate is differentiated.
+
+        Args:
+            scene: the scene that is traced.
+            space: the space, which maps a configuration u to scene inputs.
+            formation: how radiance becomes an image: resolution, denoiser, tone curve.
+            root_seed: seed from which all seeds of renders are derived.
+            motion: measures how fast outlines move; None: they count as not moving.
+            estimators: estimators of the derivative that the user forces, by the name
+                of a group or control.
+            moments: moments of an exposure of some time; empty for a single one.
+        """
         self.scene = scene
         self.space = space
         self.formation = formation
@@ -209,7 +220,7 @@ class Renderer:
     ) -> Renderer:
         """Return a renderer of the same space with some changes.
 
-        It continues from this one's counters, which do not follow it.
+        Its counters of renders start from those of this one, and go on independently.
 
         Args:
             scene: another scene.
@@ -230,9 +241,14 @@ class Renderer:
 
     @contextmanager
     def share_paths(self, paths: SharedPaths | None) -> Iterator[None]:
-        """Trace what images of one seed have in common once inside the `with`.
+        """Let renders inside the `with` block share paths.
 
-        Each image is traced in full with None, or the paths of another scene.
+        Images with one seed have a part of their paths in common. Inside the block that
+        part is traced once for all of them.
+
+        Args:
+            paths: stores the shared paths. With None, or with those of another scene,
+                each image is traced in full.
         """
         paths_before = self.shared_paths
         is_of_scene = paths is not None and paths.scene is self.scene
@@ -248,11 +264,16 @@ class Renderer:
         return self.crop.window if self.crop else None
 
     def crop_to(self, window: Window, u: Tensor, seed: int, spp: int) -> Renderer:
-        """Return a renderer that renders a window alone.
+        """Return a renderer that renders only a window of each image.
 
-        Around the window, all of its images show what the image of u (d,) shows there.
-        That is rendered now, with arguments as for a call, and does not count as a
-        render.
+        Around the window, all images show the same: the image of u, which is rendered
+        now, and does not count as a render.
+
+        Args:
+            window: rows and columns that are rendered.
+            u: (d,) configuration of the surroundings.
+            seed: seed of their noise.
+            spp: their samples per pixel.
         """
         with torch.no_grad():
             inputs = self.scene.assembly(self.space.inputs(u))
@@ -284,8 +305,9 @@ class Renderer:
         u = _to_tensor(u)
         if u.ndim == 2 and len(u):
             return torch.stack([self(row, seed, spp) for row in u])
-        # `through` is what is rendered; it is not `u` where a part of the derivative
-        # comes from differences
+        # `through` has the values of `u` and is what is rendered. It is another tensor
+        # if some coordinates are differentiated by finite differences: autograd must
+        # not reach those.
         u, through = self._check_arguments(u, spp)
         with _leave_inference_mode():
             image = self._render_image(through, seed, spp)
@@ -312,14 +334,19 @@ class Renderer:
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Trace two images of a configuration with independent noise.
 
-        Noise that goes through the tone curve, which is bent, would make a noisy image
-        darker on average. So the two go through its tangent at the third, denoised
-        image instead; they may leave [0, 1]. Arguments as for a call; there is no
-        graph, and nothing is counted.
+        The tone curve is bent, so that a noisy image behind it would be darker on
+        average. The two images therefore go through the curve's tangent at the third,
+        denoised image, and may leave [0, 1]. There is no graph, and the renders are not
+        counted.
+
+        Args:
+            u: (d,) configuration in [0, 1].
+            seed: seed of the noise.
+            spp: samples per pixel of each image.
 
         Returns:
-            Three images (H, W, 3): the two, which are not denoised, and that of all
-            their samples, which is.
+            Three images (H, W, 3): two that are not denoised, and the denoised mean of
+            both.
         """
         with torch.no_grad():
             inputs = self.scene.assembly(self.space.inputs(u))
@@ -334,7 +361,9 @@ class Renderer:
             def display_straight(radiance: Tensor) -> Tensor:
                 """Return the image on the tone curve's tangent at the denoised image.
 
-                The slope is taken over a small part of the way to the noisy image.
+                The curve's slope is a difference over `STRAIGHT_FRACTION` of the way
+                from the denoised to the noisy image, where the curve is almost
+                straight.
                 """
                 nudged = torch.lerp(clean, finish(radiance), STRAIGHT_FRACTION)
                 slope = (
@@ -351,7 +380,12 @@ class Renderer:
     ) -> tuple[list[Tensor], Tensor]:
         """Trace the radiance of scene inputs twice, with independent noise.
 
-        Arguments as for a call. Nothing is counted.
+        The renders are not counted.
+
+        Args:
+            inputs: assembled inputs of the scene.
+            seed: seed of the noise.
+            spp: samples per pixel of each image.
 
         Returns:
             The two images, which are not denoised, and their mean, which is. Each is
@@ -401,7 +435,10 @@ class Renderer:
         Args:
             u: (d,) configuration.
             subdivision: divide each pixel into that many rows and columns.
-            camera: index of the camera of a rig.
+            camera: index of the camera of a rig; 0 for a single camera.
+
+        Returns:
+            Ids and depths at (subdivision H, subdivision W) points; depths in metres.
         """
         u, _ = self._check_arguments(u, 1)
         with torch.no_grad():
@@ -437,14 +474,17 @@ class Renderer:
         "secant" differences of the loss.
 
         Args:
-            loss: loss from an image (H, W, 3) sRGB to a number.
-            u, seed, spp: as for a call.
-            free: leave out what costs more renders, that is all differences: their
-                coordinates then have a derivative of zero.
+            loss: maps an image (H, W, 3) sRGB to a scalar.
+            u: (d,) configuration in [0, 1].
+            seed: seed of the noise.
+            spp: samples per pixel.
+            free: leave out all differences, since each costs renders: their coordinates
+                then have a derivative of zero.
 
         Returns:
             The loss without graph, and (d,) float32.
         """
+        # "secant" is left out of the backward pass: the loop below adds it.
         self._left_out = DIFFERENCE_ESTIMATORS if free else frozenset({"secant"})
         try:
             with torch.inference_mode(False), torch.enable_grad():
@@ -473,7 +513,10 @@ class Renderer:
     # ---- from u to the image
 
     def _check_arguments(self, u: Configuration, spp: int) -> tuple[Tensor, Tensor]:
-        """Check a call's arguments; raises as `__call__`.
+        """Check a call's arguments.
+
+        Raises InputError: u has another shape or values outside [0, 1], spp is out of
+        range, or u was made in inference mode and requires a gradient.
 
         Returns:
             The configuration as float32; and the same numbers in a tensor through which
@@ -509,15 +552,22 @@ class Renderer:
             mask = self.plan.autograd_mask
             if bool(mask.all()):
                 return u, u
-            # the value is u, the derivative is the mask
+            # The difference is 0, so that the value is u; the derivative is the mask.
             return u, u.detach() + mask * (u - u.detach())
 
     def _render_image(
         self, u: Tensor, seed: int, spp: int, *, display: bool = True
     ) -> Tensor:
-        """Render the image of u, or its radiance before display.
+        """Render the image of a configuration, or its radiance before display.
 
-        For a rig the images of its cameras stand side by side, (H, K W, 3).
+        Args:
+            u: (d,) configuration.
+            seed: seed of the noise.
+            spp: samples per pixel.
+            display: if False, return the radiance that is to be displayed.
+
+        Returns:
+            (H, W, 3); for a rig of K cameras their images side by side, (H, K W, 3).
         """
         renders_before = self.renders
         images = list[Tensor]()
@@ -538,19 +588,20 @@ class Renderer:
             images.append(self.finish_image(rendered, inputs, u, display=display))
         if len(images) == 1:
             return images[0]
-        self.renders = renders_before + 1  # one configuration, as budgets count it
+        # Budgets count configurations: all cameras of a rig are one render.
+        self.renders = renders_before + 1
         return torch.cat(images, dim=1)
 
     def _camera_inputs(
         self, mount: Mount | None, u: Tensor, space: InputMapping | None = None
     ) -> dict[str, Tensor]:
-        """Return the scene inputs of u for a camera of a rig, or for the only one.
+        """Return the scene inputs of a configuration for one camera.
 
         Args:
-            mount: the camera of the rig; None for the only one.
+            mount: a camera of a rig; None if the scene has one camera.
             u: (d,) configuration.
-            space: maps u to scene inputs; None: the renderer's, at the time when the
-                camera takes its image.
+            space: maps u to scene inputs. None: the renderer's space; a camera that
+                takes its image later than the first has things that move at that time.
         """
         if space is None:
             space = self.space
@@ -568,11 +619,12 @@ class Renderer:
     ) -> Tensor:
         """Render the mean radiance of the moments of u, denoised once.
 
-        Each row of the image takes its own fraction of each moment, as a sensor reads
-        rows one after the other. It counts as one render.
+        The image is the sum of the moments' radiance, each weighted by row: a sensor
+        reads its rows one after the other, and so a row may see a moment in part or not
+        at all. All moments together count as one render.
 
         Args:
-            mount: the camera of a rig; None for the only one.
+            mount: the camera of a rig; None if the scene has one camera.
             u: (d,) configuration.
             seed: seed of the noise; each moment gets its own.
             spp: samples per pixel of all moments together.
@@ -600,7 +652,8 @@ class Renderer:
         self.renders = renders_before + 1
         if not is_denoised:
             return exposed
-        # The change has no graph: the derivative is that of the image before denoising.
+        # Denoising is added as a change without a graph: so the derivative is that of
+        # the image before denoising.
         return exposed + self._compute_denoising_change(exposed, guides)
 
     @torch.no_grad()
@@ -648,7 +701,7 @@ class Renderer:
             radiance = radiance * torch.exp2(exposure)
             coat = coat * torch.exp2(exposure)
         if "backdrop.color" in inputs:
-            # the photograph is display-linear: divided by the gain it is radiance
+            # The photograph is display-linear, which is radiance times the gain.
             behind = inputs["backdrop.color"] / self.formation.gain
             layers = torch.cat([radiance, rendered[..., 3:7], coat], dim=-1)
             radiance = compose(layers, behind, inputs)
@@ -676,7 +729,7 @@ class Renderer:
         n_points = depth.shape[0] // self.formation.resolution[0]
         surfaces = self.scene.find_surfaces(_select_scene_inputs(inputs), n_points)
         blur = float(inputs["backdrop.blur"]) if "backdrop.blur" in inputs else 0.0
-        # pixels that a blur of this standard deviation reaches, and the one itself
+        # A blur reaches about three standard deviations; 1 is for the pixel itself.
         radius = 1 + math.ceil(3.0 * blur)
         front_inputs["backdrop.front"] = compute_front(
             surfaces, depth, n_points, radius
@@ -692,9 +745,9 @@ class Renderer:
         *,
         denoised: bool = True,
     ) -> Tensor:
-        """Return linear radiance of scene inputs, with a graph.
+        """Return the linear radiance of scene inputs, differentiable in them.
 
-        What is traced counts in `renders`.
+        If paths are traced, it counts in `renders`; a prediction does not.
 
         Args:
             inputs: inputs of the scene.
@@ -704,9 +757,10 @@ class Renderer:
             denoised: denoise it if the formation requires it.
 
         Returns:
-            (H, W, 3), or (H, W, 4) with coverage if the environment is hidden, or (H,
-            W, 7) with the change of the plane that takes the shadow in a photograph, or
-            (H, W, 13) with that of what its coat reflects, and the environment in it.
+            (H, W, C). C is 3, or 4 with coverage if the environment is hidden. It is 7
+            with the change of the radiance of a plane that takes the shadow in a
+            photograph. It is 13 if that plane has a coat, with the change of what the
+            coat reflects, and the environment in it.
         """
         if self._predict is not None:
             return self._predict(inputs)
@@ -736,9 +790,15 @@ class Renderer:
     ) -> Tensor:
         """Return the gradient of `sum(cotangent * image)` by differences.
 
-        It is zero for coordinates that do not use them. All renders share one seed
-        (common random numbers), and the image is taken after the tone curve and after
-        what controls do to it.
+        It is zero for coordinates with another estimator. All renders share one seed,
+        so that their noise cancels in the differences (common random numbers). The
+        image is the finished one, after the tone curve and the controls that change it.
+
+        Args:
+            u: (d,) configuration.
+            cotangent: (H, W, 3) derivative of a loss by the image.
+            seed: seed of the noise.
+            spp: samples per pixel, unless the plan has its own number.
         """
         noise_seed = seeds.stream(self.root_seed, "differences", seed)
         spp = self.plan.spp or spp
@@ -759,14 +819,15 @@ class Renderer:
     ) -> Tensor:
         """Return half-widths (d,) of differences over which outlines move by a pixel.
 
-        Groups that move none, that are larger than `MAX_MEASURED_SIZE`, or all of them
-        without `motion`, count as not moving: they have the default step of a range or
-        of a full turn.
+        A group counts as not moving if it moves no outline, if it has more than
+        `MAX_MEASURED_SIZE` coordinates, or if there is no `motion` to measure it. Its
+        step is the default: that of a range, or of a full turn if it is periodic.
         """
         speeds = torch.zeros(len(self.start))
         coordinates: list[int] = []
         for group in groups:
-            # the two estimators are valid only for what moves no outline
+            # "adjoint" and "image" are valid only for what moves no outline: a group
+            # with any other valid estimator may move one.
             may_move = {*group.valid} - {"adjoint", "image"}
             if may_move and group.size <= MAX_MEASURED_SIZE:
                 coordinates += range(group.begin, group.begin + group.size)
@@ -797,8 +858,9 @@ class Renderer:
         routes: dict[str, set[str]] = {group.name: set() for group in groups}
         generator = torch.Generator().manual_seed(0)
         noise = torch.rand(self.start.shape, generator=generator)
-        # Near the start but off the borders and off special values, where a derivative
-        # may be zero by chance; random weights keep those of an input from cancelling.
+        # The point is half way from the start to the center, with some noise: at
+        # borders and special values a derivative may be zero by chance. The random
+        # weights keep the derivatives of an input's entries from cancelling in the sum.
         u = (0.5 * self.start + 0.25 + 0.1 * (noise - 0.5)).requires_grad_()
         with torch.enable_grad():
             inputs = self.scene.assembly(self.space.inputs(u))
@@ -869,11 +931,22 @@ class _Radiance(torch.autograd.Function):
         denoised: bool,
         *tensors: Tensor,
     ) -> Tensor:
-        """Render the radiance of the inputs `tensors`, whose names are `names`.
+        """Render the radiance of scene inputs; it counts as one render.
 
-        NaN and infinite values become zero. It is denoised, unless `denoised` is False,
-        if the formation requires it, and counts as one render. Other arguments as for
-        `Renderer.render_radiance`; the result is the window of its crop alone.
+        NaN and infinite values become zero.
+
+        Args:
+            ctx: autograd's context, which stores what `backward` needs.
+            renderer: renderer of the scene.
+            names: names of the inputs, in the order of `tensors`.
+            seed: seed of the noise.
+            spp: samples per pixel.
+            hide: hide the environment behind a backdrop.
+            denoised: denoise the result if the formation requires it.
+            *tensors: values of the inputs.
+
+        Returns:
+            (h, w, C) radiance, of the window of the renderer's crop if it has one.
         """
         ctx.renderer = renderer
         ctx.names = names
@@ -915,8 +988,8 @@ class _Radiance(torch.autograd.Function):
     def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
         """Return the gradient of `sum(cotangent * radiance)` by an adjoint.
 
-        It is that of the inputs whose coordinates use an adjoint; an input that no
-        coordinate needs is left out. The denoiser counts as the identity.
+        Only inputs that a coordinate with an adjoint estimator reaches get a gradient;
+        that of all others is None. The denoiser is taken for the identity.
         """
         renderer: Renderer = ctx.renderer
         inputs = dict(zip(ctx.names, ctx.saved_tensors, strict=True))
@@ -924,8 +997,8 @@ class _Radiance(torch.autograd.Function):
         cotangent = renderer.replace_non_finite(cotangent)
         by_input = dict[str, Tensor]()
         remaining = list(inputs)
-        # An input that groups of both estimators reach goes to the material form, which
-        # is right for more inputs.
+        # An input that groups of both estimators reach is differentiated by "material",
+        # which is right for more inputs: so that one comes first.
         for estimator in ("material", "adjoint"):
             reached = _reached_inputs(renderer, estimator)
             wrt = [name for name in remaining if name in reached]

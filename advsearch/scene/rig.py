@@ -85,22 +85,23 @@ class Mount:
     ) -> dict[str, Tensor]:
         """Return the scene inputs of this camera, given those of the first camera.
 
-        The first camera's pose, times the mount's, is turned about the vertical through
-        the object by the mount's azimuth. A field of view or a lens of its own replaces
-        the first's.
+        The mount's pose is relative to the first camera's. The result is turned about
+        the vertical through the object's center by the mount's azimuth. If the mount
+        has a field of view or a lens, it replaces the first camera's.
 
         Args:
             inputs: scene inputs of the first camera.
-            first_pose: (4, 4) its pose, if the inputs have none.
+            first_pose: (4, 4) pose of the first camera, used if the inputs have none.
             center: (3,) center of the object.
-            unit_metres: length of a unit of the scene.
+            unit_metres: length of a unit of the scene, in metres.
         """
-        # the mount's axes are OpenCV's, the scene's are Mitsuba's
+        # The mount's axes are OpenCV's (x right, y down), the scene's are Mitsuba's (x
+        # left, y up): `AXES` converts both sides.
         mount_pose = torch.from_numpy(AXES @ self.pose @ AXES).float()
         mount_pose[:3, 3] /= unit_metres
         orbit_rotation = torch.eye(4)
         orbit_rotation[:3, :3] = torch.from_numpy(make_rotation(self.azimuth, 0.0, 0.0))
-        # the center stays where it is
+        # The shift by which the rotation leaves the center where it is: c - R c.
         orbit_rotation[:3, 3] = center - orbit_rotation[:3, :3] @ center
         camera_inputs = {
             **inputs,
@@ -121,13 +122,14 @@ def read_rig(spec: str) -> tuple[Mount, ...]:
     """Read the cameras of a rig.
 
     Args:
-        spec: the file. Of a transforms.json, frames are named by index, the first one
-            first: ``transforms.json#0,4,8``. Of an images.txt, all images are cameras,
-            or those named by IMAGE_ID: ``images.txt#3,7``.
+        spec: the file. Frames of a transforms.json are named by index, and the first
+            name is the rig's first camera: ``transforms.json#0,4,8``. All images of an
+            images.txt are cameras, or only those named by IMAGE_ID:
+            ``images.txt#3,7``.
 
     Returns:
-        The cameras; empty if the file has one camera, or one of its cameras is named
-        (``#cam1``).
+        The cameras. It is empty if this is no rig: the file has one camera, or one of
+        its cameras is named (``#cam1``).
 
     Raises:
         FileFormatError: there are more than `MAX_CAMERAS`, numbers that no camera has,
@@ -195,9 +197,13 @@ class PhotographCameras:
 
 
 def read_photograph_cameras(path: str) -> PhotographCameras | None:
-    """Read the cameras of many photographs; None if the file is of another kind.
+    """Read the cameras of many photographs from an images.txt or a transforms.json.
 
-    `path` names none of its cameras.
+    Args:
+        path: the file, without the name of one of its cameras.
+
+    Returns:
+        The cameras; None if the file is of another kind.
 
     Raises:
         FileFormatError: the file cannot be used.
@@ -222,7 +228,11 @@ def read_photograph_cameras(path: str) -> PhotographCameras | None:
 
 
 def _read_image_cameras(path: str) -> PhotographCameras:
-    """Read the cameras of COLMAP's images.txt."""
+    """Read the cameras of the photographs in COLMAP's images.txt.
+
+    The file has a line with the pose of each photograph; its lens is in the cameras.txt
+    beside it, and is read when the photograph is requested.
+    """
     words_by_id = _parse_images(path)
     files = {name: words[-1] for name, words in words_by_id.items()}
     read_model = cache(read_camera)  # many images have one camera
@@ -236,17 +246,20 @@ def _read_image_cameras(path: str) -> PhotographCameras:
 
 
 def _find_photograph(path: str, files: Mapping[str, str], photograph: Path) -> str:
-    """Return the name of the entry whose file is a photograph.
+    """Return the name of the entry of a camera file that is for a photograph.
+
+    The paths in a camera file are often those of another computer. So the entry is
+    taken whose path has most parts in common with the photograph's, from the end.
 
     Args:
         path: path of the camera file, for messages.
-        files: files of the entries, by name.
-        photograph: the file.
+        files: path of the photograph of each entry, by the entry's name.
+        photograph: path of the photograph.
 
     Raises:
         FileFormatError: no entry fits, or several do equally well.
     """
-    # how many parts, counted from the end, each entry's path has in common
+    # number of parts that each path has in common with the photograph's
     counts = {
         name: _count_shared_parts(file, photograph) for name, file in files.items()
     }
@@ -265,7 +278,8 @@ def _find_photograph(path: str, files: Mapping[str, str], photograph: Path) -> s
 def _count_shared_parts(file: str, photograph: Path) -> int:
     """Return how many parts two paths share, counted from the last one.
 
-    A file without a suffix, as Instant NGP has it, fits any.
+    For "images/a.jpg" and "/home/me/images/a.jpg" it is 2. If the first has no suffix,
+    as in files of Instant NGP, the suffix of the other is ignored.
     """
     path = PurePosixPath(file.replace("\\", "/"))
     full = photograph.absolute()
@@ -282,8 +296,8 @@ def _count_shared_parts(file: str, photograph: Path) -> int:
 def _check_mounts(spec: str, mounts: Sequence[Mount]) -> None:
     """Raise FileFormatError unless cameras of a rig fit together.
 
-    They are 2 to `MAX_CAMERAS`, have names of their own, and the first, which is the
-    scene's camera, has no pose, azimuth or delay.
+    There have to be 2 to `MAX_CAMERAS` with different names. The first is the scene's
+    camera, to which the others are relative: it may have no pose, azimuth or delay.
     """
     if not 2 <= len(mounts) <= MAX_CAMERAS:
         raise FileFormatError(
@@ -303,8 +317,16 @@ def _check_mounts(spec: str, mounts: Sequence[Mount]) -> None:
 def _read_entry(spec: str, index: int, entry: Any) -> Mount:
     """Return the camera of an entry of our own format.
 
-    Each of `ENTRY_KEYS` may be missing: it stands where the first camera does, looks
-    the same way and has its lens. `index` counts from 0, for a name and errors.
+    Any of `ENTRY_KEYS` may be missing. A camera without a pose stands where the first
+    camera does and looks the same way; one without a lens has that of the first.
+
+    Args:
+        spec: the file, for messages.
+        index: index of the camera from 0, for messages and a default name.
+        entry: the entry, a dictionary if the file is right.
+
+    Raises:
+        FileFormatError: the entry has other keys, or values that no camera has.
     """
     where = f"{spec}: camera {index + 1}"
     if not isinstance(entry, dict) or not set(entry) <= set(ENTRY_KEYS):
@@ -340,8 +362,13 @@ def _read_entry(spec: str, index: int, entry: Any) -> Mount:
 def _read_entry_pose(where: str, entry: Mapping[str, Any]) -> Float64Array:
     """Return the pose (4, 4) of an entry of our own format, by `turn` and `place`.
 
-    It leads from the camera's axes, x to the right, y down, z ahead, to those of the
-    first camera. `where` is the beginning of an error.
+    It maps coordinates of the camera to those of the first one. In both x is to the
+    right, y down, z ahead. `turn` has yaw, pitch and roll in degrees, and `place` the
+    position in metres.
+
+    Args:
+        where: file and camera, for messages.
+        entry: the entry; a missing `turn` or `place` is 0.
     """
     angles = entry.get("turn", [0.0] * 3)
     yaw, pitch, roll = _parse_numbers(where, "turn", angles, 3, MAX_TURN)
@@ -360,16 +387,14 @@ def _read_entry_pose(where: str, entry: Mapping[str, Any]) -> Float64Array:
 def _parse_numbers(
     where: str, key: str, value: Any, count: int, limit: float
 ) -> list[float]:
-    """Return an entry as a list of `count` finite numbers, none larger than a limit.
-
-    The limit is that of their absolute values.
+    """Return an entry as a list of `count` finite numbers within a limit.
 
     Args:
         where: file and camera, for messages.
         key: name of the entry, for messages.
         value: the entry.
         count: how many numbers it has to have.
-        limit: the limit.
+        limit: largest absolute value of each number.
 
     Raises:
         FileFormatError: it is no such list.
@@ -398,10 +423,17 @@ def _to_rows(value: Any) -> list[list[Any]]:
 
 
 def _read_camchain(spec: str, data: Mapping[str, Any]) -> tuple[Mount, ...]:
-    """Return the cameras of Kalibr's camchain; empty if it has no extrinsics.
+    """Return the cameras of Kalibr's camchain, the first one first.
 
-    Cameras are in the order of their numbers; each but the first states its transform
-    from the one before.
+    Cameras are in the order of their numbers (cam0, cam1). Each but the first states
+    its transform from the camera before it.
+
+    Args:
+        spec: the file.
+        data: its content.
+
+    Returns:
+        The cameras; empty if the file has one, too many, or no transforms.
     """
     cameras = {
         name: camera
@@ -459,15 +491,15 @@ def _check_frames(path: str, data: Any) -> dict[str, Any]:
 
 
 def _read_frame_pose(path: str, data: Mapping[str, Any], name: str) -> Float64Array:
-    """Return the pose (4, 4), from its camera to the world, of a frame.
+    """Return the pose (4, 4) of a frame, which maps from its camera to the world.
 
-    The camera's axes are x to the right, y down, z ahead. Positions are divided by the
-    scale that the file has applied.
+    The camera's axes are x to the right, y down, z ahead. The tool may have scaled the
+    scene: positions are divided by the scale that the file states.
 
     Args:
         path: path of the transforms.json.
-        data: what is in it.
-        name: index of the frame.
+        data: content of the file.
+        name: index of the frame, as a text.
     """
     frame = data["frames"][int(name)]
     matrix = _parse_rigid(
@@ -481,7 +513,13 @@ def _read_frame_pose(path: str, data: Mapping[str, Any], name: str) -> Float64Ar
 def _read_frame_models(
     path: str, names: Sequence[str], frames: Sequence[Mapping[str, Any]]
 ) -> list[CameraModel]:
-    """Return the camera models of frames of a transforms.json, which have names."""
+    """Return the camera models of frames of a transforms.json.
+
+    Args:
+        path: the file.
+        names: indices of the frames in the file, as texts.
+        frames: entries of these frames.
+    """
     lenses = [
         {key: frame[key] for key in frame if key in LENS_KEYS} for frame in frames
     ]
@@ -498,9 +536,9 @@ def _read_applied_scale(path: str, data: Mapping[str, Any]) -> float:
     """Return the factor by which the positions of a transforms.json are scaled already.
 
     It is nerfstudio's `applied_scale`, times the scale within its `applied_transform`.
-    The rotation and the shift of that move all cameras alike, and do not count.
-    Instant NGP's `scale` and `offset` are applied by the program that reads
-    the file, so the positions in it are without them.
+    The rotation and the shift of that transform move all cameras alike, and so do not
+    count. Instant NGP's `scale` and `offset` do not count either: the program that
+    reads the file applies them, so that the positions in the file are without them.
 
     Raises:
         FileFormatError: the transform is none of rotation, shift and scale, or the
@@ -554,7 +592,7 @@ def _parse_images(path: str) -> dict[str, list[str]]:
     """
     text = read_existing_text(path, "COLMAP's images", MAX_IMAGES_SIZE)
     lines = [line for line in text.splitlines() if not line.startswith("#")]
-    # A line of an image and a line of its points take turns; points are not read.
+    # Each image has two lines: its own, and one of its points, which are not needed.
     image_lines = [line for line in lines[::2] if line.strip()]
     # the last of ten words is the file, whose name may have blanks
     words_of_images = [line.split(maxsplit=9) for line in image_lines]
@@ -572,10 +610,14 @@ def _parse_images(path: str) -> dict[str, list[str]]:
 
 
 def _parse_image(where: str, words: Sequence[str]) -> Float64Array:
-    """Return the pose (4, 4), from the camera to the world, of an image of COLMAP.
+    """Return the pose (4, 4) of an image of COLMAP, which maps from camera to world.
 
-    `words` are those of its line, see `_parse_images`. Raises FileFormatError: they are
-    not ten, or have no quaternion of length 1.
+    Args:
+        where: file and image, for messages.
+        words: IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID and NAME of its line.
+
+    Raises FileFormatError: there are not ten words, or the quaternion does not have the
+    length 1.
     """
     if len(words) != 10:
         raise FileFormatError(
@@ -601,10 +643,14 @@ def _parse_image(where: str, words: Sequence[str]) -> Float64Array:
 
 
 def _parse_names(path: str, listing_text: str, known_names: Sequence[str]) -> list[str]:
-    """Return the names of cameras in a list with commas.
+    """Split a list of cameras such as "cam0,cam2" into names.
 
-    Raises FileFormatError unless they are 2 to `MAX_CAMERAS` different ones of
-    `known_names`.
+    Args:
+        path: the file, for messages.
+        listing_text: the list.
+        known_names: names of the file's cameras.
+
+    Raises FileFormatError: they are not 2 to `MAX_CAMERAS` different names of the file.
     """
     names = list(map(str.strip, listing_text.split(",")))
     if not 2 <= len(names) <= MAX_CAMERAS or len(set(names)) < len(names):
@@ -628,10 +674,16 @@ def _make_mounts(
     poses: Sequence[Float64Array],
     models: Sequence[CameraModel],
 ) -> tuple[Mount, ...]:
-    """Return cameras relative to the first.
+    """Return cameras with poses relative to the first.
 
-    Poses (4, 4) lead from their coordinates (x to the right, y down, z ahead) to common
-    ones.
+    Args:
+        spec: the file, for messages.
+        names: names of the cameras.
+        poses: (4, 4) for each from its coordinates (x to the right, y down, z ahead) to
+            those of a common world.
+        models: lens of each.
+
+    Raises FileFormatError: the lenses are of different kinds.
     """
     kinds = sorted({model.kind for model in models})
     if len(kinds) > 1:
@@ -648,8 +700,12 @@ def _make_mounts(
 def _measure_scale(path: str, applied_transform: Any) -> float:
     """Return the scale of nerfstudio's `applied_transform`.
 
-    It has 3 or 4 rows of 4 numbers. Raises FileFormatError: it is no rotation times a
-    scale, with a shift.
+    Args:
+        path: the file, for messages.
+        applied_transform: 3 or 4 rows of 4 numbers, by which the tool has moved and
+            scaled the scene.
+
+    Raises FileFormatError: it is not a rotation times a scale, with a shift.
     """
     rows = _to_rows(applied_transform)
     cells = [cell for row in rows for cell in row]

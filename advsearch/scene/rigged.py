@@ -53,9 +53,11 @@ MAX_ARC_COSINE = 1.0 - 1e-9
 
 
 def find_rig_parameter(name: str) -> Parameter | None:
-    """Return the parameter of a name `JOINT.x` (or y, z) or `TARGET.weight`.
+    """Return the parameter of a name such as "Head.x" or "Smile.weight".
 
-    None for other names. Whether there is such a joint or target is not asked.
+    It is the turn of a joint about x, y or z, or the weight of a morph target. The
+    result is None for other names. It is not checked whether an object has such a joint
+    or target.
     """
     owner, dot, component = name.rpartition(".")
     if not (owner and dot and component in (*AXES, WEIGHT)):
@@ -124,13 +126,18 @@ class SkeletonRig:
     ) -> None:
         """Bring the arrays of all parts into the order of the mesh's vertices.
 
-        They become tensors. Joints of a part are rows of its own nodes; here they are
-        rows of the nodes of all parts, one after the other. Arguments are those of the
-        class.
+        The arrays become tensors. A part numbers its joints by the rows of its own
+        nodes; here they are rows of the concatenated nodes of all parts.
+
+        Args:
+            parts: parts of the file that move with the skeleton; all share it.
+            vertices: (V,) for each vertex of the mesh its index in the concatenated
+                vertices of all parts.
+            to_mesh: (3, 3) from the file's axes and unit to the mesh's.
         """
         self.skeleton = parts[0].skeleton
         self._to_mesh = torch.from_numpy(to_mesh)
-        # without the scale, the cube root of the determinant
+        # The map is a rotation times a scale, whose cube is the determinant.
         self._rotation_to_mesh = torch.from_numpy(
             to_mesh / np.cbrt(np.linalg.det(to_mesh))
         )
@@ -143,7 +150,7 @@ class SkeletonRig:
             return np.pad(values, ((0, 0), (0, max_joints - values.shape[1])))
 
         points = np.concatenate([part.vertices for part in parts])
-        # counted on from the nodes of the parts before
+        # `start` is the number of nodes of all parts before this one.
         joints = np.concatenate(
             [
                 pad_joints(part.joints + start)
@@ -151,7 +158,8 @@ class SkeletonRig:
             ]
         )
         weights = np.concatenate([pad_joints(part.weights) for part in parts])
-        # Of each vertex: where it is, its joints (rows of `_nodes`) and their weights.
+        # For each vertex of the mesh: its position at rest (V, 3), its joints (V, n),
+        # which are rows of `_nodes`, and their weights (V, n).
         self._points = torch.from_numpy(points[vertices])
         self._joints = torch.from_numpy(joints[vertices])
         self._weights = torch.from_numpy(weights[vertices])
@@ -266,9 +274,9 @@ class SkeletonRig:
         The result is in the unit of the mesh, and differentiable.
 
         Args:
-            values: scalar tensors by the names of `parameters`; those that are missing
-                are as in the clip, or at rest.
-            clip: name of an animation.
+            values: scalar tensors by the names of `parameters`, such as "Head.z". Those
+                that are missing have the values of the clip, or those at rest.
+            clip: name of an animation of the file; None for the pose at rest.
 
         Raises:
             InputError: the file's numbers are so large that vertices are not finite.
@@ -288,9 +296,13 @@ class SkeletonRig:
     def pose(self, values: Mapping[str, Tensor], clip: str | None = None) -> Tensor:
         """Return the vertices (V, 3) float64 in the file's axes and unit.
 
-        Nodes are posed by the clip, then joints are turned; vertices are morphed, then
-        moved with their joints (linear blend skinning). Arguments are those of
-        `offsets`.
+        First the clip poses the nodes, then the joints are turned. The vertices are
+        morphed, and then moved with their joints (linear blend skinning).
+
+        Args:
+            values: numbers by parameter, such as "Head.z": turns of joints in degrees,
+                weights of morph targets, and the time in the clip.
+            clip: name of the clip of the animation; None for the pose at rest.
         """
         device = next(iter(values.values()), torch.zeros(())).device
         number_by_name = {name: value.double() for name, value in values.items()}
@@ -330,8 +342,10 @@ class SkeletonRig:
         """Return the vertices (V, 3) of the meshes with morph targets applied.
 
         Args:
-            number_by_name: values of parameters, which override those of a clip.
-            clip_weights: weights of a clip, by node.
+            number_by_name: values of parameters such as "Smile.weight", which replace
+                those of a clip.
+            clip_weights: for each node whose weights the clip sets, the weights (T,) of
+                its targets.
             device: device of the result.
         """
         points = self._points.to(device)
@@ -343,7 +357,8 @@ class SkeletonRig:
                     weight = clip_weights[target.node][target.index_in_node]
                 else:
                     weight = torch.tensor(target.rest_weight, dtype=torch.float64)
-            # A weight of 0 is left out, unless its derivative is wanted.
+            # A weight of 0 changes nothing, and is left out to save time, unless its
+            # derivative is required.
             if weight.requires_grad or float(weight) != 0.0:
                 offsets = weight.to(device) * target.offsets.to(device)
                 points = points.index_add(0, target.rows.to(device), offsets)
@@ -362,8 +377,12 @@ class SkeletonRig:
     ) -> tuple[Tensor, dict[int, Tensor]]:
         """Return what a clip sets at a time.
 
-        What it does not set is at rest; a node that the file gives as a matrix stays as
-        it is.
+        What the clip does not set has its value at rest. A node whose pose is a matrix
+        in the file can't be animated, and stays as it is.
+
+        Args:
+            clip: the clip.
+            seconds: () time since the clip's start.
 
         Returns:
             The matrices (N, 4, 4) of all nodes to their parents; and the weights (T,)
@@ -403,12 +422,16 @@ class SkeletonRig:
     ) -> Tensor:
         """Return local matrices (N, 4, 4) with the turns of joints applied.
 
-        Turns, in degrees by `JOINT.x` and so on, are about the axes of the object as it
-        stands at rest: first x, then y, then z.
+        Turns are about the axes of the object as it stands at rest: first x, then y,
+        then z.
+
+        Args:
+            local_matrices: (N, 4, 4) from each node to its parent.
+            number_by_name: degrees by names such as "Head.z"; other names are ignored.
         """
         device = local_matrices.device
         rotation_to_mesh = self._rotation_to_mesh.to(device)
-        # the joints of which a turn about any axis is set, each once
+        # the joints that have a turn about any axis, each once and in order
         joints = dict.fromkeys(
             name.rpartition(".")[0]
             for name in number_by_name
@@ -423,9 +446,9 @@ class SkeletonRig:
                         make_axis_rotation(axis, number_by_name[f"{joint}.{axis}"])
                         @ rotation
                     )
-            # It is about the axes of the object; local matrices are in those of the
-            # parent node. The same turn in other axes: first in those of the file, then
-            # in those of the parent at rest.
+            # The turn is in the object's axes, but local matrices are in those of the
+            # parent node. So it is converted, first to the file's axes, then to those
+            # of the parent at rest.
             rotation = rotation_to_mesh.T @ rotation @ rotation_to_mesh
             parent = int(self.skeleton.parents[node])
             if parent >= 0:
@@ -467,7 +490,7 @@ def _group_by_depth(parents: IntArray) -> list[tuple[Tensor, Tensor]]:
     """
     levels = list[tuple[Tensor, Tensor]]()
     nodes = np.flatnonzero(parents < 0)
-    # position of each node among those of its depth, once that is known
+    # position of each node among those of its depth; 0 until its depth is reached
     row_in_level = np.zeros(len(parents), np.int64)
     while len(nodes):
         parent_rows = row_in_level[parents[nodes]]
@@ -480,19 +503,20 @@ def _group_by_depth(parents: IntArray) -> list[tuple[Tensor, Tensor]]:
 def sample_track(track: Track, seconds: Tensor) -> Tensor:
     """Return the value (W,) of a track at a time (glTF 2.0, appendix C).
 
-    Between two keys it is that of the first (steps), or interpolated: linearly, on the
-    sphere if it is a rotation, or by a cubic Hermite spline. Before the first key and
-    after the last it is constant; rotations are quaternions of length 1. It is
-    differentiable in the time, but for steps.
+    Between two keys the value is that of the first key (STEP), or it is interpolated:
+    linearly, on the sphere if it is a rotation, or by a cubic Hermite spline
+    (CUBICSPLINE). Before the first key and after the last it is constant. Rotations are
+    quaternions of length 1. The value is differentiable in the time, except for STEP.
 
     Args:
         track: its `values` are (K, 1, W), or (K, 3, W) for a spline: the tangent before
             the key, the value, and the tangent after it.
-        seconds: () the time.
+        seconds: () time since the track's start.
     """
     times = torch.from_numpy(track.times).to(seconds.device)
     keys = torch.from_numpy(track.values).to(seconds.device)
-    # 0, or 1 for a spline, whose value is between two tangents
+    # The second axis has 1 entry, or 3 for a spline: tangent, value, tangent. Half of
+    # its length, rounded down, is the index of the value.
     value_index = keys.shape[1] // 2
     is_rotation = track.path == "rotation"
     # the first key after the time; 0 or the number of keys outside of the track
@@ -522,10 +546,15 @@ def sample_track(track: Track, seconds: Tensor) -> Tensor:
 
 
 def slerp(start: Tensor, end: Tensor, fraction: Tensor) -> Tensor:
-    """Interpolate between two rotations (4,) along the shorter arc.
+    """Interpolate between two rotations along the shorter arc (Shoemake 1985).
 
-    `fraction` is 0 at the start and 1 at the end. Rotations that are almost the same
-    are interpolated along the chord, since the arc's formula divides by zero there.
+    Rotations that are almost the same are interpolated along the chord, since the
+    formula of the arc divides by the sine of their angle, which is almost 0.
+
+    Args:
+        start: (4,) quaternion.
+        end: (4,) quaternion.
+        fraction: () 0 at the start and 1 at the end.
     """
     start = start / start.norm()
     end = end / end.norm()

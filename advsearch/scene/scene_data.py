@@ -112,10 +112,10 @@ class SceneData:
 
     @cached_property
     def meshes(self) -> Mapping[str, MeshPart]:
-        """Every mesh by name, as the settings have it.
+        """All meshes by name, with poses and materials of the settings.
 
-        The one under test is `OBJECT`. The glass of lamps has the pose of what carries
-        it.
+        The object under test is named `OBJECT`. The glass of a car's lamps has the pose
+        of the car.
         """
         around = {
             name: apply_settings(part, self.values)
@@ -177,11 +177,12 @@ class SceneData:
 
     @property
     def photograph(self) -> Photograph | None:
-        """The ground that shows the environment's photograph; None where it is a table.
+        """The ground that shows the environment's photograph; None for another ground.
 
-        Where `ground.kind` is not set, a photographed environment has such a ground,
-        unless a table is described or the environment may be hidden behind a color,
-        which would hide everything above the horizon alone.
+        The setting `ground.kind` decides if it is set. Otherwise a photographed
+        environment has such a ground, with two exceptions: settings describe a table,
+        or the environment may be hidden behind a plain color. The color would hide only
+        what is above the horizon, while the ground would still show the photograph.
         """
         environment = self.environment
         kind = self.values.get("ground.kind")
@@ -233,8 +234,10 @@ def cache_per_scene(
 ) -> Callable[Concatenate[AnyScene, P], R]:
     """Cache what a function returns for a scene and hashable arguments.
 
-    The scene may go, and what was computed for it goes with it: a scene holds all of
-    its meshes and maps. What the function returns must not hold the scene.
+    The cache does not keep a scene alive, since it has large meshes and maps: when the
+    scene is deleted, so are its results. A result must not refer to its scene, as
+    otherwise neither would ever be deleted. The oldest of more than
+    `MAX_CACHED_RESULTS` results of one scene is dropped.
     """
     results_by_scene: WeakKeyDictionary[Any, dict[Any, R]] = WeakKeyDictionary()
 

@@ -85,10 +85,22 @@ class Parameter:
         periodic: bool = False,
         log: bool = False,
     ) -> Parameter:
-        """Make a parameter that is one number and moves no outlines.
+        """Make a parameter that is one number and moves no outlines in the image.
 
-        See `moving` for one that does, and `Parameter` for the arguments: `text` is its
-        description.
+        `Parameter.moving` makes one that does.
+
+        Args:
+            estimators: valid estimators of its derivative, the preferred one first.
+            name: name without the control's, such as "roughness".
+            unit: unit, such as "degrees"; "1" for none.
+            low: smallest value.
+            high: largest value.
+            default: default value; a text says how the scene computes it.
+            text: description for the user.
+            search: range that is searched by default; None: the value stays at its
+                default.
+            periodic: whether `high` is the same as `low`, as for an angle.
+            log: whether a search takes even steps of the logarithm.
         """
         return cls(
             name=name,
@@ -120,7 +132,21 @@ class Parameter:
         periodic: bool = False,
         log: bool = False,
     ) -> Parameter:
-        """Make a number that can move an outline in the image."""
+        """Make a parameter that is one number and can move an outline in the image.
+
+        Args:
+            estimators: valid estimators of its derivative, the preferred one first.
+            name: name without the control's, such as "yaw".
+            unit: unit, such as "degrees"; "1" for none.
+            low: smallest value.
+            high: largest value.
+            default: default value; a text says how the scene computes it.
+            text: description for the user.
+            search: range that is searched by default; None: the value stays at its
+                default.
+            periodic: whether `high` is the same as `low`, as for an angle.
+            log: whether a search takes even steps of the logarithm.
+        """
         return cls(
             name=name,
             shape=(),
@@ -147,7 +173,18 @@ class Parameter:
         estimators: tuple[str, ...] = (),
         moves_silhouettes: bool = False,
     ) -> Parameter:
-        """Make a choice among names, whose values are the indices of its options."""
+        """Make a parameter that is a choice among names.
+
+        Its value is the index of an option.
+
+        Args:
+            name: name without the control's, such as "kind".
+            options: names to choose from.
+            default: what the scene has without a choice, in words.
+            text: description for the user.
+            estimators: valid estimators of a derivative; none by default.
+            moves_silhouettes: whether it can move an outline in the image.
+        """
         return cls(
             name=name,
             shape=(),
@@ -174,7 +211,14 @@ class Parameter:
     ) -> tuple[Parameter, ...]:
         """Make the three parameters of a color, display-referred sRGB.
 
-        The text goes on behind "Red", "Green", "Blue".
+        Args:
+            text: description for the user, to which "Red", "Green" or "Blue" is the
+                beginning: "of the ground" becomes "Red of the ground".
+            search: range that is searched by default; None: the value stays at its
+                default.
+            low: smallest value of each channel; the largest is 1.
+            defaults: default values of red, green and blue.
+            estimators: valid estimators of the derivative, the preferred one first.
         """
         descriptions = [f"{name.capitalize()} {text}" for name in CHANNELS]
         return tuple(
@@ -198,7 +242,13 @@ class Parameter:
 def _make_surface_parameter(
     name: str, text: str, search: tuple[float, float]
 ) -> Parameter:
-    """Return a parameter of the principled surface."""
+    """Return a parameter of the principled surface, a number from 0 to 1.
+
+    Args:
+        name: name of Mitsuba's parameter, such as "roughness".
+        text: description for the user.
+        search: range that is searched by default.
+    """
     return Parameter(
         name=name,
         shape=(),
@@ -405,7 +455,11 @@ LAMPS_OFF = LAMPS[0]
 
 
 def _make_lamp_parameter(whose: str) -> Parameter:
-    """Return the parameter for the lamps of a car."""
+    """Return the parameter for the lamps of a car: off, low beam or high beam.
+
+    Args:
+        whose: the car, for the description, such as "the object".
+    """
     text = (
         f"Headlamps of {whose}, with its tail lamps: the low beam, or the high "
         "beam; in the avenue."
@@ -644,10 +698,14 @@ def parse_mesh_name(name: str) -> str | None:
 
 
 def resolve_settings(settings: SettingValues) -> dict[str, float | None]:
-    """Return every setting's value: the defaults, and over them what was given.
+    """Return every setting's value: the user's, or else the default.
 
-    None where the scene works a value out. A choice has the index of its option.
-    Settings of meshes around the object are there where they were given.
+    The value is None if the scene computes it, as the camera's distance from the
+    object. The value of a choice is the index of its option. Settings of meshes around
+    the object are included only if the user has given them.
+
+    Args:
+        settings: the user's values by name, such as {"camera.fov": 40}.
 
     Raises:
         InputError: a value is not a finite number inside its range, or two settings

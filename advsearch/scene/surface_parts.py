@@ -59,15 +59,16 @@ _SMOOTHING_ROUNDS = 10
 
 
 def unwrap(soup: TriangleSoup, chart_group: IntArray | None = None) -> TriangleSoup:
-    """Return faces with texture coordinates from xatlas; deterministic.
+    """Return faces with new texture coordinates from xatlas.
 
-    The charts, pieces of the surface in the texture, do not overlap and lie inside the
-    unit square. The faces of a mesh in very many pieces become triangles of one size,
-    side by side in a grid.
+    xatlas cuts the surface into charts, which it lays side by side into the unit
+    square, without overlap. If the mesh is in very many pieces, xatlas is not used: all
+    faces become triangles of one size in a grid. The result is deterministic.
 
     Args:
         soup: the faces.
-        chart_group: (F,) faces with different numbers get charts of their own.
+        chart_group: (F,) a number for each face; no chart has faces with different
+            numbers. None: there is no such limit.
     """
     patch = _find_patches(soup)  # (F,) the patch of each face, which is cut out
     if chart_group is not None:
@@ -91,9 +92,12 @@ def unwrap(soup: TriangleSoup, chart_group: IntArray | None = None) -> TriangleS
 def _make_grid_uvs(count: int) -> Float64Array:
     """Return texture coordinates (count, 3, 2): two faces in each cell of a grid.
 
-    Faces 0 and 1 are the lower left and the upper right half of the first cell, and so
-    on, row by row from the bottom. The grid is the smallest with as many rows as
-    columns that has a place for all.
+    Faces 0 and 1 are the lower left and the upper right half of the first cell, faces 2
+    and 3 those of the second, and so on, row by row from the bottom. The grid is the
+    smallest square grid that has room for all faces.
+
+    Args:
+        count: number of faces.
     """
     n_columns = int(np.ceil(np.sqrt(np.ceil(count / 2))))
     face = np.arange(count)
@@ -109,13 +113,13 @@ def _make_grid_uvs(count: int) -> Float64Array:
 def _generate_atlas(soup: TriangleSoup, groups: Sequence[IntArray]) -> xatlas.Atlas:
     """Unwrap groups of faces into one atlas, of `ATLAS_SIZE` if they fit into it.
 
-    Each group is a mesh of its own for xatlas, with the vertices that it uses, so that
-    no chart has faces of two groups. xatlas makes several atlases of the size where one
-    is too small; then it is run again for one of any size.
+    Each group is passed to xatlas as a mesh of its own, so that no chart has faces of
+    two groups. If not all charts fit into one atlas of `ATLAS_SIZE`, xatlas makes
+    several; then it is run again for one atlas of any size.
 
     Args:
         soup: the faces.
-        groups: for each the indices of its faces.
+        groups: for each group the indices of its faces.
     """
     for resolution in (ATLAS_SIZE, 0):  # 0: one atlas, however large
         atlas = xatlas.Atlas()
@@ -152,12 +156,12 @@ def _are_straight(normals: Float64Array, plane: IntArray) -> bool:
 def _find_patches(soup: TriangleSoup) -> IntArray:
     """Cut a mesh that xatlas cannot unwrap well in one piece.
 
-    xatlas 0.0.11 takes neighbouring faces that hardly bend for one plane. On a finely
-    tessellated smooth surface that goes on from face to face around the full object,
-    which is then flattened like a sheet of paper; where a closed surface leaves no
-    border, the process crashes. Such meshes, and large ones, are cut where the surface
-    turns from one of 14 directions to another. Large ones are cut further by
-    `_CELL_FACES`.
+    xatlas 0.0.11 takes neighbouring faces with almost the same normal for one plane. On
+    a finely tessellated smooth surface this goes on from face to face around the full
+    object, which is then flattened like a sheet of paper. If the surface is closed, and
+    so has no border, the process crashes. Such meshes, and large ones, are cut where
+    the surface turns from one of 14 directions to another. Large ones are also cut into
+    pieces of about `_CELL_FACES` faces.
 
     Returns:
         The patch of each face (F,), numbered from 0.
@@ -215,8 +219,9 @@ def _smooth_normals(
     A round replaces each normal by the unit mean of itself and its neighbours'.
 
     Args:
-        normals: (F, 3).
-        face, neighbour: (E,) indices of the two faces of each shared edge.
+        normals: (F, 3) unit normals of the faces.
+        face: (E,) index of one face of each shared edge.
+        neighbour: (E,) index of the other face.
     """
     count = len(normals)
     itself = np.arange(count)
@@ -243,9 +248,9 @@ def _halve_patches(centers: Float64Array, patch: IntArray, max_faces: int) -> In
     A patch is cut across its longest axis, at the median of its faces' centers.
 
     Args:
-        centers: (F, 3) of the faces.
-        patch: (F,) the patch of each face.
-        max_faces: how many a piece may have.
+        centers: (F, 3) centers of the faces.
+        patch: (F,) number of the patch that each face is in.
+        max_faces: largest number of faces of a piece.
 
     Returns:
         (F,) the piece of each face, numbered from 0.
@@ -301,8 +306,12 @@ class SurfaceParts:
     def __init__(self, mesh: Mesh) -> None:
         """Rasterise the map, and find the center of each cell and of each face.
 
-        Parts are the cells, row by row, and then the faces, unless there are more than
-        `MAX_FACES`: then the faces are left out.
+        The parts of a surface are the cells of its map, row by row, and then its faces.
+        A mesh with more than `MAX_FACES` faces has the cells alone.
+
+        Args:
+            mesh: the mesh. If its texture coordinates do not tell all points apart, it
+                is unwrapped anew.
         """
         self.mesh = mesh
         self._mesh_uvs = mesh.uvs[mesh.faces].astype(np.float64)
@@ -336,11 +345,11 @@ class SurfaceParts:
         return kinds
 
     def find_cells(self, face: IntArray, uv: Float64Array) -> IntArray:
-        """Return the index of the map's cell (n,) in which each point on a face lies.
+        """Return the index (n,) of the cell of the map that each point is in.
 
-        Where the map has texture coordinates of its own, `is_unwrapped`, a point is
-        taken to it by its barycentric weights in the face. What is outside of the map
-        counts as on its border.
+        If the map has its own texture coordinates (`is_unwrapped`), the point's
+        coordinates in it follow from its barycentric weights in the face. Points
+        outside of the map count as on its border.
 
         Args:
             face: (n,) index of the face.
@@ -349,7 +358,7 @@ class SurfaceParts:
         if self.is_unwrapped:
             # its arguments are in the order of rows and columns: v, then u
             weights = compute_barycentric(self._mesh_uvs[face], uv[:, 1], uv[:, 0])
-            # of a face without area, whose weights are not finite, the middle is taken
+            # The weights in a face without area are not finite: its middle is taken.
             weights = np.nan_to_num(weights, nan=1 / 3, posinf=1 / 3, neginf=1 / 3)
             weights = np.clip(weights, 0.0, 1.0)
             weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
@@ -373,7 +382,7 @@ def _unwrap_mesh(mesh: Mesh) -> Float64Array:
     unique_points, unique_index = np.unique(points, axis=0, return_inverse=True)
     faces = unique_index.reshape(-1)[mesh.faces.astype(np.int64)]
     n_faces = len(faces)
-    # only points and faces count: the rest says that nothing is known
+    # `unwrap` uses points and faces alone: the other fields are fillers.
     soup = TriangleSoup(
         points=unique_points,
         faces=faces,
@@ -400,9 +409,14 @@ def _rasterise_map(mesh: Mesh, uvs: Float64Array) -> Charts:
 def _has_unique_uvs(mesh: Mesh, uvs: Float64Array) -> bool:
     """Return whether texture coordinates (F, 3, 2) tell points of a surface apart.
 
-    They do if they lie in the unit square, give almost all of the surface an area,
-    cover enough of the square, and hardly any of it twice. The last two are tested on a
-    raster of `_TEST_RASTER_SIZE` pixels a side.
+    They do under four conditions. They are in the unit square. Almost all of the
+    surface has an area in the texture. They cover enough of the square, and hardly any
+    of it twice. The last two are tested on a raster of `_TEST_RASTER_SIZE` pixels a
+    side.
+
+    Args:
+        mesh: the mesh.
+        uvs: (F, 3, 2) texture coordinates of the corners of its faces.
     """
     if uvs.min() < 0.0 or uvs.max() > 1.0:
         return False
@@ -418,7 +432,8 @@ def _has_unique_uvs(mesh: Mesh, uvs: Float64Array) -> bool:
         (_TEST_RASTER_SIZE, _TEST_RASTER_SIZE),
         tolerance=-1e-6,
     )
-    # pixels in any face; and how often a pixel is in one more face
+    # The rows of the result are pairs of face and pixel. Those beyond one for each
+    # covered pixel are in a further face.
     covered = len(np.unique(row * _TEST_RASTER_SIZE + column))
     doubled = len(row) - covered
     return (

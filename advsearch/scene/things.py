@@ -86,13 +86,18 @@ class ThingPart(MeshPart):
 
 
 def parse_things(things_spec: str | None) -> tuple[RequestedThing, ...]:
-    """Read the things of a setting, see above.
+    """Parse the setting that names things beside the object.
 
-    They are separated by semicolons. A name that is taken gets a number behind it,
-    unless it was chosen with `name=`.
+    Things are separated by semicolons, as in "car@12,3.5,heading=180; person@4,-2". If
+    the name of a thing is taken, a number is added to it ("car-2"), unless the user has
+    chosen it with `name=`.
+
+    Args:
+        things_spec: the setting; None or empty for no things.
 
     Raises:
-        InputError: it is invalid, or has more than `MAX_THINGS`.
+        InputError: a thing is not written so, a chosen name is taken, or there are more
+            than `MAX_THINGS`.
     """
     things: list[RequestedThing] = []
     for part in filter(None, map(str.strip, (things_spec or "").split(";"))):
@@ -116,10 +121,14 @@ def parse_things(things_spec: str | None) -> tuple[RequestedThing, ...]:
 
 
 def _parse_thing(part: str) -> RequestedThing:
-    """Read one thing of a setting, see `parse_things`.
+    """Parse one thing, such as "car@12,3.5,heading=180".
 
-    The name is that of the object unless it has one of its own. Raises InputError,
-    UnknownNameError: it is not as described there.
+    Before the @ is the name or file of its object; behind it are x and y in metres, and
+    options: heading, size, name, label, lamps and facing. Without `name=` the thing is
+    named after its object.
+
+    Raises InputError, UnknownNameError: it is not written so, or a number or an option
+    is not valid.
     """
     object_spec, separator, rest = part.rpartition("@")
     object_spec = object_spec.strip()
@@ -144,7 +153,7 @@ def _parse_thing(part: str) -> RequestedThing:
     size = None
     if "size" in options:
         size = _parse_number(part, "size", options["size"], MIN_METRES, MAX_METRES)
-    # without the part of the file that is behind a #
+    # what is behind a # names a part of a file, as in scene.glb#chair
     name = make_safe_name(Path(options.get("name") or object_spec.partition("#")[0]))
     return RequestedThing(
         object_spec=object_spec,
@@ -162,8 +171,11 @@ def _parse_thing(part: str) -> RequestedThing:
 def _parse_options(part: str, words: Iterable[str]) -> dict[str, str]:
     """Return the options of a thing, words such as heading=180, by name.
 
-    `part` is the text of the thing, for messages. Raises UnknownNameError: there is no
-    such option, or no such word for its lamps.
+    Args:
+        part: text of the thing, for messages.
+        words: its options, such as "heading=180".
+
+    Raises UnknownNameError: there is no such option, or no such value for its lamps.
     """
     options: dict[str, str] = {}
     for word in words:
@@ -201,9 +213,9 @@ def add_things(
 
     Args:
         scene: scene with the object.
-        things_spec: the setting; None for no things.
-        load: loads an object; its arguments are a name or a file, and the axis of
-            the file that is the object's front, None for what its format says.
+        things_spec: the setting, such as "car@12,3.5,heading=180"; None for no things.
+        load: loads an object. Its arguments are a name or a file, and the axis of the
+            file that is the object's front; None for the usual one of its format.
 
     Raises:
         InputError: the text is invalid, a name is taken, or sizes in metres are not
@@ -236,9 +248,16 @@ def _make_thing(
 ) -> tuple[ThingPart, list[str]]:
     """Return a thing that stands in a scene, and remarks on it.
 
-    Remarks are those of its file, doubts about its size, and where there are lanes a
-    guess of its front. `thing` is what was asked for; other arguments and errors are as
-    for `add_things`.
+    Remarks are notes on its file, doubts about its size and, if the ground has lanes,
+    that its front was guessed.
+
+    Args:
+        scene: the scene.
+        thing: what the user has requested.
+        load: loads an object by its name or file, and the axis that is its front.
+
+    Raises:
+        InputError: its size in metres is not known, or its name is taken.
     """
     object_spec = thing.object_spec
     name = thing.name
@@ -271,9 +290,10 @@ def _make_thing(
 
 
 def _list_overlap_remarks(scene: SceneData) -> list[str]:
-    """Return a remark on each pair that overlaps, of the object and the things.
+    """Return a remark on each pair of the object and the things that overlaps.
 
-    That is by their convex outlines from above, at heights that both have.
+    Two of them overlap if their convex outlines, seen from above, do and they have some
+    height in common.
     """
     footprints = {"the object": compute_footprint(scene.base_vertices)} | {
         name: compute_footprint(compute_base_vertices(part))
@@ -299,8 +319,8 @@ def _compute_pose(
     Args:
         scene: scene with the object, whose size is the unit of lengths.
         asset: the thing's object.
-        requested: where it stands and how it is turned.
-        metres: its longest side.
+        requested: position in metres from the object, and heading in degrees.
+        metres: longest side of the thing in metres.
     """
     # the point of the mesh that is put on the ground, and its longest side
     foot_point, extent = find_footing(asset.mesh.vertices.astype(np.float64))
@@ -313,9 +333,10 @@ def _compute_pose(
 
 
 def find_ground_height(scene: SceneData, position: Float64Array) -> float:
-    """Return how high the ground lies at a position (2,), object sizes.
+    """Return the height of the ground at a position (2,), in object sizes.
 
-    That is the height of the road, the pavement, the table or the floor; or 0.
+    The ground is the highest of the meshes on which things stand: a road, a pavement, a
+    table or a floor. The height is 0 if there is none.
     """
     ground = (part for part in scene.surrounding_meshes.values() if part.is_ground)
     triangles = (
@@ -332,10 +353,14 @@ def find_ground_height(scene: SceneData, position: Float64Array) -> float:
 
 
 def find_triangle_heights(corners: Float64Array, position: Float64Array) -> list[float]:
-    """Return the heights of triangles (F, 3 corners, 3) above or below a point (2,).
+    """Return the heights at which a vertical line meets triangles.
 
-    A triangle counts if the point is inside it or on its border, seen from above; one
-    that stands upright does not. Its height is that of its plane at the point.
+    A triangle counts if the line's point is inside it or on its border, seen from
+    above. A vertical triangle does not count.
+
+    Args:
+        corners: (F, 3, 3) corners of the triangles.
+        position: (2,) x and y of the line.
     """
     a, b, c = np.moveaxis(corners, 1, 0)
     # The point makes a triangle with each side; the areas, signed and seen from above.
@@ -368,9 +393,10 @@ def find_overlapping_solid(scene: SceneData, footprint: Footprint) -> str | None
 
 
 def add_solid_remarks(scene: AnyScene) -> AnyScene:
-    """Return the scene with a remark on its object and each thing inside a solid.
+    """Return the scene with a remark if its object or a thing is inside a solid.
 
-    Solids are those of the place around it; without any the scene is returned as it is.
+    Solids are parts of the place, such as houses, in which nothing can stand. If the
+    place has none, the scene is returned as it is.
     """
     if not any(part.solids for part in scene.surrounding_meshes.values()):
         return scene
@@ -394,13 +420,18 @@ def add_solid_remarks(scene: AnyScene) -> AnyScene:
 def list_camera_remarks(
     scene: SceneData, eyes: Sequence[Float64Array]
 ) -> tuple[str, ...]:
-    """Return a remark where cameras are inside a solid of the place; empty if none is.
+    """Return a remark if cameras are inside a solid of the place, such as a house.
 
-    `eyes` are their positions (3,) in metres, at least one.
+    The result is empty if none is.
+
+    Args:
+        scene: the scene.
+        eyes: positions (3,) of the cameras in metres, at least one.
     """
     solid_names = list[str]()
     for eye in eyes:
-        # A camera is a tiny square.
+        # Overlap is defined for footprints, so that the camera is taken for a tiny
+        # square.
         x, y, z = eye / scene.size_in_metres
         corners = np.array(
             [(x - EYE_SIZE, y), (x, y - EYE_SIZE), (x + EYE_SIZE, y), (x, y + EYE_SIZE)]

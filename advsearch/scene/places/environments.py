@@ -31,14 +31,16 @@ from advsearch.trust.stored_files import track_opened_files
 def import_place(spec: str) -> EnvironmentAsset:
     """Read a place with its light, the first in its file or the one that is named.
 
-    `spec` is the place's file, and perhaps a light, ``place.yaml#night``. A bundled
-    environment wins over a file of the light's name. If the light has lux, they are the
-    illuminance of level ground under the open sky: the luminance of a radiance of 1,
-    `candelas`, follows from that.
+    The map of a light is the name of a bundled environment, or else a file beside that
+    of the place. If the light has lux, that is the illuminance of level ground under
+    the open sky, and tells the luminance of a radiance of 1 (`candelas`).
+
+    Args:
+        spec: the place's file, and perhaps the name of a light: ``place.yaml#night``.
 
     Raises:
-        FileFormatError, InputError: a file is missing, damaged, outside of the folder,
-            or says something else.
+        FileFormatError: a file is missing, damaged, or outside of the folder.
+        InputError: the light has lux, but its map is black.
         UnknownNameError: the place has no such light, mesh or variant, or there is no
             such bundled environment.
     """

@@ -69,7 +69,8 @@ def split_light(spec: str) -> tuple[str, str | None]:
 def read_place_file(path: Path) -> PlaceFile:
     """Read the YAML file of a place.
 
-    Raises FileFormatError: it is missing, is not YAML, or says something else.
+    Raises FileFormatError: it is missing, is no YAML, or has other entries or values.
+    The message has the first of these, such as "lights.day.lux".
     """
     content = parse_text(
         path,
@@ -109,9 +110,16 @@ def resolve_sibling_path(path: Path, name: str) -> Path:
 def read_place(path: Path, file: PlaceFile, variant: str | None) -> Place:
     """Read the meshes of a place.
 
+    Args:
+        path: the YAML file of the place.
+        file: its content.
+        variant: name of a variant of the materials, such as "wet"; None for none.
+
     Raises:
-        FileFormatError, InputError: as for an imported object.
-        UnknownNameError: it has no such mesh or variant.
+        FileFormatError: the mesh file is missing, damaged or over a limit.
+        InputError: its geometry cannot be used.
+        UnknownNameError: it has no such variant, or no mesh of a name that the YAML
+            file has.
     """
     parts, notes = read_place_meshes(resolve_sibling_path(path, file.mesh), variant)
     names = [part.name for part in parts]
@@ -127,7 +135,8 @@ def read_place(path: Path, file: PlaceFile, variant: str | None) -> Place:
         for outline in entry.list_footprints()
     )
     parts = [replace(part, is_ground=part.name in file.ground) for part in parts]
-    # the solids of the place go with its first mesh
+    # Solids belong to the place and not to a mesh. Each has to be listed once: so the
+    # first mesh has them all.
     parts[0] = replace(parts[0], solids=solids)
     directory = Path(os.path.abspath(path)).parent
     return Place(make_safe_name(directory), file, tuple(parts), tuple(notes))
@@ -148,18 +157,18 @@ def load_bundled_place(name: str, variant: str | None = None) -> Place:
 def make_place_parts(
     place: Place, metres: float, candelas: float | None, *, is_dark: bool
 ) -> tuple[MeshPart, ...]:
-    """Return the meshes of a place with lengths in the metres of one object size.
+    """Return the meshes of a place in the units of a scene.
 
-    What they emit is divided by `candelas`, so that it is in the unit of the light's
-    radiance. Meshes that are lamps emit only if it is dark, and then what the place's
-    file says.
+    Lengths become object sizes, and emission is divided by `candelas`, so that it is in
+    the unit of the environment's radiance. Meshes that are lamps emit only if it is
+    dark, and then the luminance that the place's file states.
 
     Args:
         place: the place, whose lengths are in metres and whose emission is in cd/m2.
-        metres: size in metres of one object size.
-        candelas: luminance of a radiance of 1, cd/m2; None where the light has no unit,
-            and its lamps stay off.
-        is_dark: whether its lamps shine.
+        metres: one object size in metres.
+        candelas: luminance of a radiance of 1, cd/m2; None if the light has no unit:
+            then the lamps stay off.
+        is_dark: whether the lamps are on.
     """
     radiance_unit = np.float32(candelas or DEFAULT_LUMINANCE)
     are_lamps_on = is_dark and candelas is not None

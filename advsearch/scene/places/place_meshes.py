@@ -167,7 +167,7 @@ def read_place_meshes(
 ) -> tuple[list[MeshPart], list[str]]:
     """Read the meshes of a place, and notes on what is left out.
 
-    They are in metres, z up, with what they emit in cd/m2.
+    Meshes are in metres, z up, and their emission is in cd/m2. Each has one material.
 
     Args:
         path: the glTF file.
@@ -216,7 +216,13 @@ def _drop_supported_extensions(header: Header) -> Header:
 def _note_left_out(
     header: Header, primitives: Sequence[PosedPrimitive], notes: Notes
 ) -> None:
-    """Note what an object of the file would have, and a place does not."""
+    """Note what the file has and a place ignores: vertex colors, skins and lights.
+
+    Args:
+        header: header of the file.
+        primitives: the primitives that were read.
+        notes: gets the notes.
+    """
     if any(primitive.part.colors is not None for primitive in primitives):
         notes.warn(
             " has colours of vertices, which are left out; paint them into a texture"
@@ -278,12 +284,13 @@ def _read_primitives(
 ) -> tuple[list[PosedPrimitive], dict[int | None, ImportedSurface]]:
     """Read the primitives that the file's nodes show, and the surfaces they use.
 
-    A mesh that several nodes show is read once, and is there at each of their poses.
+    Several nodes may show one mesh. It is read once, and the result has it in the pose
+    of each node.
 
     Args:
         file: the glTF file.
         variant: index of a variant of its materials; None for none.
-        notes: notes to which what is left out is added.
+        notes: a note is added on everything that is left out.
 
     Returns:
         The primitives in the pose of each node, and the surface of each material.
@@ -297,7 +304,7 @@ def _read_primitives(
     for mesh, pose in posed_meshes:
         for index, primitive in enumerate(header.meshes[mesh].primitives):
             piece = pieces.get((mesh, index))
-            if piece is None:  # it is no triangles
+            if piece is None:  # it is made of points or lines
                 continue
             _, uv_scale, uv_shift = fitted[piece.material]
             part = transform_part(_fit_uvs(piece.part, uv_scale, uv_shift), pose)
@@ -320,9 +327,17 @@ def _fit_uvs(
 def _read_pieces(
     file: GltfFile, meshes: Sequence[int], variant: int | None
 ) -> dict[tuple[int, int], PrimitiveData]:
-    """Read the primitives of meshes, by the mesh and the index in it.
+    """Read the primitives of meshes with the materials of a variant.
 
-    Each has the material of the variant. Those without faces are left out.
+    Primitives without faces, such as lines, are left out.
+
+    Args:
+        file: the glTF file.
+        meshes: indices of the meshes.
+        variant: index of a variant of the materials; None for none.
+
+    Returns:
+        The primitives, by the index of the mesh and that of the primitive in it.
     """
     header = file.header
     pieces: dict[tuple[int, int], PrimitiveData] = {}
@@ -346,8 +361,14 @@ def _fit_surfaces(
 ) -> dict[int | None, tuple[ImportedSurface, Float64Array, Float64Array]]:
     """Return the surface of each material, with the scale and shift of its UVs.
 
-    UVs times the scale (2,) plus the shift (2,) are those in the surface's images,
-    which are fitted to all pieces of the material.
+    A surface's images are fitted to the texture coordinates of all pieces with its
+    material. The piece's UVs times the scale (2,) plus the shift (2,) are its texture
+    coordinates in them.
+
+    Args:
+        file: the glTF file.
+        pieces: geometry by the index of its mesh and of the primitive in it.
+        notes: a note is added on everything that is left out.
 
     Raises FileFormatError, InputError: there are too many materials or texels.
     """
@@ -394,9 +415,14 @@ def _group_by_material(
 ) -> dict[NameAndMaterial, list[ImportedPart]]:
     """Group primitives to meshes of one material each, in the order of materials.
 
-    A mesh is named by its own material, also where the variant gives another one to all
-    that has it. Where the variant does so for a part only, that part becomes a mesh of
-    its own, with the name of the other material.
+    A variant replaces materials by others. A mesh is named by its original material, so
+    that its name is the same in all variants. But if the variant replaces the material
+    of some primitives only, these become a mesh of their own, with the name of the
+    material that they get.
+
+    Args:
+        header: header of the file, with the names of materials.
+        primitives: the primitives in their poses, with both materials.
 
     Returns:
         The parts of each mesh, by its name and the index of its material in the
@@ -434,7 +460,16 @@ def _make_part(
 ) -> MeshPart:
     """Return one mesh of a place from its parts and their surface.
 
-    A color without a texture becomes a small texture of it, and its alpha the opacity.
+    A color without a texture becomes a texture of 2 x 2 texels. A fourth channel of the
+    texture, alpha, becomes the opacity.
+
+    Args:
+        path: the file, for messages.
+        name: name of the mesh.
+        members: the primitives that it is joined from.
+        surface: their material, as the file has it.
+
+    Raises InputError: the joined geometry cannot be used.
     """
     color = surface.color
     if color is None:
@@ -465,8 +500,9 @@ def _with_finish(
 ) -> MeshPart:
     """Return a mesh with the specular and the clear coat of its material.
 
-    The gloss of a coat can only be set in a surface in Mitsuba's words, which a mesh
-    with cut-outs or bumps cannot have: its coat has Mitsuba's own gloss.
+    The gloss of a coat needs a surface in Mitsuba's own description, which a mesh with
+    an opacity or a normal map cannot have. The coat of such a mesh has Mitsuba's
+    default gloss.
 
     Args:
         path: the file, for messages.
@@ -476,8 +512,9 @@ def _with_finish(
     """
     entry = MaterialEntry() if index is None else header.materials[index]
     finish = _read_extension(path, _Finish, entry.extensions)
-    # Of a surface that faces the light, by its index of refraction. Our specular of 1
-    # reflects `REFLECTANCE`.
+    # The fraction that is reflected of light along the normal is ((n - 1) / (n + 1))^2
+    # for an index of refraction n (Fresnel). A specular of 1 here reflects
+    # `REFLECTANCE`.
     ior = finish.KHR_materials_ior.ior
     facing_reflectance = (
         finish.KHR_materials_specular.specularFactor * ((ior - 1.0) / (ior + 1.0)) ** 2
@@ -504,8 +541,8 @@ def _with_finish(
 def _join(members: Sequence[ImportedPart]) -> Mesh:
     """Join parts of a file to one mesh, z up, its front along +x.
 
-    Parts have glTF's axes. Texture coordinates that are missing are 0; normals that are
-    missing are those of faces. Normals become unit vectors.
+    The parts have glTF's axes: y up, the front along +z. Missing texture coordinates
+    become 0, and missing normals those of the faces. All normals become unit vectors.
     """
     rotation = compute_rotation("y", "+z")  # from glTF's axes
     vertices = list[Float64Array]()

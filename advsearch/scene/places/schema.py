@@ -31,11 +31,14 @@ class _Entry(BaseModel):
 
 
 def _is_convex(corners: Float64Array) -> bool:
-    """Return whether corners (K, 2), in turn, turn to one side only, and hold an area.
+    """Return whether an outline is convex and has an area.
 
-    That is, whether the outline is convex: left or right turns only. A corner on a
-    straight line does not count, within rounding. If all are on one line, the outline
-    holds no area.
+    It is convex if it turns only left or only right at its corners. A corner at which
+    it goes straight on, within rounding, does not count. If all corners are on one
+    line, it has no area.
+
+    Args:
+        corners: (K, 2) in their order around the outline.
     """
     edges = np.roll(corners, -1, axis=0) - corners
     # cross products of successive edges
@@ -72,8 +75,9 @@ class SolidEntry(_Entry):
     def _check_form(self) -> SolidEntry:
         """Check that an entry has one convex outline, or a radius and positions.
 
-        Raises ValueError, which pydantic reports: both or neither, heights that do not
-        rise, an outline that is not convex, or a name that is no line of text.
+        Raises ValueError, which pydantic reports: the entry has both or neither, the
+        lower height is not first, the outline is not convex, or the name is not a
+        single line of text.
         """
         has_positions = self.at is not None
         has_radius = self.radius is not None

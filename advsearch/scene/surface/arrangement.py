@@ -80,26 +80,34 @@ class SurfaceView:
 
         Its rows are the pixels, its columns the cells of the fine grid. Each ray that
         hits the surface adds four entries to its pixel's row: the weights of a bilinear
-        look-up times the ray's own. Arguments are those of the class.
+        look-up times the ray's own.
+
+        Args:
+            samples: rays of all cameras of one launch that hit the object.
+            camera_index: index of this view's camera in that launch.
+            shape: rows and columns of the fine grid.
+            sides: number of sides of the surface that have light of their own, 1 or 2.
         """
         self.base_radiance = samples.radiance[camera_index]
         self.coverage = samples.coverage[camera_index]
         height, width = self.base_radiance.shape[:2]
         n_cells = shape[0] * shape[1]
-        # The rays of all cameras are counted on, and those of the samples rise: the
-        # camera's are between the first ray of it and of the next one.
+        # Rays are numbered through from one camera to the next, and `samples.sample`
+        # is the ascending number of each sample's ray. So the samples of this camera
+        # are those between its own first ray and that of the next camera.
         n_rays = height * width * RAYS_PER_PIXEL
         first_rays = torch.tensor([camera_index, camera_index + 1]) * n_rays
         start, end = torch.searchsorted(samples.sample, first_rays).tolist()
         ray = samples.sample[start:end] - camera_index * n_rays
         pixel = ray // RAYS_PER_PIXEL
-        # (n, 4) cells and weights of the bilinear look-ups; with two sides those on the
-        # back are in the second half of the columns
+        # Cells and weights (n, 4) of the bilinear look-ups. If the surface has two
+        # sides, the second half of the columns is its back.
         columns, fractions = find_bilinear_weights(samples.uv[start:end].numpy(), shape)
         is_back = samples.is_back[start:end].numpy()
         columns += np.int32(n_cells) * is_back[:, None]
         weights = fractions * samples.weight[start:end].numpy()[:, None]
-        # samples are in the order of pixels, with four entries each
+        # The samples are in the order of pixels, and each has four entries: so row
+        # pointers of the compressed matrix need no sorting.
         row_starts = np.searchsorted(pixel.numpy(), np.arange(height * width + 1)) * 4
         self.matrix = scipy.sparse.csr_matrix(
             (weights.ravel(), columns.ravel(), row_starts.astype(np.int32)),
@@ -212,7 +220,12 @@ class Arrangement:
     ) -> None:
         """Lay texels over all surfaces, trace what they see, and measure how they look.
 
-        Arguments are those of the class.
+        Args:
+            renderer: renderer of the scene.
+            inputs: scene inputs, which fix where everything stands. Those that change
+                only the finished image are ignored.
+            texture: rows and columns of the texture whose color is searched.
+            seed: seed of the rays.
         """
         scene = renderer.scene
         self._scene = scene
@@ -228,7 +241,7 @@ class Arrangement:
         surfaces = self._make_object_texels(charts, vertices, normals)
         self.n_sides = len(surfaces)
         self._has_ground = description.get_number("ground.size") > 0.0
-        # from which a photographed ground was taken; None of any other ground
+        # height of the camera that photographed the ground; None for another ground
         self._capture_height = (
             None if description.photograph is None else description.capture_height
         )
@@ -242,7 +255,8 @@ class Arrangement:
         self._view_matrices = texels.make_view_matrices(
             met_cells, self.texels.texel_of_cell, len(self.texels.positions)
         )
-        # for each side, from the light on the object's texels to the fine grid
+        # for each side of the object: the matrix that takes the light on its texels to
+        # the fine grid. The back has the same texels, but the opposite normals.
         self._to_fine = [
             texels.make_lookup_matrix(
                 surfaces[side],
@@ -283,7 +297,11 @@ class Arrangement:
         )
 
     def _make_view_tracer(self, object_center: Float32Array) -> ViewTracer:
-        """Return what traces rays through cameras, with the lens of the inputs."""
+        """Return the tracer of camera rays, with the lens that the inputs set.
+
+        Args:
+            object_center: (3,) center of the object in world space.
+        """
         model = self._scene.definition[0].camera_model
         if model is not None and "camera.lens" in self.inputs:
             model = model.with_numbers(self.inputs["camera.lens"])
@@ -339,8 +357,13 @@ class Arrangement:
     ) -> list[texels.LitTexels]:
         """Return the texels of the object, as one surface.
 
-        If its back is visible from outside there are two: the front and the back, whose
-        normals are reversed.
+        If the back of its faces is visible from outside, there are two surfaces: the
+        front and the back. They have the same texels with opposite normals.
+
+        Args:
+            charts: rasterised texture coordinates of the object.
+            vertices: (V, 3) in world space.
+            normals: (V, 3) in world space.
         """
         single = texels.make_mesh_texels(OBJECT, charts, vertices, normals)
         if not is_visible_from_behind(self._scene, OBJECT, single.positions):
@@ -359,9 +382,14 @@ class Arrangement:
     def _find_buried(self, met_cells: Ints, side: int) -> BoolArray:
         """Return which texels (n,) of one side of the object lie inside something.
 
-        `met_cells` has what each texel's rays met: a cell, or a negative number for a
-        back without light of its own. A texel is buried if most of its rays meet backs.
-        Where the backs have texels too (two sides), it also has to see no sky.
+        Inside of something, rays meet the backs of faces. A texel is buried if more
+        than `BURIED_FRACTION` of its rays do. If backs have texels too (two sides), the
+        object may be an open shell: then the texel also has to see no sky.
+
+        Args:
+            met_cells: (n, rays) cell that each ray of a texel met; a negative number is
+                a back without texels.
+            side: 0 for the front of the object, 1 for its back.
         """
         cells = met_cells[self.texels.select_grid(side)]
         if self.n_sides == 1:
@@ -378,8 +406,8 @@ class Arrangement:
     def _measure_object(self) -> Lobes:
         """Measure how the object reflects, at one texel that stands for all.
 
-        With cut-outs it is one of the most opaque texels: where the surface is cut out
-        there is nothing to measure.
+        If the object has an opacity map, one of its most opaque texels is measured:
+        where the surface is cut out there is nothing to measure.
         """
         front = self.texels.select_grid(0)
         opacity = self._scene.definition[0].meshes[OBJECT].opacity
@@ -391,6 +419,7 @@ class Arrangement:
             opacity_column = column * opacity.shape[1] // n_columns
             texel_opacity = opacity[opacity_row, opacity_column]
             candidates = candidates[texel_opacity >= texel_opacity.max()]
+        # any of them would do: the gloss is the same all over the object
         texel = candidates[len(candidates) // 2]
         return measure_lobes(
             self._scene,
@@ -403,8 +432,12 @@ class Arrangement:
     def _find_ground_below(self, center: Float32Array) -> tuple[Tensor, Tensor]:
         """Find where the ground is in the blurred maps, seen from the object's center.
 
-        A photographed ground has the color of the map in the direction in which the
-        camera that took the photograph sees the same point.
+        A photographed ground takes its color from the environment's map. The color of a
+        point is that in its direction from the camera that took the photograph, which
+        is not its direction from the object.
+
+        Args:
+            center: (3,) center of the object in world space.
 
         Returns:
             (h, w) whether the ground is seen in each direction; and (h, w, 3) that
@@ -415,8 +448,9 @@ class Arrangement:
         world_directions = directions @ self.world_to_map
         if not self._has_ground:
             return torch.zeros(texels.BLURRED_SHAPE, dtype=torch.bool), directions
-        # for directions that do not go down the point means nothing: they are left out
-        # below
+        # The ray from the center meets the ground at this distance. For a direction
+        # that does not go down the point means nothing, and the last line leaves it
+        # out.
         distance = float(center[2]) / (-world_directions[..., 2]).clamp_min(1e-6)
         points = (
             torch.from_numpy(center).float() + world_directions * distance[..., None]
@@ -466,8 +500,9 @@ class Arrangement:
         reflects to the camera is left to `ArrangementLight.compute_reflected`.
 
         Args:
-            padded: (H, W + 2, 3) map of the environment.
-            color: (h, w, 3).
+            padded: (H, W + 2, 3) radiance map of the environment, with one more column
+                at each end, so that interpolation has no seam.
+            color: (h, w, 3) base color of the object, linear.
         """
         with torch.no_grad():
             sky = texels.prepare_sky(padded)
@@ -479,9 +514,10 @@ class Arrangement:
                 reflectance,
                 BOUNCES,
             )
+            # radiance of a diffuse surface
             leaving = reflectance * irradiance / math.pi
             surroundings = sky.map
-            # without a ground it is read, but does not count
+            # Without a ground this is only a filler: no ray looks it up.
             far_ground = torch.ones(1, 3)
             if self._has_ground:
                 ground = self.texels.select_grid(self.n_sides)
@@ -500,10 +536,16 @@ class Arrangement:
             return ArrangementLight(torch.cat(side_irradiances), light_maps)
 
     def _find_hot_cosines(self, sky: texels.SkyLight) -> Tensor | None:
-        """Return the visible cosines (n, k) towards what is hot; None if nothing is.
+        """Return the cosines (n, k) of n texels towards k directions of hot light.
 
-        Its k directions are sampled where the map is far brighter than its mean, see
-        `texels.HOT_FACTOR`. The cosine is 0 where something hides one.
+        Hot is the light far above the map's mean, such as that of the sun. A cosine is
+        0 if something hides the direction from the texel.
+
+        Args:
+            sky: the environment, with the directions of its hot light.
+
+        Returns:
+            None if nothing is hot.
         """
         hot_directions = sky.hot[0]
         if not len(hot_directions):
@@ -522,10 +564,14 @@ class Arrangement:
     ) -> Tensor:
         """Return what the camera sees of the ground's texels (n, 3), smoothed.
 
-        That is the radiance that leaves them. For a photographed ground it is the
-        fraction of the photograph that is left: the irradiance, divided by that under
-        the open sky. `irradiance` and `leaving` (radiance) are those of all texels, the
-        ground's last.
+        For a plain ground that is the radiance that leaves its texels. For a
+        photographed ground it is the factor on the photograph, which a shadow darkens:
+        the irradiance divided by that under the open sky.
+
+        Args:
+            irradiance: (N, 3) of all texels; the ground's are the last.
+            leaving: (N, 3) radiance that leaves all texels.
+            padded: (H, W + 2, 3) map of the environment.
         """
         ground = self.texels.select_grid(self.n_sides)
         if self._capture_height is None:
@@ -547,8 +593,13 @@ class Arrangement:
     ) -> Tensor:
         """Put the ground into a map (h, w, 3) of what surrounds the object.
 
-        All of the ground has the value `far_ground` (1, 3) of its far end: a radiance,
-        or for a photographed ground a fraction of the photograph there.
+        The map is for gloss, and so coarse that all of the ground may have one value.
+
+        Args:
+            surroundings: (h, w, 3) map of the environment alone.
+            far_ground: (1, 3) value of the ground's far end: a radiance, or for a
+                photographed ground the factor on the photograph.
+            padded: (H, W + 2, 3) map of the environment.
         """
         is_hidden, photograph_directions = self._ground_below
         ground = far_ground
@@ -562,8 +613,11 @@ class Arrangement:
     def _compute_reflectance(self, color: Tensor, padded: Tensor) -> Tensor:
         """Return which fraction (n, 3) of even light each texel reflects.
 
-        That is the base color times the diffuse fraction, plus the fraction of the
-        gloss. Arguments are those of `compute_light`.
+        It is the base color times the diffuse fraction, plus the fraction of the gloss.
+
+        Args:
+            color: (h, w, 3) base color of the object.
+            padded: (H, W + 2, 3) map of the environment, for a photographed ground.
         """
         colors = [self._compute_object_color(color)] * self.n_sides
         if self._has_ground:
@@ -586,8 +640,11 @@ class Arrangement:
     def _compute_ground_color(self, padded: Tensor) -> Tensor:
         """Return the base color (n, 3) of the ground's texels.
 
-        A photographed ground has the color with which it looks like its photograph when
-        it is lit by the whole sky, radiance = color E / pi.
+        A photographed ground has the color with which it looks like its photograph
+        under the full sky: radiance = color E / pi, where E is the irradiance.
+
+        Args:
+            padded: (H, W + 2, 3) map of the environment.
         """
         ground = self.texels.positions[self.texels.select_grid(self.n_sides)]
         if self._capture_height is None:
@@ -607,8 +664,11 @@ def _make_upsampling_matrix(
 ) -> scipy.sparse.csr_matrix:
     """Return the matrix from the texels of a small texture to those of the fine grid.
 
-    Both shapes are (rows, columns). The interpolation is bilinear: each row of the
-    matrix has four entries.
+    The interpolation is bilinear, so that each row of the matrix has four entries.
+
+    Args:
+        texture: rows and columns of the texture.
+        fine: rows and columns of the fine grid.
     """
     n_rows, n_columns = fine
     y, x = np.meshgrid(

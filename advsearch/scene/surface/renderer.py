@@ -104,9 +104,14 @@ class SurfaceRenderer(Predictor):
     n_traced_images = 0
 
     def __init__(self, traced: Renderer, u: Tensor, seed: int) -> None:
-        """Fix everything as it is at u, but cameras, environment and base color.
+        """Lay texels over the scene as it is at one configuration.
 
-        The arrangement of texels is made for it; `seed` is that of its rays.
+        Predictions hold as long as only cameras, environment and base color change.
+
+        Args:
+            traced: renderer of the scene.
+            u: (d,) configuration.
+            seed: seed of the rays by which texels see each other and the sky.
         """
         super().__init__(traced)
         self.n_dropped = 0
@@ -135,10 +140,10 @@ class SurfaceRenderer(Predictor):
         return inputs.get(COLOR_INPUT, self._base[COLOR_INPUT])
 
     def is_applicable(self, inputs: Mapping[str, Tensor]) -> bool:
-        """Return whether the arrangement holds for some scene inputs.
+        """Return whether `predict_images` holds for some scene inputs.
 
-        They may differ from its own in cameras and environment only, not in the base
-        color.
+        They may differ from those of this arrangement in cameras and environment only,
+        not in the base color, which `predict_images` leaves as it is.
         """
         expected = {**self.arrangement.inputs, COLOR_INPUT: self.base_color}
         fixed_inputs = {
@@ -192,12 +197,12 @@ class SurfaceRenderer(Predictor):
     def get_light(
         self, inputs: Mapping[str, Tensor]
     ) -> tuple[ArrangementLight, Tensor]:
-        """Return the light under the environment of some scene inputs, and its factor
-        (3,).
+        """Return the light under the environment of scene inputs, and a factor (3,).
 
-        Exposures and tints of one map share one light, and differ by the factor. A
-        light is computed on first use. Up to `MAX_BYTES` of lights are stored; the
-        oldest go first.
+        Light is linear in the environment. So maps that differ only by exposure or tint
+        share one stored light, and the factor turns it into that of `inputs`, for each
+        color channel. A light is computed on first use. Up to `MAX_BYTES` of lights are
+        stored; the oldest are dropped first.
         """
         fingerprint = MapFingerprint.compute(
             inputs.get(ENVIRONMENT_INPUT, self._base[ENVIRONMENT_INPUT]).detach()
@@ -232,9 +237,12 @@ class SurfaceRenderer(Predictor):
     ) -> Iterator[LitCameraView]:
         """Yield what each camera sees, in groups of cameras under the same environment.
 
-        `inputs` are the scene inputs of each camera. A group is traced in one launch;
-        the next launch is started before the results of this one are used, so that both
-        go on at once.
+        A group is traced in one launch. The next launch is started before the results
+        of this one are used, so that the rays are traced while the caller works.
+
+        Args:
+            inputs: scene inputs of each camera. Views come in the order of groups;
+                `LitCameraView.camera_index` is the index in `inputs`.
         """
         lights = [self._choose_light(camera_inputs) for camera_inputs in inputs]
         cameras_of_light: dict[ArrangementLight, list[int]] = {}
@@ -243,7 +251,7 @@ class SurfaceRenderer(Predictor):
         cameras = [
             self._select_camera_inputs(camera_inputs) for camera_inputs in inputs
         ]
-        # lazy: asking for the next element starts a launch
+        # A generator, not a list: each `next` starts one launch.
         launches = (
             self.arrangement.start_tracing(
                 [cameras[camera_index] for camera_index in camera_indices], light
@@ -253,8 +261,8 @@ class SurfaceRenderer(Predictor):
         finish_launch = next(launches)
         for light, camera_indices in cameras_of_light.items():
             samples = finish_launch()
-            # The next launch runs while these samples are used; the last has none after
-            # it.
+            # The next launch runs while these samples are used. After the last group
+            # there is none to start.
             finish_launch = next(launches, finish_launch)
             for index, camera_index in enumerate(camera_indices):
                 view = self.arrangement.make_view(samples, index)
@@ -267,16 +275,18 @@ class SurfaceRenderer(Predictor):
         color: Tensor,
         full_configurations: Sequence[Tensor],
     ) -> Tensor:
-        """Return the images (n, H, W, 3) sRGB of what cameras see of a base color.
+        """Return the images (n, H, W, 3), sRGB, of an object with a base color.
 
         Args:
-            views: views of the cameras.
-            inputs: scene inputs for each, whose base color is ignored.
-            color: (h, w, 3); the images are differentiable in it.
-            full_configurations: full configurations (d,), for what controls do to the
-                finished image.
+            views: what the n cameras see, in any order.
+            inputs: scene inputs of each camera, whose base color is ignored.
+            color: (h, w, 3) base color; the images are differentiable in it.
+            full_configurations: for each camera the values (d,) of all coordinates.
+                Controls that change the finished image, such as blur, read them.
         """
         fine = self.arrangement.upsample(color)
+        # What the surface reflects is the same for all cameras under one light, and is
+        # computed once.
         reflected = dict[ArrangementLight, Tensor]()
         images = dict[int, Tensor]()
         for lit_view in views:
@@ -323,7 +333,7 @@ class SurfaceRenderer(Predictor):
 def find_refusal(renderer: Renderer, varying: Collection[str]) -> Refusal | None:
     """Return why light on surfaces cannot predict a space's images; None if it may.
 
-    None does not say how good the prediction is: that is measured afterwards.
+    None does not mean that the prediction is good: that is measured afterwards.
 
     Args:
         renderer: renderer of the space.
@@ -352,8 +362,8 @@ def find_refusal(renderer: Renderer, varying: Collection[str]) -> Refusal | None
 def find_scene_refusal(renderer: Renderer) -> Refusal | None:
     """Return why light cannot be stored on a scene's surfaces; None if it may be.
 
-    It may be for an object with one texture, on a ground and under an environment, if
-    images are denoised.
+    It can be if the scene is an object with one texture on a ground, under an
+    environment, and if images are denoised: predictions have no noise.
     """
     description = renderer.scene.definition[0]
     mesh_part = description.meshes[OBJECT]
@@ -376,9 +386,12 @@ def find_scene_refusal(renderer: Renderer) -> Refusal | None:
 def find_changed_inputs(renderer: Renderer, varying: Collection[str]) -> frozenset[str]:
     """Return the names of the scene inputs that some controls change.
 
-    `varying` has names of controls or of groups of coordinates. Their coordinates are
-    set to one fraction of their ranges after another, all at once, and the inputs are
-    compared with those of the start.
+    All coordinates of these controls are set to one value, one of a few fractions of
+    their range after another, and the inputs are compared with those of the start.
+
+    Args:
+        renderer: renderer of the scene.
+        varying: names of controls, or of groups of coordinates such as "pose.yaw".
     """
     changed: set[str] = set()
     with torch.no_grad():

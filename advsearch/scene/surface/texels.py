@@ -70,9 +70,11 @@ class LitTexels:
 def join_texels(surfaces: Sequence[LitTexels]) -> LitTexels:
     """Join the texels of several surfaces, each with one grid.
 
-    Cells and texels are numbered on from one surface to the next.
+    The cells and texels of a surface get the numbers that follow those of the surface
+    before it.
     """
-    # index of each surface's first texel and first cell, and last the number of all
+    # Indices of the first texel and the first cell of each surface. The last entry is
+    # the total number.
     texel_bounds = np.cumsum([0] + [len(texels.positions) for texels in surfaces])
     cell_bounds = np.cumsum([0] + [texels.grids[0].n_cells for texels in surfaces])
     grids = []
@@ -105,13 +107,15 @@ def make_mesh_texels(
 
     Args:
         name: name of the mesh.
-        charts: its rasterised texture coordinates.
-        vertices, normals: (V, 3) in world space.
-        side: side of its faces, as `TexelGrid` has it.
+        charts: rasterised texture coordinates of the mesh.
+        vertices: (V, 3) in world space.
+        normals: (V, 3) in world space.
+        side: side of the faces that the texels are on: 1 the front, -1 the back, 0
+            both.
     """
     position, normal = _interpolate(charts, vertices, normals)
-    # index of the texel in each covered cell, which are counted row by row; in other
-    # cells it means nothing
+    # Texels are the covered cells, numbered row by row: the index of each. In cells
+    # that are not covered the number means nothing.
     texel_of_covered = np.cumsum(charts.is_covered.ravel()) - 1
     rows, columns = np.nonzero(charts.is_covered)
     return LitTexels(
@@ -130,16 +134,18 @@ def make_ground_texels(
     """Return the texels over a level plane, small under the object and large far off.
 
     Along each axis of the grid, the position p from -1 to 1 lies at the distance
-    `scale * sinh(rate * p)` from the center.
+    `scale * sinh(rate * p)` from the center: texels are narrowest at the center, and
+    grow with the distance from it.
 
     Args:
         name: name of the ground.
-        height: height of the plane.
-        reach: half its width, cut to `MAX_GROUND_REACH`.
+        height: height of the plane, in object sizes.
+        reach: half the plane's width; what is beyond `MAX_GROUND_REACH` gets no texels.
         center: x and y of the object's center.
     """
     reach = min(reach, MAX_GROUND_REACH)
-    # by how much even texels would be wider than `MIN_TEXEL_WIDTH`, that at the center
+    # The ratio is that of the width of equal texels to `MIN_TEXEL_WIDTH`, the width
+    # that the texel at the center shall have.
     rate = _find_warp_rate(reach / (MIN_TEXEL_WIDTH * GROUND_TEXELS / 2.0))
     scale = reach / math.sinh(rate)
     axis_position = (np.arange(GROUND_TEXELS) + 0.5) * 2.0 / GROUND_TEXELS - 1.0
@@ -166,8 +172,8 @@ def make_ground_texels(
 def _find_warp_rate(ratio: float) -> float:
     """Find the rate with sinh(rate) / rate = ratio, by bisection.
 
-    A ratio of 1 or less has no such rate: the result is then the lower bound, 0.001,
-    for which a grid is all but even.
+    For a ratio of 1 or less there is no such rate. Then the result is the lower bound,
+    0.001, with which all texels of a grid have almost the same width.
     """
     lower = 1e-3
     upper = 20.0  # a ratio of twelve million
@@ -191,6 +197,9 @@ def _weigh_neighbours(
 ) -> tuple[IntArray, Float64Array]:
     """Return the texels around points and their weights in a joint bilateral filter.
 
+    A texel's weight is the product of three: one falls with the distance in the grid,
+    one with the distance in space, and one with the angle between the normals.
+
     Args:
         texels: texels of the mesh.
         charts: charts of the mesh.
@@ -205,8 +214,8 @@ def _weigh_neighbours(
     """
     y, x = grid_position
     n_rows, n_columns = charts.is_covered.shape
-    # (rows, columns) index of the texel in each cell, -1 outside of the charts: covered
-    # cells are counted row by row
+    # The index of the texel in each cell of the grid; -1 outside of the charts. Texels
+    # are the covered cells, numbered row by row.
     texel_at = np.cumsum(charts.is_covered.ravel()).reshape(n_rows, n_columns) - 1
     texel_at = np.where(charts.is_covered, texel_at, -1)
 
@@ -241,11 +250,15 @@ def _use_nearest_texel(
     texel_index: IntArray,
     weights: Float64Array,
 ) -> None:
-    """Give all the weight to the nearest texel where no neighbour of a point has any.
+    """Give all the weight to the nearest texel if no neighbour of a point has any.
 
-    The first columns of `texel_index` and `weights` (N, neighbours), the results of
-    `_weigh_neighbours`, are overwritten for these points. Other arguments are those of
-    `_weigh_neighbours`.
+    Args:
+        texels: texels of the mesh.
+        charts: charts of the mesh.
+        grid_position: rows and columns (N,) of the points in the grid of the charts.
+        texel_index: (N, neighbours) texels around the points; the first column is
+            overwritten for points without weights.
+        weights: (N, neighbours) their weights, likewise.
     """
     y, x = grid_position
     n_rows, n_columns = charts.is_covered.shape
@@ -283,7 +296,8 @@ def make_lookup_matrix(
         Sparse, (cells of the finer grid, texels of the first surface).
     """
     if buried.all():
-        buried = np.zeros_like(buried)  # then none counts as such
+        # With no texel left there would be no light at all: so all of them count.
+        buried = np.zeros_like(buried)
     fine_charts = rasterize_charts(charts.mesh, shape)
     position, normal = _interpolate(fine_charts, vertices, normals)
     rows, columns = np.nonzero(fine_charts.distance <= BORDER_TEXELS)
@@ -320,6 +334,8 @@ def _make_sparse(
     size: tuple[int, int],
 ) -> Tensor:
     """Return a sparse matrix of weights, without those of 0.001 and less.
+
+    So small weights change nothing that is visible, and would make the matrix larger.
 
     Args:
         fine_cell: (N,) row of the matrix for each row of the weights.
@@ -383,7 +399,8 @@ def make_smoothing_matrix(ground: LitTexels, sees_sky: BoolArray) -> Tensor:
     axis_weights = scipy.sparse.diags_array(
         BINOMIAL, offsets=range(-2, 3), shape=(width, width), dtype=np.float64
     )
-    # along both; columns of texels that are not used are 0, and rows add up to 1
+    # The Kronecker product weighs along both axes. Columns of texels that are not used
+    # become 0, and then each row is divided by its sum.
     weights = scipy.sparse.csr_array(
         scipy.sparse.kron(axis_weights, axis_weights)
         @ scipy.sparse.diags_array(is_used.ravel().astype(float))
@@ -396,10 +413,12 @@ def make_smoothing_matrix(ground: LitTexels, sees_sky: BoolArray) -> Tensor:
 def _interpolate(
     charts: Charts, vertices: Float32Array, normals: Float32Array
 ) -> tuple[Float32Array, Float32Array]:
-    """Return the position and the unit normal of the surface in each cell, both (h, w,
-    3).
+    """Return the position and the unit normal (h, w, 3) of the surface in each cell.
 
-    `vertices` and `normals` are (V, 3).
+    Args:
+        charts: face and barycentric weights of each cell.
+        vertices: (V, 3) in world space.
+        normals: (V, 3) in world space.
     """
     corners = charts.mesh.faces[charts.face]
     position = np.einsum("hwk,hwkc->hwc", charts.weights, vertices[corners])
@@ -465,20 +484,22 @@ class SkyLight:
 def prepare_sky(padded: Tensor) -> SkyLight:
     """Prepare an environment's map (H, W + 2, 3) for look-ups.
 
-    What is brighter than `HOT_FACTOR` times the mean is hot: that excess gets rays of
-    its own, and the rest stays in the cells. If it has no more than `MIN_HOT_FRACTION`
-    of the light, nothing is hot. The map for gloss has all light.
+    A texel's light above `HOT_FACTOR` times the mean, such as that of the sun, is hot.
+    It gets rays of its own, since the coarse cells of the sky would blur its shadows;
+    the rest stays in the cells. If no more than `MIN_HOT_FRACTION` of all light is hot,
+    nothing is treated so. `SkyLight.map`, which gloss reflects, has all light.
     """
     radiance = padded[:, 1:-1].detach()
     n_rows, n_columns = radiance.shape[:2]
     polar = torch.linspace(0.0, math.pi, n_rows)
-    # The solid angle of a texel goes by this, and is 1 at the horizon. The texels at
-    # the poles reach half a texel from it: they take the sine in the middle of that.
+    # The solid angle of a texel is proportional to the sine, which is 1 at the horizon.
+    # At a pole the sine is 0, but the texel there reaches half a texel from the pole:
+    # it takes the sine at a quarter of a texel, the middle of that.
     sine = polar.sin().clamp_min(math.sin(0.25 * math.pi / n_rows))
     sine = sine[:, None].expand(n_rows, n_columns)
     luminance = radiance @ LUMINANCE_WEIGHTS
     mean_luminance = float((luminance * sine).sum() / sine.sum())
-    # the part of each texel's light that is above the limit
+    # the fraction of each texel's light that is above the limit
     hot_fraction = (
         1.0 - HOT_FACTOR * mean_luminance / luminance.clamp_min(1e-12)
     ).clamp_min(0.0)
@@ -500,10 +521,10 @@ def prepare_sky(padded: Tensor) -> SkyLight:
 def _sample_hot(radiance: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
     """Sample directions towards hot light, and the light that comes from each.
 
-    Hot texels get rays in proportion to their power. The map is interpolated between
-    its texels, so that a texel shines over a tent of two texels' width: its rays are
-    spread over the tent by a lattice (`HOT_LATTICE`), and even a sun of one texel has a
-    soft shadow.
+    Hot texels get rays in proportion to their power. The map is interpolated linearly
+    between its texels, so that the light of one texel covers two texels' width, with a
+    weight that falls linearly to 0 (a tent). Its rays are spread over the tent by a
+    lattice (`HOT_LATTICE`); so even a sun of one texel has a soft shadow.
 
     Args:
         radiance: (H, W, 3) of what is hot.
@@ -527,7 +548,7 @@ def _sample_hot(radiance: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
     column_offset = _to_tent((index * HOT_LATTICE[1] % HOT_RAYS + 0.5) / HOT_RAYS)
     polar = ((row + row_offset) * (math.pi / (n_rows - 1))).clamp(0.0, math.pi)
     azimuth = (column + 0.5 + column_offset) * (2.0 * math.pi / n_columns)
-    # of a texel at the horizon
+    # solid angle of a texel at the horizon, in steradians
     solid_angle = math.pi / (n_rows - 1) * 2.0 * math.pi / n_columns
     power_per_ray = float(power.sum()) * solid_angle / HOT_RAYS
     color = _normalize_luminance(radiance[row, column])
@@ -573,12 +594,12 @@ def _average_cells(radiance: Tensor, sine: Tensor, size: tuple[int, int]) -> Ten
 def blur_map(radiance: Tensor) -> Tensor:
     """Blur a map (h, w, 3) by each of `BLUR_WIDTHS`.
 
-    A width is the root mean square angle over both directions, hence each direction has
-    it divided by the square root of 2. Columns are blurred first, by a Gaussian over
-    the polar angle; then rows, by a Gaussian over the angle along them.
+    A width is the root mean square angle over both directions, in radians: so the
+    Gaussian of each direction has a sigma of the width / sqrt(2). Columns are blurred
+    first, over the polar angle; then rows, over the angle along them.
 
     Returns:
-        (widths, h, w, 3).
+        (n_widths, h, w, 3) one blurred map for each width.
     """
     n_rows, n_columns = radiance.shape[:2]
     polar = (torch.arange(n_rows) + 0.5) * math.pi / n_rows
@@ -590,8 +611,9 @@ def blur_map(radiance: Tensor) -> Tensor:
         # rows near the poles have less solid angle, and count less
         column_kernel = torch.exp(-exponent) * polar.sin()[None, :]
         column_kernel = column_kernel / column_kernel.sum(dim=1, keepdim=True)
-        # A row goes round, and is blurred in the frequency domain, by a Gaussian too:
-        # over more columns towards the poles, where a row is short.
+        # A row is periodic, and so is blurred in the frequency domain, where a Gaussian
+        # is a Gaussian too. Towards the poles a row spans a shorter angle, and the same
+        # blur takes more columns.
         row_filter = torch.exp(
             -0.5 * (frequency[None, :] * sigma / polar.sin()[:, None]).square()
         )
@@ -619,11 +641,14 @@ def compute_irradiance(
     reflectance: Tensor,
     bounces: int,
 ) -> Tensor:
-    """Return the irradiance (n, 3) of texels.
+    """Return the irradiance (n, 3) of texels, with light between them.
+
+    Each bounce adds the light that diffuse texels with the irradiance so far reflect,
+    `reflectance * irradiance / pi`, to the light of the sky.
 
     Args:
-        view_matrices: sparse, from radiance to irradiance: of the sky's cells (n,
-            cells), and of the texels on each other (n, n).
+        view_matrices: two sparse matrices from radiance to irradiance: one from the
+            sky's cells (n, cells), one from the texels to each other (n, n).
         sky: the environment.
         direct: (n, k) cosines towards hot light where it is visible; None if nothing is
             hot.
@@ -645,15 +670,15 @@ def make_view_matrices(
 ) -> tuple[Tensor, Tensor]:
     """Return the matrices from radiance to irradiance, by what the rays of texels met.
 
-    They are sparse: from the sky's cells (n, cells), and from texels (n, n_texels). A
-    texel's rays have the density of the cosine, so that its irradiance is pi times the
-    mean radiance of what they meet.
+    They are sparse: from the sky's cells (n, cells), and from texels (n, n_texels). The
+    density of a texel's rays is proportional to the cosine at its normal, so that its
+    irradiance is pi times the mean radiance of what they meet.
 
     Args:
-        met_cells: (n, rays) of `trace_texel_rays`: a cell of the grids, from
-            `len(texel_of_cell)` on a cell of the sky, or negative for nothing that
-            shines.
-        texel_of_cell: index of the texel of each cell, see `LitTexels`.
+        met_cells: (n, rays) what each ray met. Below `len(texel_of_cell)` it is a cell
+            of the grids; from there on a cell of the sky; and a negative value is
+            something that does not shine.
+        texel_of_cell: index of the texel that gives each cell its light.
         n_texels: number of texels of all grids.
     """
     count, n_rays = met_cells.shape
@@ -677,13 +702,14 @@ def make_view_matrices(
 
 
 def look_up_environment(padded: Tensor, directions: Tensor) -> Tensor:
-    """Look up an environment in some directions, at the nearest texel: (n, 3).
+    """Return the radiance (n, 3) of an environment in n directions.
 
-    In the map's axes y is up, and row 0 is straight up.
+    The nearest texel counts, without interpolation. In the map's axes y is up, and the
+    texels of row 0 are straight up.
 
     Args:
         padded: (H, W + 2, 3) map, with a copied column at each end.
-        directions: (n, 3) in the map's own axes, of any length.
+        directions: (n, 3) in the map's axes, of any length.
     """
     n_rows = padded.shape[0]
     n_columns = padded.shape[1] - 2

@@ -102,14 +102,16 @@ class Lighting:
 def find_lighting(renderer: Renderer) -> Lighting:
     """Find the groups of coordinates that change only light and the finished image.
 
-    Each group is varied alone, and the scene inputs are compared: so it holds for
-    whatever sets them.
+    Each group is varied alone, and the scene inputs are compared. So the result does
+    not depend on which kind of control sets them.
 
     Some lights of a Mitsuba scene are no inputs. They cannot be switched off, and would
-    count again in the image of each light that is traced by itself; with such lights
-    only the groups are returned that change nothing but the finished image.
+    be counted again in the image of every light that is traced by itself. In a scene
+    with such lights, only groups that change nothing but the finished image are
+    returned.
     """
-    # other groups stay half way between the start and the center of the unit cube
+    # Other groups stay half way between the start and the center of the unit cube:
+    # there a value is rarely at a border, where a change may have no effect.
     reference = 0.5 * renderer.start + 0.25
     groups = {}
     harmonic_groups = set()
@@ -146,8 +148,9 @@ def _measure_effect(
     """Return what a group of coordinates changes; None if that is more than light.
 
     Several configurations, which differ from `reference` in this group alone, are
-    compared with `base_inputs`, the scene inputs at `reference`. The brightest one has
-    the environment with most light.
+    compared with `base_inputs`, the scene inputs at `reference`. The effect names the
+    inputs that change; its brightest configuration is that whose environment has most
+    light.
     """
     changed: set[str] = set()
     is_harmonic = False
@@ -176,9 +179,10 @@ def _measure_effect(
 def _sample_configurations(group: Group, reference: Tensor) -> Iterator[Tensor]:
     """Yield copies of a configuration in which one group has other values.
 
-    All coordinates of the group have the same value: one of a few fractions of the
-    range, or the middle of an option of a choice, of which at most `MAX_OPTIONS` are
-    taken, evenly. For a group of several coordinates a random point is added.
+    All coordinates of the group have the same value, one of a few fractions of the
+    range. For a choice it is the middle of an option, and at most `MAX_OPTIONS` options
+    are taken at even steps. For a group of several coordinates a random point is added,
+    since equal values may cancel.
     """
     fractions = list(PROBE_FRACTIONS)
     if group.options:
@@ -209,10 +213,16 @@ def _find_change(
 ) -> _Change:
     """Return in which way a group of coordinates changes one input.
 
-    `before` and `after` are the input's values. An environment may become a multiple of
-    itself (POWER), or one with spherical harmonics added (HARMONICS); any other input
-    may only be the light of a lamp or belong to the finished image (POWER). All else is
-    OTHER.
+    Args:
+        name: name of the input.
+        before: its value at the reference configuration; None if it has none.
+        after: its value once the group is changed.
+        n_coordinates: number of coordinates of the group.
+
+    Returns:
+        POWER: a lamp's light or an input of the finished image changed, or the
+        environment was multiplied by a factor. HARMONICS: spherical harmonics were
+        added to the environment. NONE: it is the same. OTHER: anything else.
     """
     if before is None or after is None:
         return _Change.OTHER
@@ -224,10 +234,12 @@ def _find_change(
         return _Change.OTHER
     if _is_explained(before[None], after):
         return _Change.POWER
-    if n_coordinates == 1:  # harmonics are added by several numbers
+    # A control that adds harmonics has a coordinate for each coefficient.
+    if n_coordinates == 1:
         return _Change.OTHER
     harmonic_basis = torch.cat([before[None], _make_harmonic_maps(before)])
-    # rejects most other changes in a tenth of the time
+    # The fit to every `COARSE_STEP`th pixel rejects most other changes in a tenth of
+    # the time.
     if not _is_explained(
         harmonic_basis[:, ::COARSE_STEP, ::COARSE_STEP],
         after[::COARSE_STEP, ::COARSE_STEP],
@@ -253,9 +265,12 @@ def _is_explained(basis: Tensor, target: Tensor) -> bool:
 def _make_harmonic_maps(like: Tensor) -> Tensor:
     """Return spherical harmonics of degrees 0 to 2 as maps (9, H, W, 3).
 
-    Light cannot be negative: each harmonic is lifted to at least zero by a multiple of
-    the first, which is constant. Size and mean are those of the map `like`, with its
-    copied columns at both ends.
+    Light cannot be negative. So each harmonic is raised to at least zero by adding a
+    multiple of the first one, which is constant: sums of the maps stay the same.
+
+    Args:
+        like: (H, W, 3) map whose size and mean the results have. Its first and last
+            columns are copies of the columns at the other end.
     """
     basis = compute_real_harmonics(like.shape[0], like.shape[1] - 2)
     # (9, H, W): the last column before the first, and the first after the last
@@ -275,9 +290,9 @@ class BasisMaps:
     def fit_weights(self, target: Tensor) -> Tensor:
         """Return the weights (k, 3) with which the maps add up to a map (H, W, 3).
 
-        With several maps they are a least squares fit, weighted by solid angle. A
-        single map is taken for proportional to the target. The weights are
-        differentiable.
+        There is one weight for each map and channel. With several maps they are a least
+        squares fit, weighted by solid angle. A single map is assumed to be proportional
+        to the target. The weights are differentiable.
         """
         flat_target = target.permute(2, 0, 1).reshape(3, -1, 1)
         if len(self.maps) == 1:
@@ -309,7 +324,8 @@ class BasisMaps:
         angle: the least squares fit.
         """
         count, height, width, _ = self.maps.shape
-        # the solid angle of a texel goes by the sine of its angle from straight up
+        # The solid angle of a texel is proportional to the sine of its angle from
+        # straight up. Least squares with weights W: (A W A^T)^-1 A W.
         polar = (torch.arange(height) + 0.5) * torch.pi / height
         sine = torch.sin(polar)[:, None].expand(height, width).reshape(-1)
         channel_maps = self.maps.permute(3, 0, 1, 2).reshape(3, count, -1).double()
@@ -340,7 +356,13 @@ class LightBasis:
     def __init__(self, renderer: Renderer, lighting: Lighting, inputs: Inputs) -> None:
         """Split the light of scene inputs into lights of which each has its own image.
 
-        Arguments and what is set are those of the class.
+        Radiance is the sum over lights, so that an image under any mixture of them is
+        the sum of their images, each times its brightness.
+
+        Args:
+            renderer: renderer of the scene.
+            lighting: groups of coordinates that change light.
+            inputs: scene inputs whose light is split.
         """
         patterns = {
             name for name in renderer.scene.input_names if name.endswith(PATTERN_SUFFIX)
@@ -352,7 +374,7 @@ class LightBasis:
             else renderer.scene.get_base_value(name)
             for name in sorted(names)
         }
-        # In the inputs of a light all others are dark.
+        # The inputs of one light are this, with its own value put in: all others dark.
         dark = {name: torch.zeros_like(value) for name, value in values.items()}
         changed_names = lighting.changed_inputs
         # The patterns of projectors are in the first light, whether they change or not.
@@ -365,7 +387,8 @@ class LightBasis:
         self._lamps = sorted(changed_names & names - {ENVIRONMENT_INPUT})
         changes_environment = ENVIRONMENT_INPUT in changed_names
         is_unlit = not (fixed_values or self._lamps or changes_environment)
-        # without any light at all there is one, which is dark
+        # A scene without any light still gets one, which is dark: so that there is an
+        # image.
         self._has_fixed_light = bool(fixed_values) or is_unlit
         self.inputs_of_light = list[Inputs]()
         if self._has_fixed_light:
@@ -391,8 +414,13 @@ class LightBasis:
 def _make_basis_maps(renderer: Renderer, lighting: Lighting, first: Tensor) -> Tensor:
     """Return the environment's basis maps (k, H, W, 3).
 
-    The first is `first`. If some group adds spherical harmonics, they are the others,
-    set to zero in texels where no harmonics are added.
+    The first is `first`. If a group adds spherical harmonics to the environment, they
+    are the others. They are zero in texels in which no harmonics are added.
+
+    Args:
+        renderer: renderer of the scene.
+        lighting: groups that change light.
+        first: (H, W, 3) the environment's map.
     """
     if not lighting.harmonic_groups:
         return first[None]
@@ -433,13 +461,18 @@ class BasisRenderer(Predictor):
     ) -> None:
         """Trace an image for each light, and the matrices of base colors under it.
 
-        `changing` is the result of `find_lighting`, which is called if it is None;
-        other arguments as for `LinearRenderer`.
+        Args:
+            traced: renderer that traces the paths.
+            u: (d,) configuration at which the images are traced.
+            seed: seed of the samples.
+            tick: called as the passes are done, with the progress.
+            changing: result of `find_lighting`, which is called if this is None.
         """
         super().__init__(traced)
         with torch.no_grad():
             changing = changing or find_lighting(traced)
-            # the basis map of the environment is the brightest that there can be
+            # The environment is traced at its brightest: other environments are
+            # predicted by scaling its image, which fails if a channel of it is black.
             brightest = u.detach().clone()
             for coordinates, values in changing.brightest_values:
                 brightest[coordinates] = values
@@ -456,7 +489,14 @@ class BasisRenderer(Predictor):
     def _trace_lights(
         self, traced: Renderer, u: Tensor, seed: int, tick: ProgressCallback
     ) -> list[LinearRenderer]:
-        """Trace image and matrices under each light; arguments as of the class."""
+        """Trace the image and the matrices of base colors under each light.
+
+        Args:
+            traced: renderer of the scene.
+            u: (d,) configuration at which images are traced.
+            seed: seed of the noise; each light gets its own.
+            tick: called with the samples per pixel of each pass as it is done.
+        """
         set_inputs = traced.scene.assembly(traced.space.inputs(u)).keys()
         linear_names = set_inputs & find_linear_inputs(traced)
         # patterns of projectors shine in the first light alone
@@ -508,9 +548,10 @@ def find_refusal(renderer: Renderer, varying: Collection[str] = ()) -> Refusal |
     """Return why images of a space cannot be predicted; None if they can.
 
     A group that is searched may change the finished image, haze, light (if nothing
-    varies), or inputs to which radiance is linear, for which it needs the adjoint; and
-    at least one has to need a render. Haze and a missing denoiser are reasons only
-    where nothing else is.
+    varies), or inputs to which radiance is linear, such as base colors. The last need
+    the adjoint estimator. At least one group has to need a render, as otherwise a
+    prediction would save nothing. Haze and a missing denoiser are named only if there
+    is no other reason.
 
     Args:
         renderer: renderer of the space.
@@ -552,9 +593,15 @@ def _find_general_refusal(
     searched_groups: Sequence[Group],
     light_groups: Mapping[str, object],
 ) -> Refusal | None:
-    """Return why images cannot be predicted though each searched group allows it.
+    """Return a reason against predictions that is not about a single group.
 
-    `light_groups` has what the groups change that change light, by their names.
+    There are three: nothing needs a render, the scene has haze, or no denoiser.
+
+    Args:
+        renderer: renderer of the space.
+        searched_groups: groups that are searched.
+        light_groups: inputs that are changed by the groups that change only light, by
+            the group's name.
     """
     if not any(
         renderer.routes.get(group.name) or light_groups.get(group.name)

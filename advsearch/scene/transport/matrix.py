@@ -99,7 +99,13 @@ class ColoredRows:
     """
 
     def __init__(self, rows: int, columns: int, small: bool) -> None:
-        """Make an empty matrix of rows x columns; `small` is as for the class."""
+        """Make an empty matrix.
+
+        Args:
+            rows: number of rows.
+            columns: number of columns.
+            small: store it in 16 bits, and unpack it for each product.
+        """
         self._shape = (rows, columns)
         self._small = small
         self.entries = 0
@@ -135,21 +141,23 @@ class ColoredRows:
         fractions: Float32Array,
         weights: Float32Array,
     ) -> None:
-        """Add samples of rows, each with fractions of k columns and a color.
+        """Add samples to rows of the matrix.
 
-        A row has the sum of its samples' colors, and the mean of their fractions,
-        weighted by the mean of each color's channels.
+        A sample distributes its color over k columns by fractions. A row stores the sum
+        of its samples' colors, and one set of fractions for all three channels: the
+        mean of the samples' fractions, each weighted by the mean of its color's
+        channels.
 
         Args:
             rows: (n,) row of each sample, ascending.
-            columns: (n, k) columns of each; several may be the same.
+            columns: (n, k) columns of each sample; several may be the same.
             fractions: (n, k) fractions of the columns.
-            weights: (n, 3) colors.
+            weights: (n, 3) color of each sample.
         """
         if not len(rows):
             return
-        # Rows are ascending, so that entries are in the order of compressed rows
-        # already: of each row the first sample, and so its first entry.
+        # Rows are ascending, so that the entries are in the order of compressed rows
+        # already. The matrix is made of where the entries of each row begin.
         first_samples = np.searchsorted(rows, np.arange(self._shape[0] + 1))
         first_entries = first_samples * columns.shape[1]
         entry_weights = (
@@ -178,7 +186,8 @@ class ColoredRows:
 
         Args:
             image_shape: height and width of the image whose pixels are the rows.
-            smooth: removes the noise from the image of all rows' colors.
+            smooth: removes the noise from the image (H, W, 3) of all rows' colors;
+                None leaves it as it is.
         """
         row_sums = np.asarray(self._sum.sum(axis=1)).ravel()
         # a row without entries stays empty
@@ -250,7 +259,11 @@ class TextureTransport:
     ) -> None:
         """Make empty matrices: from texels, and from cells of `CELL_SIZE` texels.
 
-        Shapes are (height, width); `small` is as for the class.
+        Args:
+            image_shape: (height, width) of the image, whose pixels are the rows.
+            texture_shape: (height, width) of the texture.
+            small: store the finished matrices in 16 bits to save memory, and unpack
+                them for each product.
         """
         self._image_shape = image_shape
         self._texture_shape = texture_shape
@@ -282,14 +295,15 @@ class TextureTransport:
         return self._sharp.bytes + self._scattered.bytes
 
     def add_pass(self, vertices: Sequence[Vertices], fraction: float) -> None:
-        """Add a pass of paths.
+        """Add the vertices of one pass of paths to both matrices.
 
-        A vertex that a pixel sees sharply counts for four texels, as a bilinear
-        look-up; another one for the cell that it lies in.
+        A vertex that a pixel sees sharply counts for the four texels of a bilinear
+        look-up. Any other vertex, which a pixel sees only by scattered light, counts
+        for the cell that it lies in.
 
         Args:
-            vertices: vertices by their index in the path.
-            fraction: the fraction of all samples that the pass has.
+            vertices: the first vertices of all paths, then the second ones, and so on.
+            fraction: fraction of all samples that this pass has.
         """
         n_rows, n_columns = self._cell_shape
         for vertex in vertices:
@@ -304,7 +318,7 @@ class TextureTransport:
                 sharp.weight.numpy() * np.float32(fraction),
             )
             scattered = vertex.select(~vertex.is_sharp)
-            uv = scattered.uv.numpy() % 1.0
+            uv = scattered.uv.numpy() % 1.0  # the texture repeats
             column = np.floor(uv[:, 0] * n_columns).astype(np.int64)
             row = np.floor(uv[:, 1] * n_rows).astype(np.int64)
             cell = row.clip(0, n_rows - 1) * n_columns + column.clip(0, n_columns - 1)
@@ -350,9 +364,17 @@ class TextureTransport:
         return radiance.reshape(*self._image_shape, 3)
 
     def _average_cells(self, values: Tensor) -> Tensor:
-        """Return the mean of texels (h, w, 3) in each cell, (rows, columns, 3)."""
+        """Return the mean of the texels in each cell.
+
+        Args:
+            values: (h, w, 3) values of the texels.
+
+        Returns:
+            (rows, columns, 3) one mean for each cell.
+        """
         n_rows, n_columns = self._cell_shape
-        # the texels that the last cells lack are filled with zeros
+        # The last cells may have fewer texels: they are filled up with zeros, which add
+        # nothing to the sum.
         bottom = CELL_SIZE * n_rows - self._texture_shape[0]
         right = CELL_SIZE * n_columns - self._texture_shape[1]
         padded = values
@@ -365,9 +387,11 @@ class TextureTransport:
         return cell_sums / self._texels_in_cell
 
     def multiply_transposed(self, cotangent: Tensor) -> Tensor:
-        """Return the transposed map of a cotangent (H, W, 3), as (h, w, 3).
+        """Return the product (h, w, 3) of the transposed matrices and a cotangent.
 
-        What a cell gets is spread evenly over its texels.
+        The cotangent (H, W, 3) is the derivative of a loss by the radiance of each
+        pixel, and the product is that by each texel of the base color. What a cell gets
+        is spread evenly over its texels, since the cell's value is their mean.
         """
         pixel_cotangent = cotangent.reshape(-1, 3)
         texel_values = self._sharp.multiply_transposed(pixel_cotangent).reshape(
@@ -382,7 +406,7 @@ class TextureTransport:
             -1, CELL_SIZE, -1, CELL_SIZE, -1
         )
         spread_cells = spread_cells.reshape(self._cell_shape[0] * CELL_SIZE, -1, 3)
-        # without what the last cells have beyond the texture
+        # The last cells may reach beyond the texture: that part is cut off.
         n_rows, n_columns = self._texture_shape
         return texel_values + spread_cells[:n_rows, :n_columns]
 
@@ -411,8 +435,8 @@ def find_bilinear_weights(
 ) -> tuple[npt.NDArray[np.int32], Float32Array]:
     """Return the four texels of each bilinear look-up, and their fractions.
 
-    The centers of texels are half a texel from the border, across which the texture
-    repeats.
+    The center of the first texel is half a texel from the border, and the texture
+    repeats across the border.
 
     Args:
         uv: (n, 2) texture coordinates.
@@ -531,7 +555,16 @@ class LinearRenderer(Predictor):
     ) -> None:
         """Trace the base image and the matrices, unless they were collected elsewhere.
 
-        Arguments are those of the class.
+        Args:
+            traced: renderer of the scene.
+            u: (d,) configuration at which the image is linearised.
+            seed: seed of the noise.
+            tick: called with the samples per pixel of each pass as it is done.
+            spp: samples per pixel.
+            quick: denoise the matrices by a cheaper method, and store them in 16 bits.
+            names: inputs that get a matrix; None for all base colors.
+            light: scene inputs that replace those of u.
+            collected: what was collected elsewhere with the same arguments.
         """
         super().__init__(traced)
         if collected is None:
@@ -574,11 +607,14 @@ class LinearRenderer(Predictor):
         self.path_renderer.space = space
 
     def predict_radiance(self, inputs: Inputs) -> Tensor:
-        """Return radiance (H, W, 3), and coverage as a fourth channel if there is a
-        backdrop.
+        """Return the radiance (H, W, 3) of scene inputs; with a backdrop more channels.
 
-        Each matrix adds to the base image what its base color changes from where it was
-        linearised. Coverage stays as it is.
+        It is the base image plus the change by each base color: its matrix times its
+        difference from the value at which the image was linearised. The channels behind
+        the first three, such as coverage, stay as they are.
+
+        Args:
+            inputs: scene inputs; only those that have a matrix count.
         """
         base = self.collected.base_image()
         radiance = base[..., :3]
@@ -613,13 +649,24 @@ def _collect(
     names: OptionalNames,
     light: Inputs,
 ) -> LinearizedScene:
-    """Trace what a `LinearRenderer` needs; arguments as there.
+    """Trace what a `LinearRenderer` needs: its base image and its matrices.
 
-    Without a matrix the base image is an ordinary render; otherwise it is the mean of
-    the paths that fill the matrices. With a backdrop, radiance leaves out the
+    If no input gets a matrix, the base image is an ordinary render. Otherwise it is the
+    mean of the paths that fill the matrices. With a backdrop, radiance leaves out the
     background, and coverage is its fourth channel.
+
+    Args:
+        renderer: renderer of the scene; it counts what is traced.
+        u: (d,) configuration at which the image is linearised.
+        seed: seed of the noise.
+        tick: called with the samples per pixel of each pass as it is done.
+        spp: samples per pixel.
+        quick: denoise the matrices by a cheaper method, and store them in 16 bits.
+        names: inputs that get a matrix; None for all base colors.
+        light: scene inputs that replace those of u.
     """
-    non_finite_before = renderer.non_finite  # a count of pixels so far
+    # the renderer counts on; the difference is the count of this call
+    non_finite_before = renderer.non_finite
     inputs = renderer.find_front(renderer.scene.assembly(renderer.space.inputs(u)))
     # those that belong to the finished image, not to the scene
     image_inputs = {
@@ -676,8 +723,22 @@ def _trace_matrices(
 ) -> Tensor:
     """Fill and finish empty matrices, and return the base image of the same paths.
 
-    A renderer that has a crop traces its window only; the rest is pasted. Other
-    arguments are those of `LinearRenderer`, and of `_collect`.
+    A renderer that has a crop traces its window only, and the rest of the image is
+    pasted around it.
+
+    Args:
+        renderer: renderer of the scene.
+        transports: an empty matrix for each input; they are filled and finished.
+        scene_inputs: inputs of the scene, without those of the finished image.
+        seed: seed of the noise.
+        tick: called with the samples per pixel of each pass as it is done.
+        spp: samples per pixel of each matrix.
+        quick: denoise the matrices by a cheaper method.
+        has_backdrop: whether a photograph takes the place of the environment.
+
+    Returns:
+        (H, W, 3) linear radiance; with a backdrop also coverage and, where a plane
+        takes the shadow, the change of its radiance.
     """
     with renderer.scene.limit_window(renderer.window):
         paths = _fill_transports(renderer, transports, scene_inputs, seed, tick, spp)
@@ -701,8 +762,15 @@ def _append_plane_change(
 ) -> Tensor:
     """Append to a base image the change of the plane that takes the shadow.
 
-    The three channels are rendered once, since no base color changes them. Without such
-    a plane the image is returned as it is. Arguments are those of `_trace_matrices`.
+    The channels are rendered once, since no base color changes them. If the scene has
+    no such plane, the image is returned as it is.
+
+    Args:
+        renderer: renderer of the scene.
+        base: (H, W, 4) radiance and coverage.
+        traced: inputs of the scene, without those of the finished image.
+        seed: seed of the noise.
+        spp: samples per pixel.
     """
     if renderer.scene.plane_radiance is None:
         return base
@@ -722,8 +790,11 @@ def _fill_transports(
 ) -> Paths:
     """Trace paths for each matrix and add them; return the mean images of all.
 
-    The vertices of a pass are released when they are added, and tracing stops with a
-    `TransportTooLargeError` as soon as all matrices take more than `MAX_BYTES`.
+    The vertices of a pass are released when they are added, so that memory holds one
+    pass at a time. `tick` is called with the samples per pixel of each pass.
+
+    Raises:
+        TransportTooLargeError: all matrices together take more than `MAX_BYTES`.
     """
     samples, n_passes = plan_passes(renderer, spp)
     height, width = _get_traced_size(renderer)
@@ -736,7 +807,7 @@ def _fill_transports(
             )
             transport.add_pass(paths.vertices, 1.0 / n_passes)
             size = sum(filled.bytes for filled in transports.values())
-            # the base image has up to four channels of 16 bits
+            # 8 bytes a pixel are for the base image: up to four channels of 16 bits
             if size + 8 * height * width > scale_limit(MAX_BYTES):
                 raise TransportTooLargeError(
                     f"{TOO_LARGE} {scale_limit(MAX_BYTES) / 2**30:g} GiB"
@@ -769,7 +840,9 @@ def _make_smooth(
         1.0 / MAX_CORRECTION, MAX_CORRECTION
     )
     is_surface = paths.albedo.sum(dim=-1, keepdim=True) > 0.0
-    # a matrix's colors do not have the pattern of the base color
+    # The denoiser keeps the edges of its guide image. The base color's pattern is not
+    # in a matrix's colors, so that the guide is 1 on all surfaces, whatever their
+    # color.
     even_albedo = is_surface.to(torch.float32).expand(-1, -1, 3).contiguous()
 
     def smooth(image: Tensor) -> Tensor:
