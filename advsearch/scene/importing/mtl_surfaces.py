@@ -161,10 +161,12 @@ class MtlReader:
         """Return the UDIM squares for which a material has images: all candidates, or
         none.
 
-        The first of its images that has a square in its name decides. There are images
-        for all squares if the name has the placeholder ``<UDIM>``, or if there is an
-        image for a candidate that is not the square in the name. Otherwise the image is
-        taken for an ordinary one that repeats, which is noted.
+        A UDIM texture has one image for each unit square of texture coordinates, with
+        the number of the square in its name, such as "wood.1002.png". The material's
+        first image with such a number decides. There are images for all squares if the
+        name has the placeholder ``<UDIM>``, or if the file of another candidate square
+        exists. Otherwise the image is taken for an ordinary one that repeats, which is
+        noted.
 
         Args:
             name: the material.
@@ -216,7 +218,8 @@ class MtlReader:
             square: the UDIM square whose images are used, 0 for none.
             name: the name by which the mesh file uses it.
         """
-        # Statements are noted once, not for each square.
+        # A material becomes one surface for each UDIM square, but its unread statements
+        # are noted only once.
         are_noted = any(
             material_id == id(material) for material_id, _ in self._surfaces
         )
@@ -248,8 +251,8 @@ class MtlReader:
     def _parse_uses(self, material: MtlMaterial, square: int) -> dict[str, MapUse]:
         """Return the maps of a material by keyword, with the images of a UDIM square.
 
-        They count as read; but of normal maps, `_make_normal_map` reads only the first
-        that it can use.
+        The maps count as read, so that they are not noted. Normal maps do not yet:
+        `_make_normal_map` reads only the first one that it can use.
         """
         uses = dict[str, MapUse]()
         for key in (*UV_MAPS, "map_pr", "map_pm"):
@@ -270,8 +273,13 @@ class MtlReader:
     ) -> None:
         """Remove maps whose texture coordinates differ from those of the first.
 
-        A surface has one layout, by scale and offset. Those removed are noted. `uses`
-        are the maps by keyword, which is changed.
+        A surface has one layout of texture coordinates: scale (``-s``) and offset
+        (``-o``). Removed maps are noted.
+
+        Args:
+            material: the material.
+            uses: its maps by keyword; maps are removed from it.
+            first_use: the map whose layout counts.
         """
         for key in [key for key in UV_MAPS if key in uses]:
             if (uses[key].scale, uses[key].offset) != (
@@ -335,10 +343,10 @@ class MtlReader:
     def _note_unread(self, material: MtlMaterial) -> None:
         """Note the statements that are not read, unless they change nothing.
 
-        Nothing is changed by zeros, by ignored keywords, by a clear coat's roughness
-        without a coat, by a grey filter of transmission, and by an ambient map that is
-        the color's. Also noted are statements that were overridden, a fourth number of
-        Kd, and illumination models with more than highlights.
+        These change nothing: numbers that are all 0, ignored keywords, the roughness of
+        a clear coat that is absent, a grey transmission filter, and an ambient map that
+        is the same image as the color's. Also noted are statements that were overridden,
+        a fourth number of Kd, and illumination models above 2, such as ray-traced glass.
         """
         zero_keys = {
             key for key in material.statements if _is_zero(material.peek_argument(key))
@@ -373,8 +381,9 @@ class MtlReader:
     def _parse_use(self, material: MtlMaterial, key: str) -> MapUse | None:
         """Parse a statement that names an image, and note options that are not read.
 
-        None if it names none. What follows a # belongs to the name if there is such a
-        file, and is a comment otherwise. Each statement is parsed once.
+        The result is None if it names none. Text from a # on belongs to the name if a
+        file with that name exists, and is a comment otherwise. Results are cached, so
+        that options are noted only once.
         """
         if (id(material), key) in self._uses:
             return self._uses[id(material), key]
@@ -423,9 +432,14 @@ class MtlReader:
     ) -> ImportedSurface:
         """Return a surface with its opacity.
 
-        That is ``d``, or 1 - ``Tr``, times the image of ``map_d``, which is resized to
-        that of the color. The single color, which counts where there is no texture, has
-        only the first factor.
+        The opacity is a number, ``d`` or 1 - ``Tr``, times the image of ``map_d``. The
+        image is resized to the size of the color texture. The single color, which counts
+        where there is no texture, is multiplied by the number alone.
+
+        Args:
+            material: the material.
+            use: its ``map_d``, or None.
+            surface: the surface with its color and texture.
         """
         factor = self._read_opacity(material)
         image = self._load_image(
@@ -457,8 +471,9 @@ class MtlReader:
     def _read_opacity(self, material: MtlMaterial) -> float:
         """Return the opacity in [0, 1] that ``d`` or ``Tr`` states, 1 by default.
 
-        ``d`` wins; a ``Tr`` that agrees with it neither as a transparency nor as an
-        opacity is noted. Alone, ``Tr`` is a transparency, which is noted.
+        If both are there, ``d`` counts. Programs mean either transparency or opacity by
+        ``Tr``; one that agrees with ``d`` in neither sense is noted. Alone, ``Tr`` is
+        taken for a transparency, which is noted too.
         """
         if "-halo" in material.read_argument("d").lower().split():
             self.notes.record("option", "-halo of d")
@@ -599,8 +614,9 @@ class MtlReader:
 def _select_channel(picture: Float32Array, use: MapUse) -> Float32Array:
     """Return the values (H, W) of an image for a map of numbers.
 
-    They are the channel that ``-imfchan`` names; or else the alpha, if it is not opaque
-    everywhere; or else the mean of the colors, also for an alpha that is not there.
+    They are those of the channel that ``-imfchan`` names, such as "r". Without one, they
+    are the alpha if it is not 1 everywhere, or else the mean of the colors. The mean is
+    also taken if ``-imfchan`` names the alpha of an image without alpha.
     """
     alpha_index = 3
     has_alpha = picture.shape[2] == 4
@@ -617,9 +633,10 @@ def _select_channel(picture: Float32Array, use: MapUse) -> Float32Array:
 def find_libraries(arguments: Sequence[str], references: References) -> list[str]:
     """Return the names of the material files that ``mtllib`` lines name.
 
-    A line may name several files, and a name may have blanks. So a line that is itself
-    the name of a file is one name. Otherwise it is split after each ``.mtl``, and the
-    rest at blanks, if these are names; if not, the line is one name after all.
+    A line may name several files, and a name may have blanks. If the full line is the
+    name of a file that exists, it is one name. Otherwise it is split after each
+    ``.mtl``, and the rest at blanks. The pieces are taken if all of them end in ``.mtl``
+    or one of them exists. If not, the line is taken as one name.
 
     Args:
         arguments: what follows ``mtllib`` in each line.
@@ -803,6 +820,10 @@ class MapUse:
 def parse_mtl(text: str, file: str) -> tuple[list[MtlMaterial], list[str]]:
     """Parse the text of a material file.
 
+    Args:
+        text: the text.
+        file: name of the file, for notes.
+
     Returns:
         Its materials, and the keywords of statements before the first of them.
     """
@@ -835,9 +856,10 @@ def without_comment(text: str) -> str:
 def parse_map(argument: str) -> MapUse | None:
     """Parse the arguments of a statement that names an image; None if it names none.
 
-    Known options are taken out wherever they stand; what is left is the name, which may
-    have blanks. What then stands before the name with a dash is an option that is not
-    known; its value is left out.
+    In "-s 2 2 -clamp on old wood.png" the name is "old wood.png". Known options are
+    taken out wherever they stand. Words with a dash at the beginning of the rest are
+    unknown options, which are removed together with their values. What is left is the
+    name, which may have blanks.
     """
     options: dict[str, str] = {}
     for match in _OPTION.finditer(argument):
