@@ -180,7 +180,7 @@ def find_front(path: Path, header: Header | None, up: str | None = None) -> File
 
     The front of a glTF asset faces +Z (Khronos, glTF 2.0, section 3.4), which is -Y in
     Blender. VRM 1.0 has the same rule, VRM 0.x has -Z. OBJ, PLY, STL and OpenUSD have
-    no rule, nor does it hold for a glTF file that the user declares to be z up.
+    no rule. The rule does not hold for a glTF file that the user declares to be z up.
 
     Args:
         path: the file.
