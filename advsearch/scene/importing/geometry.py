@@ -312,8 +312,8 @@ def assemble(soup: TriangleSoup) -> tuple[Mesh, IntArray | None]:
 def _fix_winding(soup: TriangleSoup, notes: Notes) -> TriangleSoup:
     """Return the soup with consistent and outward winding, and note the changes.
 
-    Faces wound against their neighbours are turned over first, then shells that are
-    inside out.
+    Faces wound against their neighbours are turned over first. Then shells that are
+    inside out are turned over. A shell is a set of faces that are connected by edges.
     """
     is_turned, shell, has_moebius_strip = _find_turned_faces(soup)
     if is_turned.any():
@@ -411,11 +411,11 @@ def _select_larger_choice(
 def _find_turned_faces(soup: TriangleSoup) -> tuple[BoolArray, IntArray, bool]:
     """Decide which faces to turn over so that neighbours agree in winding.
 
-    Every face is two nodes of a graph, "as it is" (2 f) and "turned" (2 f + 1).
-    Neighbours that agree are linked like to like, others crosswise. So a component is a
-    choice for all faces of a shell, and the shell's other component is the reverse
-    choice. If both are one component, the shell is one-sided. Each shell keeps the
-    winding of most of its area.
+    Every face f has two nodes in a graph: 2 f for "as it is" and 2 f + 1 for "turned".
+    If two neighbours agree, their equal nodes are linked; otherwise the opposite ones.
+    So a connected component is a consistent choice for all faces of a shell, and the
+    shell's other component is the reverse choice. If both are the same component, the
+    shell is one-sided. Of both choices, the one that turns less area over is taken.
 
     Returns:
         Which faces (F,) to turn over; the shell of each face (F,); and whether some

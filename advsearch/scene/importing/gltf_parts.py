@@ -733,6 +733,10 @@ def _average_where_visible(
     """Return the mean (C,) of an image over the faces of some primitives that show it.
 
     It is the mean of all texels if no primitive has texture coordinates for it.
+
+    Args:
+        image: (H, W, C) values.
+        pieces: the primitives with the material.
     """
     mapped_parts = [
         (piece.part, piece.packed_uvs)
@@ -791,7 +795,8 @@ def _enlarge(picture: Float32Array, axis: int) -> Float32Array:
     factor = -(-SMALL_IMAGE_SIZE // size)
     if factor == 1:
         return picture
-    # of the new texels' centers, in old texels with integers at their centers
+    # Positions of the new texels' centers, in units of old texels. The centers of old
+    # texels are at integers.
     position = ((np.arange(size * factor) + 0.5) / factor - 0.5).clip(0.0, size - 1.0)
     lower = np.floor(position).astype(np.int64)
     shape = [1] * picture.ndim
@@ -1244,6 +1249,10 @@ def _find_used_vertices(
 
     Primitives may share accessors, so not every vertex is used. Faces (F, 3) are
     indices into the used vertices.
+
+    Args:
+        file: the glTF file.
+        primitive: entry of the primitive.
 
     Raises:
         FileFormatError: a face refers to a vertex that is not there.

@@ -370,6 +370,10 @@ def _count_vertices(header: Header, primitives: Sequence[Primitive]) -> int:
 def count_targets(file: GltfFile, mesh_nodes: Sequence[int]) -> dict[int, int]:
     """Return the number of morph targets of each node with a mesh.
 
+    Args:
+        file: the glTF file.
+        mesh_nodes: indices of the nodes with a mesh.
+
     Raises:
         FileFormatError: the primitives of a mesh have different numbers of targets, or
             there is more to move than `MAX_MOVES`: vertices times targets, plus joints.

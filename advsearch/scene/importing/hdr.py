@@ -164,6 +164,11 @@ def _check_planes(
     """Raise FileFormatError unless channels are floats of the size of the image.
 
     Chroma (RY, BY) may have fewer pixels.
+
+    Args:
+        file: path of the file, for messages.
+        planes: channels by name, such as "R".
+        size: rows and columns of the data window.
     """
     has_size = all(
         plane.shape == size

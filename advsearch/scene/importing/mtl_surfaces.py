@@ -85,9 +85,12 @@ class MtlReader:
     def read_library(self, name: str) -> None:
         """Read a material file; of materials with the same name, the first counts.
 
-        Its materials are kept by name for `get_surface`. A file that is missing is
-        noted, and so is a second material of a name in one file, unless its statements
-        are the same. Statements before the first material are recorded as left out.
+        Its materials are stored by name for `get_surface`. A missing file is noted. So
+        is a second material with the same name in a file, unless its statements are the
+        same. Statements before the first material are recorded as left out.
+
+        Args:
+            name: name of the file, as the mesh file writes it.
         """
         try:
             text = decode_text(self.references.get(name))
@@ -302,8 +305,13 @@ class MtlReader:
     ) -> tuple[Float32Array | None, Float32Array | None]:
         """Return the color (3,) of ``Kd`` and the texture (H, W, 3) of ``map_Kd``.
 
-        A texture is not multiplied by Kd, which is an exporter's default more often
-        than a tint.
+        A texture is not multiplied by ``Kd``: beside a texture that is more often an
+        exporter's default than a tint. The color is None if it is plain white and there
+        is a texture.
+
+        Args:
+            material: the material.
+            use: its ``map_Kd``, or None.
         """
         color = self._read_color(material)
         substitute = f"{describe_substitute(color)} is used instead"
@@ -403,7 +411,10 @@ class MtlReader:
     ) -> None:
         """Note the options of an image that are not read, unless they change nothing.
 
-        `key` is the keyword of the statement with the image, in lower case.
+        Args:
+            material: the material.
+            key: keyword of the statement with the image, such as "map_kd".
+            use: the image and its options.
         """
         has_colors = key in ("map_kd", "map_ke")
         read_options = ["s", "o", "mm", "clamp"]
@@ -542,8 +553,12 @@ class MtlReader:
     ) -> Float32Array | None:
         """Return the first usable normal map (H, W, 3) of a material, or None.
 
-        Bump maps are usable if they hold normals, and no heights. All statements with
-        the same image count as read.
+        A bump map is usable if it holds normals; one of heights is left out with a note.
+        All statements with the same image count as read.
+
+        Args:
+            material: the material.
+            uses: its maps by keyword.
         """
         note_template = "the normal map {name} {why}; it is left out"
         for key in NORMAL_MAPS:
@@ -568,8 +583,12 @@ class MtlReader:
     ) -> Float32Array | None:
         """Return the radiance of ``Ke`` and ``map_Ke``, (H, W, 3), or None.
 
-        They are multiplied; without a map the radiance is (1, 1, 3). A map that cannot
-        be read leaves no emission, with a note.
+        Both are multiplied; without a map the radiance is (1, 1, 3). If the map cannot
+        be read, there is no emission, with a note.
+
+        Args:
+            material: the material.
+            use: its ``map_Ke``, or None.
         """
         values = parse_numbers(material.read_argument("ke") or "0")  # by default black
         if values is None or len(values) not in (1, 3) or min(values) < 0:

@@ -271,6 +271,8 @@ class _RowReader:
     def _walk_rows(self, position: int, n_rows: int) -> tuple[dict[str, IntArray], int]:
         """Walk through rows one by one, from the byte at a position.
 
+        A row is its properties in their order. A list is a count and then its values.
+
         Returns:
             For each property the bytes at which it begins, (n_rows,); and the byte
             after the last row.
@@ -795,8 +797,11 @@ class _Properties:
     ) -> list[ImportedSurface]:
         """Return the surface of each texture.
 
-        Its alpha is left out, with a note if it is not opaque. `has_no_colors` is
-        whether the file has no colors that could replace a texture.
+        Its alpha is left out, with a note if it is not opaque.
+
+        Args:
+            names: the texture files that the file names.
+            has_no_colors: whether the file has no colors that could replace a texture.
         """
         pictures = FileImages(len(names), References(Path(self.notes.path)), self.notes)
         surfaces = {}

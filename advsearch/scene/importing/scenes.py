@@ -301,10 +301,11 @@ def _make_surrounding_mesh(
 def list_node_names(path: Path) -> list[str]:
     """Return the node names that `import_scene` accepts for a glTF file.
 
-    A name that several nodes have is listed once.
+    Nodes are listed if they or their descendants have a mesh. A name that several nodes
+    have is listed once.
 
     Raises:
-        FileFormatError: as for `import_object`.
+        FileFormatError: the file is missing, corrupt, or no glTF.
     """
     header = gltf.read_header(path, read_mesh_bytes(path, "scene", GLTF_SUFFIXES))
     with_mesh = {

@@ -35,7 +35,13 @@ class TrackedKeys(Generic[T]):
         fold: Callable[[str], str] = str,
         prefix: str = "",
     ) -> None:
-        """Fold all keys; `prefix` stands before them in what is unread."""
+        """Fold all keys, and find those that a later one of the same form hides.
+
+        Args:
+            values: values by key, as the file spells the keys.
+            fold: turns a key into the form by which it is looked up.
+            prefix: is put before keys in the list of unread ones, such as "camera.".
+        """
         # Keys, as spelled, that a later one of the same form hides.
         self.repeated: list[str] = []
         self._fold = fold

@@ -888,7 +888,8 @@ def _measure_exterior_angles(mesh: TriMesh) -> _ExteriorAngles:
     """
     vertices = mesh.vertices
     ends, owner, across = _find_edges(vertices, mesh.corners)
-    # Sides of faces, sorted by their edge: those of one edge follow one another.
+    # Sort the sides of faces by their edge, so that those of one edge follow one
+    # another; the first and the last of them belong to its two faces.
     sorted_sides = torch.argsort(owner, stable=True)
     n_faces = torch.bincount(owner, minlength=len(ends))
     # where the last side of each edge is among the sorted ones
@@ -907,7 +908,7 @@ def _measure_exterior_angles(mesh: TriMesh) -> _ExteriorAngles:
             vector - (vector * axis).sum(dim=1, keepdim=True) * axis, dim=1
         )
 
-    # of an edge with a single face both are the same
+    # at an edge with a single face both are the same vector
     along_first = along_face(last_entry - n_faces + 1)
     along_second = along_face(last_entry)
     opening, angle = _measure_between_faces(along_first, along_second, axis, is_single)

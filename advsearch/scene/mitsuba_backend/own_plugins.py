@@ -631,7 +631,7 @@ class _PlaneHits:
             coat: coat of the plane.
             matt_direction: local direction of a path from the matt ground.
             is_off_coat: whether it goes on from the coat.
-            sampler: as in the class.
+            sampler: Mitsuba's random numbers.
 
         Returns:
             The local direction of the path, and whether there is one.
@@ -1058,7 +1058,11 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
     def sample_ray(
         self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
     ) -> Any:
-        """Sample rays and weights; see `mi.Sensor.sample_ray`."""
+        """Sample camera rays and their weights, without differentials.
+
+        The arguments are those of `sample_ray_differential`: time, wavelength sample,
+        position in the image, aperture sample, and active lanes.
+        """
         ray, weight = self.sample_ray_differential(
             time, sample1, sample2, sample3, active
         )

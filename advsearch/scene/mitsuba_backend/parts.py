@@ -187,9 +187,12 @@ def translate_part(part: parts.ScenePart) -> Translation:
 
 @translate_part.register
 def translate_mesh(part: parts.MeshPart, lobes: Plugin | None = None) -> Translation:
-    """Return what a mesh is inside Mitsuba.
+    """Return what a mesh is inside Mitsuba: its shape, and the inputs that it has.
 
-    `lobes` are further entries of the principled plugin, such as `IDLE_LOBES`.
+    Args:
+        part: the mesh.
+        lobes: further entries of the principled plugin, such as `IDLE_LOBES`; not used
+            if the mesh has a surface of the user's.
     """
     name = part.name
     shape = (len(part.mesh.vertices), 3)

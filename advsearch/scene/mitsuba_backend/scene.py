@@ -876,9 +876,10 @@ class MitsubaScene:
     def _integrator(self, method: str) -> Any:
         """Return the integrator of a method at the current depth, loaded on first use.
 
-        The methods are "path" for images, "adjoint" for derivatives of them, "hidden"
-        for both without the environment, "guides" for the denoiser, and "boundary" with
-        the terms of moving outlines.
+        Args:
+            method: "path" for images; "adjoint" for derivatives of images; "hidden" for
+                both, without the environment that the camera sees; "guides" for the
+                denoiser; "boundary" for derivatives with the terms of moving outlines.
         """
         key = method, self.depth
         if key not in self._integrators:

@@ -218,7 +218,8 @@ def import_mitsuba_scene(
 
     Raises:
         UnknownNameError: it has no such shape.
-        FileFormatError: as for `read_scene_dict`.
+        FileFormatError: the file is missing or corrupt, or it names a plugin or a file
+            that may not be read.
         InputError: the shape is no mesh and cannot be made one, or the scene is too
             large.
     """

@@ -170,8 +170,12 @@ def _separate_faces(
 ) -> tuple[Float64Array, IntArray, Float64Array, Float64Array, dict[str, Float32Array]]:
     """Return buffers in which every corner of a face is a vertex of its own.
 
-    Normals that are missing become those of the faces, and texture coordinates that are
-    missing `DEFAULT_FACE_UVS`.
+    Missing normals are replaced by those of the faces, and missing texture coordinates
+    by `DEFAULT_FACE_UVS`.
+
+    Returns:
+        Vertices (3 F, 3), faces (F, 3), normals (3 F, 3), texture coordinates (3 F, 2),
+        and attributes by name.
     """
     corners = buffers.faces.reshape(-1)
     vertices = buffers.vertices[corners]
@@ -190,10 +194,14 @@ def _separate_faces(
 
 
 def _load_buffers(shape: Mapping[str, object], name: str) -> Buffers:
-    """Load a mesh with Mitsuba; `name` is that of the object, for errors.
+    """Load a mesh with Mitsuba.
 
     Only entries of the geometry are loaded, without surface and light. Normals and
     texture coordinates are None if the mesh has none.
+
+    Args:
+        shape: the shape's dictionary.
+        name: name of the object, for errors.
 
     Raises:
         InputError: Mitsuba refuses the mesh, or it has no faces.
@@ -297,7 +305,7 @@ def _make_unit_shape(
         Vertices (V, 3), faces (F, 3), normals (V, 3) and texture coordinates (V, 2).
     """
     fractions = np.linspace(0.0, 1.0, ROUND_SEGMENTS + 1)  # of a turn, for a round kind
-    normals = None  # up, for a flat kind
+    normals = None  # for flat shapes, (0, 0, 1) below
     if kind == "sphere":
         # half as many segments from pole to pole as around
         uvs, faces = _make_grid(fractions, fractions[::2])

@@ -544,7 +544,10 @@ class ViewTracer:
     def _look_up_texel(self, si: Any, masks: Sequence[Any], lit: LightMaps) -> Any:
         """Look up the radiance of the texels around a hit, bilinearly; 0 on no grid.
 
-        `masks` tell for each grid whether the hit is on it.
+        Args:
+            si: the hit.
+            masks: for each grid whether the hit is on it.
+            lit: the light.
         """
         first_cell = mi.UInt32(0)
         n_rows = mi.UInt32(1)
@@ -560,6 +563,7 @@ class ViewTracer:
             first_cell = dr.select(mask, mi.UInt32(grid.first_cell), first_cell)
             n_rows = dr.select(mask, mi.UInt32(grid.shape[0]), n_rows)
             n_columns = dr.select(mask, mi.UInt32(grid.shape[1]), n_columns)
+        # integers at the centers of cells
         row = y * mi.Float(n_rows) - 0.5
         column = x * mi.Float(n_columns) - 0.5
         radiance = _look_up_bilinear(

@@ -145,7 +145,7 @@ class _SceneText:
     def parse(self, data: bytes) -> ElementTree.Element:
         """Parse the bytes of a file, and return the root of its tree.
 
-        The sizes of all parsed files count together.
+        The size limit is for all parsed files together, the scene and its includes.
 
         Raises:
             FileFormatError: they are too large, no XML, or a scene of another version.
@@ -602,7 +602,8 @@ class _FileReader:
     def _read_bitmap(self, plugin: Plugin) -> Plugin:
         """Return a texture's plugin with its file read, as linear values.
 
-        A large file of linear values is averaged down to `TEXTURE_LIMIT`.
+        A file of display colors is decoded from sRGB, unless the plugin says that it is
+        raw. A large file of linear values is averaged down to `TEXTURE_LIMIT`.
         """
         file = self._find_file("a texture", plugin.pop("filename"))
         if file.suffix.lower() not in RADIANCE:

@@ -413,6 +413,10 @@ class Conversion:
     def _add_mesh(self, prim: Any, node: dict[str, Any]) -> Array | None:
         """Add a mesh to a node: one primitive for each material and tint.
 
+        Args:
+            prim: prim of the mesh.
+            node: entry of its node, to which the index of the mesh is added.
+
         Returns:
             The matrix (4, 4), for rows, of the skeleton that poses the mesh in the
             world; None if none does.
@@ -760,8 +764,16 @@ class Conversion:
     ) -> Iterator[tuple[BoundMaterial, Array]]:
         """Yield the materials of a mesh and their faces.
 
-        A face belongs to the first subset that has it, and to the mesh's own material
-        if none has. `faces` is how many there are.
+        A face has the material of the first subset that contains it, or else the mesh's
+        own material.
+
+        Args:
+            prim: prim of the mesh.
+            mesh: the same as USD's mesh.
+            faces: how many faces the mesh has.
+
+        Yields:
+            A material, and the indices of its faces.
         """
         subsets = UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets()
         is_unbound = np.ones(faces, bool)
@@ -778,8 +790,9 @@ class Conversion:
         """Pose the points of a mesh by its skeleton at rest.
 
         Returns:
-            The matrix (4, 4) of the skeleton, for rows, and the points (P, 3) in it;
-            (None, points) if the mesh has no skeleton, or one that cannot be posed.
+            The matrix (4, 4) from the skeleton to the world, for row vectors, and the
+            points (P, 3) in the skeleton's coordinates. If the mesh has no skeleton, or
+            one that cannot be posed, None and the points as they are.
         """
         skinning = self._skins.GetSkinningQuery(prim)
         if not skinning or not skinning.HasJointInfluences():
