@@ -262,6 +262,11 @@ def repair(soup: TriangleSoup, source: str, notes: Notes) -> TriangleSoup:
     Faces without area are removed, the winding becomes consistent and outward, and
     every normal has unit length and is on the front of its face.
 
+    Args:
+        soup: the soup, of extent 1.
+        source: name of the file, for messages.
+        notes: notes about the file, to which the changes are added.
+
     Raises:
         InputError: no face has an area; the message names the file, `source`.
     """
@@ -912,10 +917,14 @@ class _EarCutter:
         return np.asarray(is_cut | is_hopeless)
 
     def _cut(self, rows: IntArray, a: IntArray, b: IntArray, c: IntArray) -> None:
-        """Cut the ears a, b, c off the polygons in `rows`, (N,) each.
+        """Cut an ear off each of some polygons.
 
-        The triangle is stored, and b is taken out of the linked list of corners and of
-        the dents.
+        The triangle is stored, and its tip b is removed from the linked list of corners
+        and from the dents.
+
+        Args:
+            rows: (N,) the polygons.
+            a, b, c: (N,) the corners of the ear: the tip b and its neighbours.
         """
         self.triangles[rows, self.n_cut[rows]] = np.stack([a, b, c], axis=1)
         self.is_present[rows] &= self.dent[rows] != b[:, None]

@@ -127,7 +127,10 @@ def _parse_content(path: Path, chunk: bytes) -> dict[str, Any]:
 
 
 def _make_entry_error(path: Path, error: ValidationError) -> FileFormatError:
-    """Return the error for the first entry of a header that is invalid."""
+    """Return the error for the first entry of a header that is invalid.
+
+    It names the entry, as in "meshes[0].primitives[1].mode".
+    """
     first_error = error.errors(include_url=False)[0]
     # As in "meshes[0].primitives[1].mode".
     keys = (

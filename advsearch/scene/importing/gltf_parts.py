@@ -230,7 +230,11 @@ def _find_unread_keys(entry: Entry) -> list[str]:
 
 
 def _note_unread_attributes(header: Header, primitive: Primitive, notes: Notes) -> None:
-    """Note the vertex attributes of a primitive that are not read."""
+    """Note the vertex attributes of a primitive that are not read.
+
+    Attributes of skins and Gaussian splats are left out here: the former are read, and
+    the latter have a note of their own.
+    """
     read_names = {"POSITION", "NORMAL", "COLOR_0", "TEXCOORD_0"}
     if primitive.material is not None:
         material = header.materials[primitive.material]
@@ -771,7 +775,11 @@ def _pad(
 ) -> Float32Array:
     """Pad an image along an axis by a number of texels before and after it.
 
-    The pad has the value `border`, or repeats the texel at the edge if that is None.
+    Args:
+        image: (H, W, C) texels.
+        axis: axis of the array, 0 for rows.
+        before, after: width of the pads in texels.
+        border: (1,) or (C,) value of the pads; None repeats the texel at the edge.
     """
     size = image.shape[axis]
     texel_index = np.clip(np.arange(-before, size + after), 0, size - 1)

@@ -295,7 +295,12 @@ def _select_layer(
 
 
 def _describe_other_layers(selected: _Layer, layers: list[_Layer]) -> list[str]:
-    """Return a clause about the layers that are left out; none if there are none."""
+    """Return a clause about the layers that are left out; none if there are none.
+
+    Args:
+        selected: the layer that is read.
+        layers: all layers with colors.
+    """
     other_names = ", ".join(
         # not more, so that the note stays readable
         format_name(layer.name)

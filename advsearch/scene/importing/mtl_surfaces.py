@@ -617,7 +617,11 @@ class MtlReader:
     ) -> Float32Array | None:
         """Return the values (H, W, C) of an image with its ``-mm`` applied.
 
-        None, and a note, if it cannot be read.
+        Args:
+            use: the image; None returns None.
+            kind: what it holds, such as "colours".
+            note_template: the note if it cannot be read, with `{name}` for the image and
+                `{why}` for the reason; then None is returned.
         """
         if use is None:
             return None

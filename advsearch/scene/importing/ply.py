@@ -600,7 +600,17 @@ class _Properties:
     def _check_polygons(
         self, corners: IntArray, counts: IntArray, n_points: int
     ) -> None:
-        """Check what `read_polygons` returns. Raises FileFormatError as it does."""
+        """Check the polygons of the file.
+
+        Args:
+            corners: (C,) the vertex of each corner of the polygons.
+            counts: (P,) how many corners each polygon has.
+            n_points: how many vertices there are.
+
+        Raises:
+            FileFormatError: there is no polygon with 3 corners, one has too many, or
+                refers to a vertex that is not there.
+        """
         if (counts < 3).all():
             got = "points or lines only; export triangles"
             if self.has_splats:

@@ -145,7 +145,16 @@ def _describe_size(
 def _texture_plain(
     soup: TriangleSoup, surface: ImportedSurface, material: IntArray
 ) -> tuple[TriangleSoup, SurfaceMaps]:
-    """Return a soup of one color with UVs, the file's if they do not overlap."""
+    """Return a soup of one color with UVs, and a plain map for it.
+
+    The UVs are those of the file if they are usable and faces of different materials do
+    not share texels; otherwise the soup is unwrapped.
+
+    Args:
+        soup: the object.
+        surface: its only surface, which has no images.
+        material: (F,) index of each face's material.
+    """
     keeps_uvs = _is_usable(soup, soup.uvs) and not _has_overlap(soup.uvs, material)
     if keeps_uvs:
         soup_with_uvs = replace(soup, uvs=np.clip(soup.uvs, 0.0, 1.0))
@@ -548,7 +557,11 @@ class _Texels(NamedTuple):
 
 
 def _make_blank_maps(surfaces: Sequence[ImportedSurface], size: int) -> SurfaceMaps:
-    """Return white, flat and dark maps (N, N, ...), of which surfaces need some."""
+    """Return blank maps (N, N, ...) as far as surfaces need them.
+
+    Colors are white and opaque, normals flat, and the emission black. The color has a
+    fourth channel if a surface has an opacity.
+    """
     has_opacity = any(_get_base_color(surface).shape[-1] == 4 for surface in surfaces)
     n_channels = 4 if has_opacity else 3
     color = np.ones((size, size, n_channels), np.float32)

@@ -445,7 +445,10 @@ class _Statements(NamedTuple):
 
 
 def _parse_statements(lines: ObjLines, notes: Notes) -> _Statements:
-    """Parse the statements that are no numbers, and note those that are left out."""
+    """Parse the statements that are no numbers, and note those that are left out.
+
+    Statements that only name groups of faces, or switch something off, need no note.
+    """
     library_lines = list[str]()
     material_changes = list[tuple[int, str]]()
     smoothing_changes = list[tuple[int, str]]()

@@ -381,9 +381,13 @@ def _sample_reflected(view: FilmView, moving_si: Any, si: Any, sampler: Any) -> 
 def _sample_light(
     view: FilmView, si: Any, sampler: Any, active: Any
 ) -> tuple[Any, Any, Any]:
-    """Sample a direction to an emitter; return it, its weight, and where there is one.
+    """Sample a direction to an emitter from surface points.
 
-    A surface that only mirrors reflects none of it.
+    Nothing is sampled at a surface that only mirrors: it would reflect none of it.
+
+    Returns:
+        Mitsuba's direction sample; the emitter's radiance over the density; and in which
+        lanes there is a sample.
     """
     is_smooth = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Smooth)
     active_em = active & is_smooth

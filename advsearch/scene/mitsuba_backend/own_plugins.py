@@ -464,12 +464,16 @@ def _eval_towards_emitter(
 def _make_event(ray: Any, si: Any, scattered: Any, distance: Any) -> Any:
     """Return the interaction of one event of a path.
 
-    Where `scattered`, that is the point of the haze at `distance` along the ray, else
-    the surface hit `si`.
+    Args:
+        ray: the segment that leads to the event.
+        si: the surface interaction at its end.
+        scattered: whether the event is a scattering in the haze before that.
+        distance: distance of that scattering along the ray.
     """
     event = dr.zeros(mi.Interaction3f)
     event.t = dr.select(scattered, distance, si.t)
     event.p = dr.select(scattered, ray(distance), si.p)
+    # without a normal, no offset is added to rays that start in the haze
     event.n = dr.select(scattered, mi.Normal3f(0.0), si.n)
     event.time = ray.time
     event.wavelengths = ray.wavelengths

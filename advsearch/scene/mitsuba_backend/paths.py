@@ -61,7 +61,14 @@ class PathSamples:
         spp: int = 1,
         is_stratified: bool = True,
     ) -> None:
-        """Seed the generators; Dr.Jit calls it without arguments."""
+        """Seed the generators; Dr.Jit calls it without arguments to make an empty one.
+
+        Args:
+            seed: seed of the image, a number of Dr.Jit.
+            sample: indices of the samples in the image.
+            spp: samples per pixel.
+            is_stratified: whether the sampler is `multijitter`, else `independent`.
+        """
         if sample is None:
             return
         state, increment = mi.sample_tea_32(seed, sample)

@@ -530,7 +530,7 @@ def _describe_left_out(
 
 
 def _describe_integrator(name: str, plugin: Mapping[str, object]) -> Iterator[str]:
-    """Yield clauses about an integrator."""
+    """Yield clauses about what an integrator states and our own does not follow."""
     kind = plugin["type"]
     if kind not in PATH_INTEGRATORS:
         yield (
@@ -551,7 +551,13 @@ def _describe_integrator(name: str, plugin: Mapping[str, object]) -> Iterator[st
 def _describe_sensor(
     name: str, plugin: Mapping[str, object], *, hazy: bool
 ) -> Iterator[str]:
-    """Yield clauses about a sensor."""
+    """Yield clauses about what of a sensor is left out.
+
+    Args:
+        name: name of the sensor.
+        plugin: its dictionary.
+        hazy: whether the medium that it stands in is rendered, as a haze.
+    """
     kind = plugin["type"]
     if kind not in CAMERAS:
         yield f"the sensor {name} is left out: a {kind}"
@@ -681,7 +687,16 @@ class _ObjectFrame:
 
 
 def _scale_power(value: object, factor: float, kind: str) -> object:
-    """Multiply a light's power in any form that Mitsuba takes; `kind` is for errors."""
+    """Multiply a light's power in any form that Mitsuba takes.
+
+    Args:
+        value: the power: a number, or the dictionary of a spectrum or a bitmap.
+        factor: the factor.
+        kind: type of the light, for errors.
+
+    Raises:
+        InputError: the power is of another form.
+    """
     if isinstance(value, (int, float)):
         return float(value) * factor
     if isinstance(value, Mapping):

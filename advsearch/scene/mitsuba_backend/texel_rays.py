@@ -126,7 +126,10 @@ def _find_sky_cell(
 ) -> Any:
     """Return the index of the environment's cell that lies in a direction.
 
-    The environment is cut into cells, `sky_shape` (rows, columns), counted row by row.
+    Args:
+        scene: the scene.
+        direction: unit directions in the world.
+        sky_shape: rows and columns of the environment's cells, counted row by row.
     """
     n_rows, n_columns = sky_shape
     column, row = compute_map_position(direction, world_to_map(scene))
@@ -328,8 +331,13 @@ def find_hit_grids(
 ) -> list[Any]:
     """Return for each grid a mask of the hits that lie on it.
 
-    A grid has a shape and perhaps one side of its faces; `direction` is that of the
-    rays.
+    A grid belongs to a shape, and perhaps to only one side of its faces.
+
+    Args:
+        mitsuba_scene: the scene.
+        grids: the grids.
+        si: the hits.
+        direction: unit directions of the rays, which tell front from back.
     """
     is_front = dr.dot(si.n, direction) < 0.0
     shapes = {shape.id(): shape for shape in mitsuba_scene.shapes()}
@@ -575,7 +583,14 @@ def _set_base_color(
 ) -> Any:
     """Set a scene's inputs with one grey as the base color of a shape, if it has one.
 
-    Returns Mitsuba's scene. `name` is that of the shape.
+    Args:
+        scene: the scene.
+        inputs: inputs that are set; a base color of the shape is replaced.
+        name: name of the shape.
+        grey: linear reflectance of all texels.
+
+    Returns:
+        Mitsuba's scene.
     """
     key = f"{name}.base_color"
     changed = dict(inputs)
@@ -589,8 +604,13 @@ def _hit_point(
 ) -> Any:
     """Return the surface interaction at a point (3,), as seen by viewers.
 
-    A ray onto the point from just above makes it; then its viewer is replaced.
-    `to_viewer` are unit vectors in the frame of the surface, one for each lane.
+    A ray from just above hits the point. Then the direction to the viewer is replaced
+    in the interaction.
+
+    Args:
+        mitsuba_scene: the scene.
+        position, normal: (3,) the point and its unit normal.
+        to_viewer: unit vectors in the frame of the surface, one for each lane.
     """
     # 1e-3: so near that nothing else is in between
     start = mi.Point3f([float(x) for x in position + 1e-3 * normal])

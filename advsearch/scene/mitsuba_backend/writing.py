@@ -298,7 +298,13 @@ def _make_mesh(part: parts.MeshPart, remaining_inputs: Plugin) -> Plugin:
 
 
 def _make_surface(part: parts.MeshPart, part_inputs: Plugin) -> Plugin:
-    """Return the surface of a mesh, and take its numbers out of the mesh's inputs."""
+    """Return the surface of a mesh, with the values that its inputs have.
+
+    Args:
+        part: the mesh.
+        part_inputs: its inputs by names such as "roughness"; those that are set here
+            are removed.
+    """
     if part.surface is not None:
         base_color = part.base_color
         return fill_base_color(

@@ -95,8 +95,13 @@ def decode_image(data: bytes, path: str, *, is_srgb: bool) -> Array:
 def _decode_image(data: bytes, path: str, is_srgb: bool) -> Array:
     """Return the stored values (H, W, 4) in [0, 1] of an image file.
 
-    Greys of integers are divided by the largest of 16 bits, those of floats are taken
-    as they are.
+    Grey integers are taken for 16 bits, and divided by 65535. Grey floats stay as they
+    are.
+
+    Args:
+        data: bytes of the file.
+        path: its path, for messages.
+        is_srgb: whether its values are sRGB colors, and not numbers.
     """
     with Image.open(io.BytesIO(data), formats=reading.FORMATS) as image:
         reading.check_decodable(image, path)

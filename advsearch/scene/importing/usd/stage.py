@@ -479,7 +479,14 @@ class Conversion:
     def _check_corners(
         self, prim: Any, n_points: int, counts: Array, corners: Array
     ) -> None:
-        """Raise FileFormatError if faces refer to points that are not there."""
+        """Raise FileFormatError if faces refer to points that are not there.
+
+        Args:
+            prim: prim of the mesh, for messages.
+            n_points: how many points the mesh has.
+            counts: (F,) number of corners of each face.
+            corners: (C,) the points of the corners of all faces.
+        """
         if (
             (counts < 0).any()
             or counts.sum() != len(corners)
@@ -496,7 +503,14 @@ class Conversion:
     ) -> tuple[Array, Array]:
         """Return the triangles (T, 3) of a mesh, as rows of `corners`, and their faces.
 
-        Holes are left out.
+        Faces that the mesh lists as holes are left out. In a left-handed mesh the
+        corners are reversed, since glTF's faces are counter-clockwise.
+
+        Args:
+            mesh: USD's mesh.
+            points: (P, 3) its points.
+            counts: (F,) number of corners of each face.
+            corners: (C,) the points of the corners of all faces.
         """
         self.triangles += int(np.maximum(counts - 2, 0).sum())
         reading.check_faces(self.source, self.triangles, "more")
