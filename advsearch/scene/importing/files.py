@@ -210,8 +210,8 @@ def read_bytes(path: Path, what: str, suffixes: Sequence[str]) -> bytes:
 def _check_suffix(path: Path, what: str, suffixes: Sequence[str]) -> None:
     """Raise FileFormatError for a directory, or a file with another suffix.
 
-    The message has advice: to leave out a `#part` that this kind of file cannot have, or
-    how to convert the file.
+    The message has advice: to leave out a `#part` that this kind of file cannot have,
+    or how to convert the file.
 
     Args:
         path: the file.

@@ -370,10 +370,11 @@ def find_shared_edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
 def _link_windings(
     left_face: IntArray, right_face: IntArray, same_direction: BoolArray
 ) -> tuple[IntArray, IntArray]:
-    """Return the links (2 E) of the graph in which `_find_turned_faces` finds components.
+    """Return the links (2 E) of the graph that `_find_turned_faces` uses.
 
     Each face f has two nodes, 2 f for "as it is" and 2 f + 1 for "turned". Each shared
-    edge makes two links. A link joins the states of its two faces that agree in winding.
+    edge makes two links. A link joins the states of its two faces that agree in
+    winding.
 
     Args:
         left_face: one face of each shared edge.
@@ -473,13 +474,13 @@ def _find_closed_shells(
 def _find_inside_out_shells(soup: TriangleSoup, shell: IntArray) -> BoolArray:
     """Return for each shell (S,) whether it must be turned over.
 
-    A closed shell, all of whose edges belong to exactly two of its faces, is turned over
-    if its signed volume is negative. An exception is a shell inside another closed
+    A closed shell, all of whose edges belong to exactly two of its faces, is turned
+    over if its signed volume is negative. An exception is a shell inside another closed
     shell: it is taken for the wall of a hollow space, and stays as it is, unless the
     file's normals point the other way. If the signed volume of all closed shells
-    together is negative, the full object counts as inside out: all of it is turned over,
-    and then the same rule is applied to the result. An open sheet is turned over if the
-    file's normals point away from its front.
+    together is negative, the full object counts as inside out: all of it is turned
+    over, and then the same rule is applied to the result. An open sheet is turned over
+    if the file's normals point away from its front.
 
     Args:
         soup: a soup whose neighbours agree in winding.
@@ -549,8 +550,8 @@ def _fix_normals(soup: TriangleSoup, notes: Notes) -> TriangleSoup:
     """Return the soup with a normal on the front of its face at every corner.
 
     If the file's normals are on the front of their faces on almost all of the surface
-    (`MIN_NORMAL_AGREEMENT`), they are used. If they are on the back on almost all of it,
-    they are all reversed. Otherwise all are computed.
+    (`MIN_NORMAL_AGREEMENT`), they are used. If they are on the back on almost all of
+    it, they are all reversed. Otherwise all are computed.
 
     A single normal that is missing, or on the back of its face, is computed too. A
     computed normal is smooth, or in a part with flat shading that of the face.
@@ -650,7 +651,8 @@ def normalize_vectors(vectors: Float64Array) -> Float64Array:
     Vectors without a direction become NaN.
     """
     with np.errstate(all="ignore"):
-        # Divide by the largest entry first, so that squares neither overflow nor vanish.
+        # Divide by the largest entry first, so that squares neither overflow nor
+        # vanish.
         largest = np.abs(vectors).max(axis=-1, keepdims=True)
         scaled = vectors / largest
         unit_vectors = scaled / np.linalg.norm(scaled, axis=-1, keepdims=True)
@@ -858,8 +860,8 @@ class _EarCutter:
         self.tip = np.zeros(count, dtype=np.int64)
         self.n_tries = np.zeros(count, dtype=np.int64)
         self.is_failed = np.zeros(count, dtype=np.bool_)
-        # The signed areas of the triangles between the origin and each side add up to the
-        # area of the polygon.
+        # The signed areas of the triangles between the origin and each side add up to
+        # the area of the polygon.
         successors = np.roll(flat, -1, axis=1)
         doubled_areas = _compute_doubled_areas(flat, successors, np.zeros(2))
         self.area = np.abs(doubled_areas.sum(axis=1))
@@ -894,8 +896,8 @@ class _EarCutter:
         """Return which active polygons lose their corner b, between a and c.
 
         A polygon loses it if b is the tip of an ear, or if only three corners are left.
-        It also loses it, and counts as failed, if all corners were tried without finding
-        an ear, or once the budget is spent.
+        It also loses it, and counts as failed, if all corners were tried without
+        finding an ear, or once the budget is spent.
 
         Args:
             a, b, c: (active,) three successive corners of each active polygon.

@@ -351,8 +351,8 @@ def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
     """Check the accessors of a primitive.
 
     Types have to be those of the format, attributes need as many values as positions,
-    and indices have to be unsigned integers. An accessor without data is an error if the
-    primitive has an unsupported extension: that may hold the data, compressed.
+    and indices have to be unsigned integers. An accessor without data is an error if
+    the primitive has an unsupported extension: that may hold the data, compressed.
 
     Raises:
         FileFormatError: an accessor is wrong, or an extension is needed.

@@ -487,8 +487,8 @@ class GltfSurfaces:
         is_single_texel = texels is not None and texels.shape[:2] == (1, 1)
         if texels is None or not is_unfiltered or is_single_texel:
             return texels
-        # Texels are repeated until the image has up to this size. Then the texels of the
-        # result are so small that filtering is not visible.
+        # Texels are repeated until the image has up to this size. Then the texels of
+        # the result are so small that filtering is not visible.
         max_sharp_size = min(self._images.max_side, TEXTURE_LIMIT) // 2
         repeats = max_sharp_size // max(texels.shape[:2])
         if repeats < 2:
@@ -762,8 +762,8 @@ def _average_where_visible(
 def _edges_differ(image: Float32Array, axis: int) -> bool:
     """Return whether a repeated image would blend visibly at its edges along an axis.
 
-    Filtering blends half a texel at an edge with the opposite edge. That is visible only
-    in small images, and only if the two edges differ.
+    Filtering blends half a texel at an edge with the opposite edge. That is visible
+    only in small images, and only if the two edges differ.
     """
     if image.shape[axis] > SMALL_IMAGE_SIZE:
         return False

@@ -110,8 +110,8 @@ def read_vertex_joints(
         used: (V,) the vertices that faces use.
 
     Raises:
-        FileFormatError: the number of joints is not that of the vertices, or joints have
-            no weights.
+        FileFormatError: the number of joints is not that of the vertices, or joints
+            have no weights.
     """
     # A file has sets of four joints and weights a vertex: JOINTS_0, JOINTS_1, ...
     sets = list[VertexJoints]()
@@ -474,8 +474,8 @@ def _read_clips(
 ) -> tuple[Clip, ...]:
     """Return the clips of a file, with only those channels that move geometry.
 
-    A channel moves geometry if it sets the weights of morph targets, or the transform of
-    a node with a mesh, of a joint, or of an ancestor of one. A clip without any such
+    A channel moves geometry if it sets the weights of morph targets, or the transform
+    of a node with a mesh, of a joint, or of an ancestor of one. A clip without any such
     channel is left out.
 
     Args:
@@ -544,8 +544,8 @@ def _read_track(
     """Read one channel of a clip: the keys of one property of a node.
 
     The file has a flat list of values. For each key it has one value, or for a cubic
-    spline three: the tangent before the key, the value, and the tangent after it. If the
-    property is the weights of morph targets, each of these is one number for every
+    spline three: the tangent before the key, the value, and the tangent after it. If
+    the property is the weights of morph targets, each of these is one number for every
     target.
 
     Args:
@@ -627,8 +627,8 @@ def _read_times(file: GltfFile, index: int) -> Float64Array:
         index: accessor of the times.
 
     Raises:
-        FileFormatError: the accessor is of another type, or the times do not rise from 0
-            or later.
+        FileFormatError: the accessor is of another type, or the times do not rise from
+            0 or later.
     """
     path = file.path
     accessor = file.header.accessors[index]

@@ -322,8 +322,8 @@ def _find_color_layers(
 
     A channel's name is the name of its layer, a dot, and what it holds: "diffuse.R". A
     name without a dot belongs to the layer "", which gets the name of its part if the
-    file has several parts. A layer counts if it has R, G and B, or luminance Y, alone or
-    with both chroma channels RY and BY. Y together with X or Z is a color of XYZ and
+    file has several parts. A layer counts if it has R, G and B, or luminance Y, alone
+    or with both chroma channels RY and BY. Y together with X or Z is a color of XYZ and
     does not count.
 
     Args:
@@ -536,9 +536,10 @@ def read_radiance(path: Path, data: bytes) -> tuple[Bytes, Float32Array, list[st
 def _read_color_corrections(header: bytes) -> tuple[Float32Array, list[str]]:
     """Return the inverse (3,) of all COLORCORR lines, and notes on invalid ones.
 
-    A line has three factors that were already applied to the pixels, so they are divided
-    by. A line that would take the result out of float32's range is invalid too. EXPOSURE
-    lines are ignored, since the brightness of environments is set by metering anyway.
+    A line has three factors that were already applied to the pixels, so they are
+    divided by. A line that would take the result out of float32's range is invalid too.
+    EXPOSURE lines are ignored, since the brightness of environments is set by metering
+    anyway.
     """
     factors = np.ones(3)
     notes = list[str]()

@@ -353,8 +353,9 @@ class MtlReader:
 
         These change nothing: numbers that are all 0, ignored keywords, the roughness of
         a clear coat that is absent, a grey transmission filter, and an ambient map that
-        is the same image as the color's. Also noted are statements that were overridden,
-        a fourth number of Kd, and illumination models above 2, such as ray-traced glass.
+        is the same image as the color's. Also noted are statements that were
+        overridden, a fourth number of Kd, and illumination models above 2, such as
+        ray-traced glass.
         """
         zero_keys = {
             key for key in material.statements if _is_zero(material.peek_argument(key))
@@ -444,8 +445,8 @@ class MtlReader:
         """Return a surface with its opacity.
 
         The opacity is a number, ``d`` or 1 - ``Tr``, times the image of ``map_d``. The
-        image is resized to the size of the color texture. The single color, which counts
-        where there is no texture, is multiplied by the number alone.
+        image is resized to the size of the color texture. The single color, which
+        counts where there is no texture, is multiplied by the number alone.
 
         Args:
             material: the material.
@@ -553,8 +554,8 @@ class MtlReader:
     ) -> Float32Array | None:
         """Return the first usable normal map (H, W, 3) of a material, or None.
 
-        A bump map is usable if it holds normals; one of heights is left out with a note.
-        All statements with the same image count as read.
+        A bump map is usable if it holds normals; one of heights is left out with a
+        note. All statements with the same image count as read.
 
         Args:
             material: the material.
@@ -620,8 +621,8 @@ class MtlReader:
         Args:
             use: the image; None returns None.
             kind: what it holds, such as "colours".
-            note_template: the note if it cannot be read, with `{name}` for the image and
-                `{why}` for the reason; then None is returned.
+            note_template: the note if it cannot be read, with `{name}` for the image
+                and `{why}` for the reason; then None is returned.
         """
         if use is None:
             return None
@@ -637,9 +638,9 @@ class MtlReader:
 def _select_channel(picture: Float32Array, use: MapUse) -> Float32Array:
     """Return the values (H, W) of an image for a map of numbers.
 
-    They are those of the channel that ``-imfchan`` names, such as "r". Without one, they
-    are the alpha if it is not 1 everywhere, or else the mean of the colors. The mean is
-    also taken if ``-imfchan`` names the alpha of an image without alpha.
+    They are those of the channel that ``-imfchan`` names, such as "r". Without one,
+    they are the alpha if it is not 1 everywhere, or else the mean of the colors. The
+    mean is also taken if ``-imfchan`` names the alpha of an image without alpha.
     """
     alpha_index = 3
     has_alpha = picture.shape[2] == 4
@@ -658,8 +659,8 @@ def find_libraries(arguments: Sequence[str], references: References) -> list[str
 
     A line may name several files, and a name may have blanks. If the full line is the
     name of a file that exists, it is one name. Otherwise it is split after each
-    ``.mtl``, and the rest at blanks. The pieces are taken if all of them end in ``.mtl``
-    or one of them exists. If not, the line is taken as one name.
+    ``.mtl``, and the rest at blanks. The pieces are taken if all of them end in
+    ``.mtl`` or one of them exists. If not, the line is taken as one name.
 
     Args:
         arguments: what follows ``mtllib`` in each line.

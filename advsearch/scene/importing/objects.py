@@ -227,8 +227,8 @@ def make_object(
         notes: warnings about them so far.
         file: the file that they are from.
         name: name of the object.
-        up: the axis of the file that points up, "y" or "z"; None: that of the format, or
-            else the one that its shape suggests.
+        up: the axis of the file that points up, "y" or "z"; None: that of the format,
+            or else the one that its shape suggests.
         front: the axis of the file along which its front faces.
 
     Raises:
@@ -379,7 +379,8 @@ def _make_mesh(
 ) -> Mesh:
     """Return the normalised mesh with its materials, and a rig if something moves it.
 
-    Its largest extent becomes 1. A rig is there if the file has joints or morph targets.
+    Its largest extent becomes 1. A rig is there if the file has joints or morph
+    targets.
 
     Args:
         soup: the repaired object.

@@ -385,8 +385,8 @@ def split_at_corners(
 def _number_corners(triangles: IntArray, *columns: IndexedValues | None) -> IntArray:
     """Return one number for each corner, which is equal for corners with equal values.
 
-    The rows of a corner's values become the digits of the number. The base of a digit is
-    the column's number of values plus 1; the digit 0 stands for a missing value (row
+    The rows of a corner's values become the digits of the number. The base of a digit
+    is the column's number of values plus 1; the digit 0 stands for a missing value (row
     -1).
 
     Args:

@@ -211,8 +211,8 @@ def _average(
 ) -> Float32Array:
     """Average an image (R, C, K) by weights of rows (H, R) and of columns (W, C).
 
-    The weights of rows are applied first, then those of columns. Each time the other two
-    axes are merged into one, since a sparse matrix can only multiply a matrix.
+    The weights of rows are applied first, then those of columns. Each time the other
+    two axes are merged into one, since a sparse matrix can only multiply a matrix.
 
     Returns:
         The averaged image (H, W, K).

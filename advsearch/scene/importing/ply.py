@@ -758,9 +758,9 @@ class _Properties:
     ) -> IntArray:
         """Return the index of each polygon's texture, (P,); -1 for none.
 
-        It is the `texnumber` of faces, or that of a face's first vertex. Without either,
-        all polygons have the first texture. A number for which the file names no texture
-        is noted.
+        It is the `texnumber` of faces, or that of a face's first vertex. Without
+        either, all polygons have the first texture. A number for which the file names
+        no texture is noted.
 
         Args:
             names: the textures of the file.
@@ -864,8 +864,8 @@ def _split_strips(vertices: IntArray, counts: IntArray) -> IntArray:
     """Return the triangles (T, 3) of triangle strips.
 
     Each three successive vertices of a strip are a triangle. Every second triangle is
-    wound backwards, so two of its corners are swapped here. A vertex of -1 ends a strip;
-    a new one begins after it. Triangles with a repeated vertex are left out.
+    wound backwards, so two of its corners are swapped here. A vertex of -1 ends a
+    strip; a new one begins after it. Triangles with a repeated vertex are left out.
 
     Args:
         vertices: the vertices of all strips, concatenated.

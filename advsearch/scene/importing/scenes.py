@@ -288,8 +288,8 @@ def _make_surrounding_mesh(
     """
     frame = _compute_frame(parts, object_frame.rotation)
     shape = make_object(parts, notes=[], file=path, name=name, up="y", front=front)
-    # Both meshes are normalised to an extent of 1. The scale restores the ratio of their
-    # sizes in the file.
+    # Both meshes are normalised to an extent of 1. The scale restores the ratio of
+    # their sizes in the file.
     mesh_to_object = np.eye(4)
     mesh_to_object[:3, :3] *= frame.size / object_frame.size
     mesh_to_object[:3, 3] = object_frame.to_frame(frame.origin)
@@ -463,8 +463,8 @@ def _find_light_unit(
 ) -> tuple[float, str]:
     """Return how many candela are one unit of radiant intensity, and a note on it.
 
-    glTF states lamps in candela and surfaces in nit (candela per square metre); a nit of
-    a surface is one unit here. Exporters write watts times `LUMENS` for lamps. So if
+    glTF states lamps in candela and surfaces in nit (candela per square metre); a nit
+    of a surface is one unit here. Exporters write watts times `LUMENS` for lamps. So if
     there are only lamps, `LUMENS` candela are one unit. If surfaces emit light too, the
     ratio of both counts: it is that of glTF, or in Blender's files the one that Blender
     shows.
@@ -555,10 +555,10 @@ def _position_light(
 ) -> tuple[Float64Array, Float64Array]:
     """Return the position (3,) of a light and its radiant intensity (3,).
 
-    A directional light is stated in lux. It becomes a lamp so far away that its rays are
-    almost parallel. With the intensity lux times squared distance, it causes the same
-    lux at the object. For other lights, lengths are divided by the object's size, so
-    intensities are divided by its square.
+    A directional light is stated in lux. It becomes a lamp so far away that its rays
+    are almost parallel. With the intensity lux times squared distance, it causes the
+    same lux at the object. For other lights, lengths are divided by the object's size,
+    so intensities are divided by its square.
 
     Args:
         light: its entry in the header.
@@ -614,7 +614,8 @@ def _make_camera(
     matrix[:3, 3] = frame.to_frame(frame.rotation @ pose[:3, 3])
     # `yfov` is along the height. In a wide image the larger side is the width, with a
     # tangent larger by the aspect ratio. If the file states none, it is that of the
-    # rendered image (section 5.13), for which `upright` tells that `fov` is the height's.
+    # rendered image (section 5.13), for which `upright` tells that `fov` is the
+    # height's.
     aspect_ratio = camera.perspective.aspectRatio
     half_tangent = math.tan(camera.perspective.yfov / 2.0)
     fov = math.degrees(2.0 * math.atan(half_tangent * max(aspect_ratio or 1.0, 1.0)))

@@ -92,8 +92,8 @@ def apply_textures(
 
     The file's UVs and images are used if all faces have the same images and these can
     be used without baking; at most they are cropped to the window that the UVs use.
-    Otherwise the soup is unwrapped, the images are baked, and a note says why. A soup of
-    one color gets a small plain map, and keeps its UVs if these are usable.
+    Otherwise the soup is unwrapped, the images are baked, and a note says why. A soup
+    of one color gets a small plain map, and keeps its UVs if these are usable.
 
     Args:
         soup: a repaired soup.
@@ -190,8 +190,8 @@ def index_materials(
 def _has_overlap(uvs: Float64Array, material: IntArray) -> bool:
     """Return whether faces of different materials share many texels.
 
-    Many is more than the fraction `_MAX_SHARED` of the texels that faces cover, in a map
-    of `BAKED_SIZE` texels a side.
+    Many is more than the fraction `_MAX_SHARED` of the texels that faces cover, in a
+    map of `BAKED_SIZE` texels a side.
 
     Args:
         uvs: (F, 3, 2) texture coordinates of the faces.
@@ -229,8 +229,8 @@ def _is_lit_twice(
     """Return whether texels that emit light are on several faces.
 
     Mitsuba would send light from only one of these faces. A fraction of up to
-    `_MAX_SHARED` of the lit texels may be on several faces. An emission that is the same
-    everywhere has no texels to share.
+    `_MAX_SHARED` of the lit texels may be on several faces. An emission that is the
+    same everywhere has no texels to share.
 
     Args:
         uvs: (F, 3, 2).
@@ -264,8 +264,8 @@ def _describe_reason(
 ) -> str:
     """Return the reason why an object was baked, as a sentence for its warnings.
 
-    The reasons are tried in this order: several materials or images, colors of vertices,
-    missing texture coordinates, unusable texture coordinates.
+    The reasons are tried in this order: several materials or images, colors of
+    vertices, missing texture coordinates, unusable texture coordinates.
 
     Args:
         soup: the object.
@@ -325,8 +325,8 @@ def _tint(
 def _is_usable(soup: TriangleSoup, uvs: Float64Array) -> bool:
     """Return whether UVs (F, 3, 2) are in [0, 1], and neither squashed nor tiny.
 
-    At most the fraction `_MAX_SQUASHED` of the surface may have no area in UV space, and
-    all faces together must cover at least the area `_MIN_UV_AREA` there.
+    At most the fraction `_MAX_SQUASHED` of the surface may have no area in UV space,
+    and all faces together must cover at least the area `_MIN_UV_AREA` there.
     """
     if (
         not np.isfinite(uvs).all()
@@ -397,9 +397,10 @@ def _crop_to_window(
 
     The window is the bounding box of the UVs, one texel wider on each side, so that
     filtering finds the neighbours of its texels. Images are cropped if UVs overstep the
-    unit square, or use only a small part of it. Then they are resampled at texels of the
-    same size. Images stay as they are if UVs lie inside and fill enough of the square,
-    or if the window is larger than `_MAX_WINDOW` textures, since textures repeat there.
+    unit square, or use only a small part of it. Then they are resampled at texels of
+    the same size. Images stay as they are if UVs lie inside and fill enough of the
+    square, or if the window is larger than `_MAX_WINDOW` textures, since textures
+    repeat there.
 
     Args:
         uvs: (F, 3, 2).
@@ -604,8 +605,8 @@ def _sample_base_color(
 ) -> Float32Array:
     """Return the base color (T, 3 or 4) of a surface at UVs (T, 2).
 
-    The color is display-referred. If some UVs are missing (NaN), it is the same for all:
-    the mean of the texture over the faces of the soup that show it.
+    The color is display-referred. If some UVs are missing (NaN), it is the same for
+    all: the mean of the texture over the faces of the soup that show it.
 
     Args:
         surface: the surface.
@@ -695,9 +696,9 @@ def _compute_sample_weights(steps: int) -> Float64Array:
     """Return barycentric weights (P, 3) of points evenly spread over a triangle.
 
     Each side is cut into `steps` parts, which divides the triangle into steps**2 equal
-    small triangles. The points are the centers of these. A small triangle that points up
-    begins at a grid point (i, j), and its center is a third of a step beyond it along
-    both sides. The center of one that points down is two thirds beyond it.
+    small triangles. The points are the centers of these. A small triangle that points
+    up begins at a grid point (i, j), and its center is a third of a step beyond it
+    along both sides. The center of one that points down is two thirds beyond it.
     """
     grid_i, grid_j = np.meshgrid(np.arange(steps), np.arange(steps))
     i = grid_i.reshape(-1)
@@ -782,8 +783,8 @@ def _unmirror(
     A face is mirrored if its UVs run clockwise. There the renderer's bitangent is the
     opposite of the file's, which matters only for a normal map. If (almost) all faces
     are mirrored, the y of the normals is reversed. If only some are, the maps are
-    doubled in width: the right half is a mirrored copy of the left one, and the mirrored
-    faces are moved there. No texel is resampled.
+    doubled in width: the right half is a mirrored copy of the left one, and the
+    mirrored faces are moved there. No texel is resampled.
 
     Args:
         soup: the object.
@@ -837,7 +838,8 @@ def convert_normals(
 
     A texel stores a normal's components n along tangent, bitangent and surface normal
     as (n + 1) / 2. The first two are rotated within the surface, and the third stays. A
-    normal on a face without area in UV space cannot be converted, and becomes (0, 0, 1).
+    normal on a face without area in UV space cannot be converted, and becomes (0, 0,
+    1).
 
     Args:
         texels: (T, 3) of the normal map.

@@ -562,8 +562,8 @@ class ObjLines:
     def __init__(self, data: bytes, notes: Notes) -> None:
         """Find the lines of a file, and the kind of each by its first bytes.
 
-        All lines are compared at once: the arrays of their first, second and third bytes
-        with those of the keywords.
+        All lines are compared at once: the arrays of their first, second and third
+        bytes with those of the keywords.
 
         Args:
             data: the bytes of the file.
@@ -609,8 +609,8 @@ class ObjLines:
     def read_table(self, kind: str) -> Float64Array:
         """Return the numbers of all lines of a kind, (N, columns) as in `TABLES`.
 
-        Numbers that a line lacks are 0 for ``vt`` and NaN for the others. Numbers beyond
-        the last column are left out.
+        Numbers that a line lacks are 0 for ``vt`` and NaN for the others. Numbers
+        beyond the last column are left out.
 
         Raises:
             FileFormatError: a line has too few numbers, or other words.
@@ -889,8 +889,8 @@ def _parse_corners(data: Bytes) -> tuple[IntArray, IntArray] | None:
     # a blank is before the first number: the keyword was blanked out
     number_starts = np.flatnonzero(is_digit[1:] & ~is_digit[:-1]) + 1
     is_first = is_blank[number_starts - 1]  # of its corner
-    # The byte two before a number is a slash if two slashes are before it. For the first
-    # number of a corner, `_find_columns` ignores that.
+    # The byte two before a number is a slash if two slashes are before it. For the
+    # first number of a corner, `_find_columns` ignores that.
     column = _find_columns(is_first, is_slash[number_starts - 2])
     # three numbers in a row that are not the first of a corner: it has four
     has_fourth = ~(is_first[3:] | is_first[2:-1] | is_first[1:-2])

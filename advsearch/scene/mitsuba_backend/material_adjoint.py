@@ -175,9 +175,9 @@ def material_adjoint(
 def _is_rough(cotangent: Tensor) -> bool:
     """Return whether neighbouring pixels of a cotangent (H, W, 3) hardly correlate.
 
-    Hardly means that their correlation c is less than `ROUGH_COTANGENT`. The mean square
-    of the difference of two neighbours is 2 v (1 - c), where v is the mean square of the
-    values.
+    Hardly means that their correlation c is less than `ROUGH_COTANGENT`. The mean
+    square of the difference of two neighbours is 2 v (1 - c), where v is the mean
+    square of the values.
     """
     values = cotangent.detach().to(torch.float64)
     right_square = torch.diff(values, dim=1).square().mean()
@@ -193,14 +193,15 @@ def _compute_interior_term(view: FilmView, seed: int, spp: int, tile: int) -> An
     """Return a value whose gradient by the vertices is the interior term.
 
     The derivative is taken in two steps, since that of some samples is not finite. The
-    first step goes back to the point and the normals of each sample. The second one goes
-    on to the vertices, without samples whose derivative is not finite.
+    first step goes back to the point and the normals of each sample. The second one
+    goes on to the vertices, without samples whose derivative is not finite.
 
     Args:
         view: the scene.
         seed: seed of the samples.
         spp: samples per pixel.
-        tile: width in pixels of a tile in which all pixels have the same random numbers.
+        tile: width in pixels of a tile in which all pixels have the same random
+            numbers.
     """
     with dr.suspend_grad():
         film, hit, sampler = _sample_first_hits(view, seed, spp, tile)
@@ -250,7 +251,8 @@ def _sample_first_hits(
         view: the scene.
         seed: seed of the samples.
         spp: samples in each cell.
-        tile: width of a tile in cells; all cells of a tile have the same random numbers.
+        tile: width of a tile in cells; all cells of a tile have the same random
+            numbers.
 
     Returns:
         Film positions in pixels; their hits; and a sampler that goes on with their
@@ -386,8 +388,8 @@ def _sample_light(
     Nothing is sampled at a surface that only mirrors: it would reflect none of it.
 
     Returns:
-        Mitsuba's direction sample; the emitter's radiance over the density; and in which
-        lanes there is a sample.
+        Mitsuba's direction sample; the emitter's radiance over the density; and in
+        which lanes there is a sample.
     """
     is_smooth = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Smooth)
     active_em = active & is_smooth

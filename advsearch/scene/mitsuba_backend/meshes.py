@@ -117,8 +117,8 @@ def compute_sampling_weights(parts: Iterable[MeshPart]) -> dict[str, float]:
     """Return how often light is sampled from each mesh that emits some, by its name.
 
     The environment has the weight 1, and all meshes together also have 1. Each mesh has
-    a fraction of it in proportion to its power, but at least `MIN_WEIGHT_FRACTION` of an
-    equal part, so that no light is sampled too rarely.
+    a fraction of it in proportion to its power, but at least `MIN_WEIGHT_FRACTION` of
+    an equal part, so that no light is sampled too rarely.
     """
     powers: dict[str, float] = {}
     for part in parts:

@@ -436,14 +436,14 @@ def _translate_beam(part: parts.BeamLamp) -> Translation:
     """Return a headlamp's beam as a projector.
 
     The table has the intensity I of each direction. On a plane at distance 1 an
-    intensity makes the irradiance I cos^3 of the angle to the axis: the plane is 1 / cos
-    away there (squared), and tilted by the angle. Mitsuba's projector makes pi times its
-    texture there, so the texture is I cos^3 / pi.
+    intensity makes the irradiance I cos^3 of the angle to the axis: the plane is 1 /
+    cos away there (squared), and tilted by the angle. Mitsuba's projector makes pi
+    times its texture there, so the texture is I cos^3 / pi.
     """
     height, width = part.table.shape
-    # Centers of the table's cells on a plane at distance 1. A field of view of 90 degrees
-    # is 2 wide there. Points at half cells are borders and centers in turn, so that
-    # every second one, from index 1 on, is a center.
+    # Centers of the table's cells on a plane at distance 1. A field of view of 90
+    # degrees is 2 wide there. Points at half cells are borders and centers in turn, so
+    # that every second one, from index 1 on, is a center.
     x = np.linspace(-1.0, 1.0, 2 * width + 1)[1::2]
     y = np.linspace(-1.0, 1.0, 2 * height + 1)[1::2]
     cosine = (1.0 + x[None] ** 2 + (y[:, None] * height / width) ** 2) ** -0.5
@@ -580,8 +580,8 @@ def _make_ground(description: SceneDescription) -> Any:
         return None
     level = 0.0
     if description.backdrop_photograph is not None:
-        # The photograph shows the ground already. Our plane only takes the shadow of the
-        # object, and the scene may have none.
+        # The photograph shows the ground already. Our plane only takes the shadow of
+        # the object, and the scene may have none.
         if not has_plane(description):
             return None
         level = description.get_number("ground.level")

@@ -92,8 +92,9 @@ class PathSamples:
         """Draw a point in [0, 1)^2 for each sample.
 
         With stratification, a pixel's samples have one point in each stratum, and also
-        one in each of `spp` columns and rows (correlated multi-jittered sampling, Kensler
-        2013). The constants are those of Mitsuba's `multijitter`, whose numbers these are.
+        one in each of `spp` columns and rows (correlated multi-jittered sampling,
+        Kensler 2013). The constants are those of Mitsuba's `multijitter`, whose numbers
+        these are.
         """
         if not self.is_stratified:
             x = self.rng.next_float32()

@@ -290,8 +290,8 @@ def _find_shape(
 ) -> str:
     """Return the id of the shape that a user names.
 
-    If no shape has that id, it is the only one whose id has the same letters and digits,
-    in any case: "largebox" means "large-box".
+    If no shape has that id, it is the only one whose id has the same letters and
+    digits, in any case: "largebox" means "large-box".
 
     Args:
         named: the scene's plugins by name.
@@ -469,8 +469,8 @@ def _find_surface(
 def _find_radiance(shape: Mapping[str, object]) -> Float32Array | None:
     """Return the radiance (1, 1, 3) of a shape that emits evenly; None for any other.
 
-    It emits evenly if its area light has a constant radiance, of at most `MAX_RADIANCE`,
-    and no other entries.
+    It emits evenly if its area light has a constant radiance, of at most
+    `MAX_RADIANCE`, and no other entries.
     """
     for inner in shape.values():
         if not isinstance(inner, Mapping) or inner["type"] != "area":
@@ -712,9 +712,9 @@ def _scale_power(value: object, factor: float, kind: str) -> object:
 def _scale_spectrum(value: Mapping[str, object], factor: float) -> Plugin | None:
     """Multiply a spectrum's or a bitmap's values; None if it is of another kind.
 
-    The value may be one number, three numbers, or pairs of wavelength and amount. Lights
-    with a fixed spectrum (d65, blackbody) have an entry `scale`, which is multiplied
-    instead.
+    The value may be one number, three numbers, or pairs of wavelength and amount.
+    Lights with a fixed spectrum (d65, blackbody) have an entry `scale`, which is
+    multiplied instead.
 
     Args:
         value: the dictionary of the spectrum or the bitmap.

@@ -458,7 +458,8 @@ def _read_haze_medium(
     density = _parse_numbers(medium.get("sigma_t", 1.0))
     scale = _parse_numbers(medium.get("scale", 1.0))
     # The cube root of the determinant is the factor of lengths, from the scene to the
-    # object's coordinates. The extinction is per length, so it is divided by the factor.
+    # object's coordinates. The extinction is per length, so it is divided by the
+    # factor.
     length_scale = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
     extinction = density * scale / length_scale
     # one value for all channels

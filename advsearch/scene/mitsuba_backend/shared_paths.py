@@ -62,7 +62,7 @@ class SharedPaths:
     """
 
     def __init__(self, scene: MitsubaScene, inputs: Collection[str]) -> None:
-        """Remember the scene and which inputs may change, such as "object.roughness"."""
+        """Store the scene and which inputs may change, as "object.roughness"."""
         self.scene = scene
         self._inputs = frozenset(inputs)
         self._shapes = {name.partition(".")[0] for name in inputs}
@@ -78,7 +78,8 @@ class SharedPaths:
         Args:
             inputs: values of inputs that differ from the base values.
             seeds: seed of the image "path", and perhaps of "guides". The guides come
-                from the same samples as the radiance, so only the seed of "path" counts.
+                from the same samples as the radiance, so only the seed of "path"
+                counts.
             spp: samples per pixel.
 
         Returns:

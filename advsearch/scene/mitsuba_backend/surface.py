@@ -249,8 +249,8 @@ class ViewTracer:
     ) -> list[Any]:
         """Trace all rays: the recorded kernel.
 
-        Rays go through cut-outs layer by layer. Each layer stops a fraction of the light
-        that is left of a ray; the last layer stops all of it.
+        Rays go through cut-outs layer by layer. Each layer stops a fraction of the
+        light that is left of a ray; the last layer stops all of it.
 
         Args:
             mitsuba_scene: the scene.
@@ -334,8 +334,8 @@ class ViewTracer:
         position = camera[9:12]
         if self._lens is None:
             half_width, half_height, center_x, center_y = camera[12:]
-            # Columns count from the left and rows from the top. The camera's x points to
-            # the left and its y up, so both are subtracted.
+            # Columns count from the left and rows from the top. The camera's x points
+            # to the left and its y up, so both are subtracted.
             column = mi.Float(pixel % width) + x_offset
             row = mi.Float(pixel // width) + y_offset
             x = (center_x - 2.0 * column / width) * half_width
@@ -492,8 +492,9 @@ class ViewTracer:
         for grid, mask in zip(self._grids, masks, strict=True):
             is_ground |= mask & grid.is_ground
         # A wide lobe reflects much of the ground, but one ray meets a single point of
-        # it. So the wider the lobe, the more the blurred map of the surroundings counts.
-        # It is scaled by how much darker the ground is at this point than far away.
+        # it. So the wider the lobe, the more the blurred map of the surroundings
+        # counts. It is scaled by how much darker the ground is at this point than far
+        # away.
         far_ground = mi.UInt32(self._grids[-1].first_cell + self._grids[-1].n_cells)
         darkening = texel / _gather_color(lit.texels, far_ground)
         ground = self._look_up_diffuse(hit, masks, lit, to_local)
@@ -578,8 +579,8 @@ def _make_camera_numbers(
     """Return the `CAMERA_SIZE` numbers of a camera as the kernel takes them.
 
     They are its axes to the left, up and forward (9 numbers), its position (3), half
-    its extent along x and y at distance 1 (2), and the image's center along x and y (2).
-    The last four are used only for a pinhole.
+    its extent along x and y at distance 1 (2), and the image's center along x and y
+    (2). The last four are used only for a pinhole.
 
     Args:
         inputs: the camera's inputs: `camera.to_world` (4, 4), and for a pinhole

@@ -290,9 +290,9 @@ def find_opaque_hits(
 ) -> Any:
     """Return the first hits of rays that stop them; rays pass transparent cut-outs.
 
-    A ray goes on while the fraction of light that passes everything it has met is larger
-    than `chance`. Random chances let rays pass as often as light does; 0.5 lets a ray
-    pass where most light does.
+    A ray goes on while the fraction of light that passes everything it has met is
+    larger than `chance`. Random chances let rays pass as often as light does; 0.5 lets
+    a ray pass where most light does.
 
     Args:
         mitsuba_scene: the scene.
@@ -632,8 +632,9 @@ def _measure_spreads(
 ) -> tuple[Float64Array, Float64Array]:
     """Return root mean square angles (k,) of both halves of weighted samples (k, n).
 
-    The halves have equal weight. The first half has the samples with smaller angles, the
-    second half the others. The weight of a sample at the median is split between both.
+    The halves have equal weight. The first half has the samples with smaller angles,
+    the second half the others. The weight of a sample at the median is split between
+    both.
     """
     order = np.argsort(squared_angle, axis=1)
     weight = np.take_along_axis(weight, order, axis=1)

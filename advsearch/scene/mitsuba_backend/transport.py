@@ -158,8 +158,9 @@ def _light_by_projector(
 ) -> list[tuple[Any, Any, Any]]:
     """Return the vertices of paths as a projector with a white image lights them.
 
-    A vertex is its texture coordinates in the projector's image, its weight, and whether
-    it is seen sharply, as from `_accumulate_radiance`. Other light does not count.
+    A vertex is its texture coordinates in the projector's image, its weight, and
+    whether it is seen sharply, as from `_accumulate_radiance`. Other light does not
+    count.
 
     Args:
         scene: Mitsuba's scene.
@@ -433,8 +434,8 @@ def _trace_paths(
         weight: their weights.
         noise: the sampler.
         depth: longest path in segments.
-        roulette_depth: bounces from which on a path goes on only with a probability: its
-            throughput, but at most `MAX_SURVIVAL`.
+        roulette_depth: bounces from which on a path goes on only with a probability:
+            its throughput, but at most `MAX_SURVIVAL`.
 
     Returns:
         What the camera sees, channel by channel in the order of the images of `Paths`
@@ -685,9 +686,9 @@ def _sample_center_rays(sensor: Any, resolution: tuple[int, int]) -> tuple[Any, 
 def _passes_camera_ray(scene: Any, si: Any, active: Any) -> Any:
     """Return where a camera ray goes on through what it hit.
 
-    It does if the surface emits no light, and if one of two things holds: more than half
-    of the light passes, as in a hole of a leaf, or the surface does nothing but let
-    light pass.
+    It does if the surface emits no light, and if one of two things holds: more than
+    half of the light passes, as in a hole of a leaf, or the surface does nothing but
+    let light pass.
 
     Args:
         scene: Mitsuba's scene.

@@ -195,7 +195,7 @@ class _SceneText:
     def _set_handlers(
         self, parser: expat.XMLParserType, tree: ElementTree.TreeBuilder
     ) -> None:
-        """Set the parser's callbacks, which build a tree and refuse what no scene needs.
+        """Set the parser's callbacks, which build a tree and refuse some things.
 
         They refuse document types, entities, the elements `alias` and `path`, and
         elements that are more or nested deeper than the limits. Texts and comments
@@ -320,7 +320,7 @@ class _SceneText:
 def _convert_plugin(
     path: Path, state: Any, index: int, referred_ids: set[str]
 ) -> Plugin:
-    """Convert a parsed plugin and its inner plugins to a `mitsuba.load_dict` dictionary.
+    """Convert a parsed plugin, with its inner ones, for `mitsuba.load_dict`.
 
     Args:
         path: path of the file, for errors.
@@ -379,7 +379,8 @@ def _get_node_name(node: Any, argument: str, *, at_top: bool) -> str:
 def _convert_value(where: str, kind: Any, value: Any) -> object:
     """Return a number, a string, a color or a transform of a plugin as Python has it.
 
-    A color or a spectrum becomes a plugin, such as `{"type": "rgb", "value": [1, 0, 0]}`.
+    A color or a spectrum becomes a plugin, such as `{"type": "rgb", "value": [1, 0,
+    0]}`.
 
     Args:
         where: beginning of error messages.
@@ -387,8 +388,8 @@ def _convert_value(where: str, kind: Any, value: Any) -> object:
         value: the value.
 
     Raises:
-        FileFormatError: a number is not finite or out of float32's range, or a transform
-            is not affine or cannot be inverted.
+        FileFormatError: a number is not finite or out of float32's range, or a
+            transform is not affine or cannot be inverted.
     """
     types = mi.Properties.Type
     if kind == types.Transform:
@@ -521,8 +522,8 @@ class _FileReader:
         """Return a plugin in which inner plugins are checked and files are read.
 
         Raises:
-            FileFormatError: a plugin does not come with Mitsuba; a file can be read only
-                by Mitsuba; or the name of a material is not a single word, which
+            FileFormatError: a plugin does not come with Mitsuba; a file can be read
+                only by Mitsuba; or the name of a material is not a single word, which
                 matters because Mitsuba builds the name of a file from it.
         """
         kind = str(plugin["type"])

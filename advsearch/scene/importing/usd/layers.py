@@ -71,8 +71,8 @@ def open_package(name: str, content: bytes) -> zipfile.ZipFile:
 def _check_entries(name: str, archive: zipfile.ZipFile) -> None:
     """Check number, size, names and headers of the entries of a package.
 
-    Names must stay inside the package, and have none of the characters with a meaning in
-    USD's paths. Entries must be stored without compression.
+    Names must stay inside the package, and have none of the characters with a meaning
+    in USD's paths. Entries must be stored without compression.
 
     Args:
         name: name of the package, for messages.
@@ -108,8 +108,8 @@ def _check_entries(name: str, archive: zipfile.ZipFile) -> None:
 def _check_without_gaps(name: str, archive: zipfile.ZipFile, content: bytes) -> None:
     """Reject a package with bytes between its files.
 
-    USD reads files one after the other, and ignores the index of the archive. Bytes in a
-    gap could be a file that USD reads and the checks do not see.
+    USD reads files one after the other, and ignores the index of the archive. Bytes in
+    a gap could be a file that USD reads and the checks do not see.
     """
     position = 0
     for entry in sorted(archive.infolist(), key=lambda entry: entry.header_offset):
@@ -188,7 +188,8 @@ class _LayerCheck:
         everything that is in it.
 
         Raises:
-            FileFormatError: a file is corrupt, names files elsewhere, or is over a limit.
+            FileFormatError: a file is corrupt, names files elsewhere, or is over a
+                limit.
         """
         pending = [self.file.resolve()]
         checked_files = dict[Path, None]()
@@ -352,8 +353,8 @@ class _LayerCheck:
 def format_error(error: Exception) -> str:
     """Return the message of an error of usd-core in one line.
 
-    It is the last line with a position ("12:5: ..."), or else the last text in quotation
-    marks, or else the last line.
+    It is the last line with a position ("12:5: ..."), or else the last text in
+    quotation marks, or else the last line.
     """
     text = str(error)
     lines = (

@@ -142,7 +142,8 @@ def _is_png_of_16_bits(data: bytes) -> bool:
 def _decode_png_of_16_bits(data: bytes, size: tuple[int, int]) -> Array:
     """Return the values (H, W, 4) in [0, 1] of a PNG file with 16 bits a channel.
 
-    All rows are compressed together. A row is one byte, its filter, and then its pixels.
+    All rows are compressed together. A row is one byte, its filter, and then its
+    pixels.
 
     Args:
         data: bytes of the file.

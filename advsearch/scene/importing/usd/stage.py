@@ -646,8 +646,8 @@ class Conversion:
     def _read_uvs(self, primvars: Any, layout: TextureLayout) -> MeshValues | None:
         """Return texture coordinates (N, 2) as glTF has them, v down, or None.
 
-        The material's transform of texture coordinates is applied. If the mesh lacks the
-        primvar, the fallback is used for all of it; without one the result is None.
+        The material's transform of texture coordinates is applied. If the mesh lacks
+        the primvar, the fallback is used for all of it; without one the result is None.
 
         Args:
             primvars: primvars of the mesh.
@@ -692,11 +692,11 @@ class Conversion:
     ) -> Iterator[tuple[int, MeshValues | None, Array]]:
         """Split faces with a material by their colors and opacities.
 
-        A material may take both from primvars, values of the mesh. If faces have at most
-        `MAX_TINTS` different colors, each color becomes a glTF material. If there are
-        more, or if colors change within a face, they become vertex colors. Opacities
-        always become materials, since our reader ignores the opacity of glTF's vertex
-        colors.
+        A material may take both from primvars, values of the mesh. If faces have at
+        most `MAX_TINTS` different colors, each color becomes a glTF material. If there
+        are more, or if colors change within a face, they become vertex colors.
+        Opacities always become materials, since our reader ignores the opacity of
+        glTF's vertex colors.
 
         Args:
             bound: the material.

@@ -364,9 +364,9 @@ class UsdSurfaces:
     def load_texels(self, use: UsdTextureUse) -> Array | None:
         """Return an image (H, W, 4) in linear values, before scale and bias.
 
-        The result is None, with a note, if it cannot be decoded. Images are cached until
-        the next material is converted, so that a material which uses one twice decodes
-        it once.
+        The result is None, with a note, if it cannot be decoded. Images are cached
+        until the next material is converted, so that a material which uses one twice
+        decodes it once.
         """
         key = (use.data, use.is_srgb)
         if key not in self._texels:
@@ -760,8 +760,8 @@ class PreviewSurface:
 
         Each comes from a primvar (numbers on the mesh), a texture or a value. glTF has
         one texture for both, so an opacity texture with other texture coordinates than
-        the color's is left out. If the material has an opacity threshold, the opacity is
-        a mask; otherwise it is blended.
+        the color's is left out. If the material has an opacity threshold, the opacity
+        is a mask; otherwise it is blended.
 
         Args:
             entry: the glTF material.
@@ -1001,9 +1001,9 @@ class PreviewSurface:
     def _add_normal(self, entry: dict[str, Any]) -> None:
         """Fill in the normal map.
 
-        An image of 8 bits is copied if its scale and bias are 2 and -1, as glTF implies.
-        Others are decoded and written anew. A single normal for all of the surface, or
-        an image of one channel, is left out with a note.
+        An image of 8 bits is copied if its scale and bias are 2 and -1, as glTF
+        implies. Others are decoded and written anew. A single normal for all of the
+        surface, or an image of one channel, is left out with a note.
 
         Args:
             entry: the glTF material.
