@@ -41,6 +41,10 @@ bpy.ops.export_scene.gltf(
 def convert_blend(path: Path, data: bytes) -> bytes:
     """Convert a Blender file to binary glTF.
 
+    Args:
+        path: the file, which Blender reads itself.
+        data: its bytes, of which only the first are checked.
+
     Raises:
         FileFormatError: it is no Blender file, Blender is not installed, cannot read
             it, or takes too long.

@@ -110,7 +110,7 @@ def find_advice(path: Path) -> str | None:
             return f"{kind}: {_make_blender_advice(path, operator)}"
     if suffix == ".bin":
         return _make_buffer_advice(path)
-    # what stands in the braces of `FORMAT_ADVICE`: the file, and what is made of it
+    # values for the braces in `FORMAT_ADVICE`: the file, and names of converted files
     names = {"file": shlex.quote(path.name)} | {
         name: shlex.quote(f"{path.stem}.{name}") for name in ("obj", "stl", "glb")
     }
@@ -131,7 +131,12 @@ def _make_buffer_advice(path: Path) -> str:
 
 
 def _make_blender_advice(path: Path, operator: str) -> str:
-    """Return the command by which Blender converts a file to glTF."""
+    """Return the command by which Blender converts a file to glTF.
+
+    Args:
+        path: the file.
+        operator: Blender's importer, such as "bpy.ops.import_scene.fbx".
+    """
     target = json.dumps(f"{path.stem}.glb")
     script = (
         "import bpy; bpy.ops.wm.read_factory_settings(use_empty=True); "
@@ -205,8 +210,13 @@ def read_bytes(path: Path, what: str, suffixes: Sequence[str]) -> bytes:
 def _check_suffix(path: Path, what: str, suffixes: Sequence[str]) -> None:
     """Raise FileFormatError for a directory, or a file with another suffix.
 
-    The message has advice: to leave out a `#part` that the kind of file cannot have, or
-    how to convert the file.
+    The message has advice: to leave out a `#part` that this kind of file cannot have,
+    or how to convert the file.
+
+    Args:
+        path: the file.
+        what: what it should hold, such as "object", for messages.
+        suffixes: suffixes that it may have, in lower case with the dot.
     """
     if path.is_dir():
         raise FileFormatError(
@@ -235,7 +245,10 @@ def _check_suffix(path: Path, what: str, suffixes: Sequence[str]) -> None:
 
 
 def _make_missing_file_hint(path: Path, suffixes: Sequence[str]) -> str:
-    """Return a sentence that helps to find a missing file, with a blank before it."""
+    """Return a sentence that helps to find a missing file, with a blank before it.
+
+    It names up to three files of the folder with similar names and one of the suffixes.
+    """
     if not path.parent.is_dir():
         return f" The folder {path.parent} does not exist either."
     name_by_lower_case = {}
@@ -335,7 +348,10 @@ class UniqueNames:
         self._last: dict[str, int] = {}
 
     def make_unique(self, requested: str) -> str:
-        """Return a name, with the first free number behind it if it is used already."""
+        """Return a name, with the first free number behind it if it is used already.
+
+        A second "wheel" becomes "wheel-2".
+        """
         base = sanitize_name(requested)
         name = base
         suffix_number = self._last.get(base, 1)

@@ -123,9 +123,9 @@ def join_parts(
 ) -> TriangleSoup:
     """Join parts into one soup of unit extent with welded points.
 
-    A vertex v becomes turn (v - low) / extent, with low the lowest corner of the
-    bounding box and extent its largest side. Vertices that no face has count for
-    neither. Normals are turned likewise, and become unit vectors.
+    A vertex v becomes turn (v - lower_corner) / extent, where lower_corner is the lower
+    corner of the bounding box and extent its largest side. The box is that of the
+    vertices which faces use. Normals are rotated too, and become unit vectors.
 
     Args:
         parts: at least one.
@@ -200,8 +200,8 @@ def _weld(vertices: Float64Array) -> tuple[Float64Array, IntArray]:
     # Imported late, as in `parts`.
     from scipy.spatial import cKDTree
 
-    # Equal vertices first, then near ones: chains of near points become one cluster,
-    # and its first point stands for all.
+    # Equal vertices are merged first, which leaves fewer points for the search of near
+    # ones. A chain of near points becomes one cluster; its first point replaces all.
     first_vertex, point_of_vertex = find_unique_rows(vertices)
     points = vertices[first_vertex]
     pairs = cKDTree(points).query_pairs(WELD_DISTANCE, output_type="ndarray")
@@ -218,7 +218,7 @@ def _weld(vertices: Float64Array) -> tuple[Float64Array, IntArray]:
 def find_unique_rows(rows: npt.NDArray[Any]) -> tuple[IntArray, IntArray]:
     """Find the distinct rows of an array (N, k), in rising order.
 
-    As `numpy.unique(rows, axis=0)`, but in a third of the time. Rows must have no NaN.
+    It is `numpy.unique(rows, axis=0)` in a third of the time. Rows must have no NaN.
 
     Returns:
         The index of the first row of each distinct one (U,), and which of these each
@@ -262,6 +262,11 @@ def repair(soup: TriangleSoup, source: str, notes: Notes) -> TriangleSoup:
     Faces without area are removed, the winding becomes consistent and outward, and
     every normal has unit length and is on the front of its face.
 
+    Args:
+        soup: the soup, of extent 1.
+        source: name of the file, for messages.
+        notes: notes about the file, to which the changes are added.
+
     Raises:
         InputError: no face has an area; the message names the file, `source`.
     """
@@ -282,13 +287,15 @@ def repair(soup: TriangleSoup, source: str, notes: Notes) -> TriangleSoup:
 def assemble(soup: TriangleSoup) -> tuple[Mesh, IntArray | None]:
     """Return the soup as a mesh, and the stored vertex of each of its vertices.
 
-    Corners with the same point, normal and UV, and the same stored vertex if that is
-    known, become one vertex.
+    Corners become one vertex if they have the same point, normal and UV, and also the
+    same stored vertex, where that is known. The stored vertex is the index of the
+    vertex in the file's concatenated parts; without it the second value is None.
     """
     # Adding 0 turns -0.0 into 0.0, which has other bits.
     normals = (soup.normals.astype(np.float32) + np.float32(0.0)).reshape(-1, 3)
     uvs = (soup.uvs.astype(np.float32) + np.float32(0.0)).reshape(-1, 2)
     corners = soup.faces.reshape(-1)
+    # Floats are compared by their bits, as integers.
     keys = np.column_stack([corners, normals.view(np.int32), uvs.view(np.int32)])
     if soup.stored_vertices is not None:
         keys = np.column_stack([keys, soup.stored_vertices.reshape(-1)])
@@ -310,8 +317,8 @@ def assemble(soup: TriangleSoup) -> tuple[Mesh, IntArray | None]:
 def _fix_winding(soup: TriangleSoup, notes: Notes) -> TriangleSoup:
     """Return the soup with consistent and outward winding, and note the changes.
 
-    Faces wound against their neighbours are turned over first, then shells that are
-    inside out.
+    Faces wound against their neighbours are turned over first. Then shells that are
+    inside out are turned over. A shell is a set of faces that are connected by edges.
     """
     is_turned, shell, has_moebius_strip = _find_turned_faces(soup)
     if is_turned.any():
@@ -337,9 +344,9 @@ def find_shared_edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
     """Find the edges that belong to exactly two faces (F, 3).
 
     Returns:
-        For each edge (E,) the corner in either face at which it starts (3 face + k);
-        and whether both faces run along it in the same direction, that is, disagree in
-        winding.
+        For each edge (E,) two corners: the one of each face at which the edge starts,
+        as 3 face + k; and whether both faces run along the edge in the same direction.
+        Then they disagree in winding.
     """
     # The side k of a face runs from its corner k to the next one.
     start = faces.reshape(-1)
@@ -363,10 +370,11 @@ def find_shared_edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
 def _link_windings(
     left_face: IntArray, right_face: IntArray, same_direction: BoolArray
 ) -> tuple[IntArray, IntArray]:
-    """Return the links (2 E) between the nodes of faces, see `_find_turned_faces`.
+    """Return the links (2 E) of the graph that `_find_turned_faces` uses.
 
-    Face f is the nodes 2 f, "as it is", and 2 f + 1, "turned". Each edge has two links:
-    between the nodes of its two faces that agree with one another in winding.
+    Each face f has two nodes, 2 f for "as it is" and 2 f + 1 for "turned". Each shared
+    edge makes two links. A link joins the states of its two faces that agree in
+    winding.
 
     Args:
         left_face: one face of each shared edge.
@@ -387,9 +395,12 @@ def _select_larger_choice(
 ) -> BoolArray:
     """Return which faces (F,) to turn over, so that most area of each shell stays.
 
+    A shell has two consistent windings, its choices, which are numbered. One leaves a
+    face as it is, and the other turns it over.
+
     Args:
-        as_is: (F,) for each face the choice, for its shell, that leaves it as it is.
-        turned: (F,) the reverse choice, which turns it over.
+        as_is: (F,) for each face the choice that leaves it as it is.
+        turned: (F,) the choice that turns it over.
         area: (F,) twice the area of each face.
     """
     n_choices = int(max(as_is.max(), turned.max())) + 1
@@ -406,11 +417,11 @@ def _select_larger_choice(
 def _find_turned_faces(soup: TriangleSoup) -> tuple[BoolArray, IntArray, bool]:
     """Decide which faces to turn over so that neighbours agree in winding.
 
-    Every face is two nodes of a graph, "as it is" (2 f) and "turned" (2 f + 1).
-    Neighbours that agree are linked like to like, others crosswise. So a component is a
-    choice for all faces of a shell, and the shell's other component is the reverse
-    choice. If both are one component, the shell is one-sided. Each shell keeps the
-    winding of most of its area.
+    Every face f has two nodes in a graph: 2 f for "as it is" and 2 f + 1 for "turned".
+    If two neighbours agree, their equal nodes are linked; otherwise the opposite ones.
+    So a connected component is a consistent choice for all faces of a shell, and the
+    shell's other component is the reverse choice. If both are the same component, the
+    shell is one-sided. Of both choices, the one that turns less area over is taken.
 
     Returns:
         Which faces (F,) to turn over; the shell of each face (F,); and whether some
@@ -446,8 +457,13 @@ def _find_closed_shells(
 ) -> BoolArray:
     """Return for each shell (S,) whether all its edges belong to two of its faces.
 
-    Then twice the number of its shared edges is its number of sides, three for each
-    face. `shell` is (F,), `face_counts` (S,).
+    In a closed shell of n faces, the 3 n sides of the faces are paired into edges, so
+    that twice the number of shared edges is 3 n.
+
+    Args:
+        soup: the faces.
+        shell: (F,) the shell of each face.
+        face_counts: (S,) the number of faces of each shell.
     """
     left_corner, _, _ = find_shared_edges(soup.faces)
     edge_shell = shell[left_corner // 3]  # corner c is a corner of face c // 3
@@ -458,12 +474,13 @@ def _find_closed_shells(
 def _find_inside_out_shells(soup: TriangleSoup, shell: IntArray) -> BoolArray:
     """Return for each shell (S,) whether it must be turned over.
 
-    A closed shell, all of whose edges belong to exactly two of its faces, is turned if
-    its signed volume is negative. An exception is one within another closed shell: it
-    is taken for the wall of a hollow, and stays, unless the file's normals say
-    otherwise. If the signed volume of all closed shells together is negative, the whole
-    object counts as inside out: everything is turned, and the rule holds for the
-    result. An open sheet is turned if the file's normals point away from its front.
+    A closed shell, all of whose edges belong to exactly two of its faces, is turned
+    over if its signed volume is negative. An exception is a shell inside another closed
+    shell: it is taken for the wall of a hollow space, and stays as it is, unless the
+    file's normals point the other way. If the signed volume of all closed shells
+    together is negative, the full object counts as inside out: all of it is turned
+    over, and then the same rule is applied to the result. An open sheet is turned over
+    if the file's normals point away from its front.
 
     Args:
         soup: a soup whose neighbours agree in winding.
@@ -479,8 +496,8 @@ def _find_inside_out_shells(soup: TriangleSoup, shell: IntArray) -> BoolArray:
     face_agreement = np.nan_to_num(corner_agreement).sum(axis=1)
     agreement = np.bincount(shell, weights=face_agreement, minlength=n_shells)
     lower, upper = _compute_shell_bounds(soup, shell, n_shells)
-    # If most of the volume is negative, the whole object counts as turned first, and
-    # `is_inverted` is about what is inside out after that.
+    # If most of the volume is negative, the full object is turned over first. Then
+    # `is_inverted` tells which shells are inside out after that.
     mostly_negative = volume[is_closed].sum() < 0.0
     is_inverted = (volume < 0.0) ^ mostly_negative
     for index in np.flatnonzero(is_closed & is_inverted):
@@ -491,13 +508,13 @@ def _find_inside_out_shells(soup: TriangleSoup, shell: IntArray) -> BoolArray:
         )
         if not is_enclosing.any():
             continue  # it stays inverted
-        # The wall of a hollow stays unless the file's normals point against it. Where
-        # the whole was turned, agreement before that is disagreement now.
+        # The wall of a hollow space stays unless the file's normals point the other
+        # way. If the full object was turned over, agreement before is disagreement now.
         if mostly_negative:
             is_inverted[index] = agreement[index] > 0.0
         else:
             is_inverted[index] = agreement[index] < 0.0
-    # What is inverted after a turn of the whole is right without any turn.
+    # Turned over twice, as part of the full object and by itself, a shell is as before.
     return np.where(is_closed, is_inverted ^ mostly_negative, agreement < 0.0)
 
 
@@ -532,10 +549,12 @@ def _compute_signed_volumes(
 def _fix_normals(soup: TriangleSoup, notes: Notes) -> TriangleSoup:
     """Return the soup with a normal on the front of its face at every corner.
 
-    The file's normals are kept if they are on the front of their faces on most of the
-    surface (`MIN_NORMAL_AGREEMENT`), and all reversed if they are on the back on most
-    of it; otherwise all are computed anew. A single one that is missing, or on the back
-    of its face, is computed too: smooth, or that of the face where a part is flat.
+    If the file's normals are on the front of their faces on almost all of the surface
+    (`MIN_NORMAL_AGREEMENT`), they are used. If they are on the back on almost all of
+    it, they are all reversed. Otherwise all are computed.
+
+    A single normal that is missing, or on the back of its face, is computed too. A
+    computed normal is smooth, or in a part with flat shading that of the face.
     """
     vectors = soup.compute_face_vectors()
     area = np.linalg.norm(vectors, axis=1)
@@ -574,10 +593,10 @@ def _compute_cosines(
 def compute_smooth_normals(soup: TriangleSoup) -> Float64Array:
     """Compute unit normals of corners (F, 3, 3), smooth except across creases.
 
-    At each point, the faces that can be reached from one another over edges with less
-    than the crease angle share one normal: the mean of their normals weighted by their
-    angles at that point (Thuermer and Wuethrich 1998). Corners are the nodes of a
-    graph, and a smooth edge links the two corners at either end of it.
+    At each point, faces share one normal if they are connected by edges whose angle is
+    below the crease angle. It is the mean of their normals, weighted by their angles at
+    that point (Thuermer and Wuethrich 1998). To find these faces, corners are the nodes
+    of a graph, in which a smooth edge links the two corners at each of its ends.
     """
     face_normals = normalize_vectors(soup.compute_face_vectors())
     left_corner, right_corner, same_direction = find_shared_edges(soup.faces)
@@ -632,7 +651,8 @@ def normalize_vectors(vectors: Float64Array) -> Float64Array:
     Vectors without a direction become NaN.
     """
     with np.errstate(all="ignore"):
-        # First by the largest entry, so that squares neither overflow nor vanish.
+        # Divide by the largest entry first, so that squares neither overflow nor
+        # vanish.
         largest = np.abs(vectors).max(axis=-1, keepdims=True)
         scaled = vectors / largest
         unit_vectors = scaled / np.linalg.norm(scaled, axis=-1, keepdims=True)
@@ -644,8 +664,11 @@ def normalize_vectors(vectors: Float64Array) -> Float64Array:
 def find_components(count: int, edge_starts: IntArray, edge_ends: IntArray) -> IntArray:
     """Return the connected component (count,) of each node of a graph.
 
-    Components are numbered from 0. Edges are between the nodes `edge_starts` (E,) and
-    `edge_ends` (E,), in no direction.
+    Components are numbered from 0.
+
+    Args:
+        count: number of nodes.
+        edge_starts, edge_ends: (E,) the two nodes of each edge, in either order.
     """
     # Imported late, as in `parts`.
     from scipy.sparse import coo_array, csgraph
@@ -673,8 +696,14 @@ def triangulate_and_note(
     """Triangulate polygons, and note those that may be wrong or have fewer than 3
     corners.
 
-    Arguments and results are those of `triangulate`, without the number of wrong
-    polygons.
+    Args:
+        points: (C, 3) the corners of all polygons, concatenated; may be NaN.
+        counts: (P,) the number of corners of each polygon.
+        notes: notes about the file, to which sentences are added.
+
+    Returns:
+        The corners of the triangles (T, 3), as indices into `points`; and the polygon
+        of each triangle (T,).
     """
     n_degenerate = int((counts < 3).sum())
     if n_degenerate:
@@ -694,9 +723,9 @@ def triangulate(
 ) -> tuple[IntArray, IntArray, int]:
     """Triangulate polygons.
 
-    If the triangles from a polygon's first corner all face as the polygon does (it is
-    convex, mostly), these are taken. Otherwise ears are cut off (Meisters 1975) in the
-    plane that the polygon lies in on average (Newell).
+    A polygon is first divided into a fan of triangles from its first corner. That is
+    right if all of them face as the polygon does, as in any convex polygon. Otherwise
+    ears are cut off (Meisters 1975) in the polygon's mean plane (Newell's method).
 
     Args:
         points: (C, 3) the corners of all polygons, concatenated; may be NaN.
@@ -705,16 +734,15 @@ def triangulate(
 
     Returns:
         The corners of the triangles (T, 3), as indices into `points`, in the order of
-        the polygons; the polygon of each triangle (T,); and the number of polygons of
-        which some triangles may be outside, because they cross themselves or were too
-        much work.
+        the polygons; the polygon of each triangle (T,); and the number of polygons that
+        may be divided wrongly, because they cross themselves or were too much work.
     """
     starts = np.cumsum(counts) - counts  # the first corner of each polygon
     triangles = []
     owners = []
     n_wrong = 0
     budget = MOST_WORK  # comparisons of points with ears, for all polygons
-    for count in np.unique(counts):  # those with as many corners are done at once
+    for count in np.unique(counts):  # polygons with equally many corners, in parallel
         if count < 3:
             continue
         polygons = np.flatnonzero(counts == count)
@@ -739,8 +767,8 @@ def _triangulate_equal(
 ) -> tuple[IntArray, int, int]:
     """Triangulate polygons (P, n) with the same number of corners.
 
-    First all triangles from the first corner (a fan). Of a convex polygon they all have
-    a positive area; of the others, ears are cut off instead.
+    Each polygon is divided into a fan of triangles from its first corner. If one of
+    these has no positive area, the polygon is not convex, and ears are cut off instead.
 
     Args:
         points: (C, 3).
@@ -832,7 +860,8 @@ class _EarCutter:
         self.tip = np.zeros(count, dtype=np.int64)
         self.n_tries = np.zeros(count, dtype=np.int64)
         self.is_failed = np.zeros(count, dtype=np.bool_)
-        # areas of the triangles from the origin to each side add up to the polygon's
+        # The signed areas of the triangles between the origin and each side add up to
+        # the area of the polygon.
         successors = np.roll(flat, -1, axis=1)
         doubled_areas = _compute_doubled_areas(flat, successors, np.zeros(2))
         self.area = np.abs(doubled_areas.sum(axis=1))
@@ -866,9 +895,9 @@ class _EarCutter:
     ) -> BoolArray:
         """Return which active polygons lose their corner b, between a and c.
 
-        They do if b is the tip of an ear, or one of the last three corners. As a
-        failure, which is recorded, they also do if all corners were tried without an
-        ear, or once the budget is spent.
+        A polygon loses it if b is the tip of an ear, or if only three corners are left.
+        It also loses it, and counts as failed, if all corners were tried without
+        finding an ear, or once the budget is spent.
 
         Args:
             a, b, c: (active,) three successive corners of each active polygon.
@@ -890,10 +919,14 @@ class _EarCutter:
         return np.asarray(is_cut | is_hopeless)
 
     def _cut(self, rows: IntArray, a: IntArray, b: IntArray, c: IntArray) -> None:
-        """Cut the ears a, b, c off the polygons in `rows`, (N,) each.
+        """Cut an ear off each of some polygons.
 
-        The triangle is stored, and b is taken out of the linked list of corners and of
-        the dents.
+        The triangle is stored, and its tip b is removed from the linked list of corners
+        and from the dents.
+
+        Args:
+            rows: (N,) the polygons.
+            a, b, c: (N,) the corners of the ear: the tip b and its neighbours.
         """
         self.triangles[rows, self.n_cut[rows]] = np.stack([a, b, c], axis=1)
         self.is_present[rows] &= self.dent[rows] != b[:, None]
@@ -931,8 +964,8 @@ def _find_dents(flat: Float64Array, area: Float64Array) -> tuple[IntArray, BoolA
     Only these can lie in an ear. `area` is twice the area of each polygon.
 
     Returns:
-        Corners (P, d), d as many as any polygon has, those that are not convex first;
-        and which are not convex.
+        The corners (P, d), where d is the largest number of such corners in a polygon,
+        padded with convex corners; and which of these are not convex.
     """
     previous = np.roll(flat, 1, axis=1)
     following = np.roll(flat, -1, axis=1)
@@ -954,7 +987,7 @@ def _is_ear(
     """Return which triangles have an area and contain no present point, (P,).
 
     A point is inside if it is on the left of all three sides, which run
-    counter-clockwise; on a side counts as inside.
+    counter-clockwise. A point on a side counts as inside, one at a corner does not.
 
     Args:
         corners: the three corners of each triangle, (P, 2) each.

@@ -97,8 +97,11 @@ def _check_node_lights(path: Path, header: Header, content: dict[str, Any]) -> N
 def _parse_content(path: Path, chunk: bytes) -> dict[str, Any]:
     """Parse the JSON of a header, which must have an asset.
 
-    It is checked before that it is not too large: commas and brackets are counted as an
-    upper bound of its values. Raises FileFormatError.
+    Before it is parsed, its size is limited: commas and opening brackets are counted,
+    which is an upper bound for the number of values.
+
+    Raises:
+        FileFormatError: it is too large, no JSON, or no glTF.
     """
     text = decode_text(chunk)
     # Each value follows a comma, or the bracket that begins its list or object.
@@ -124,7 +127,10 @@ def _parse_content(path: Path, chunk: bytes) -> dict[str, Any]:
 
 
 def _make_entry_error(path: Path, error: ValidationError) -> FileFormatError:
-    """Return the error for the first entry of a header that is invalid."""
+    """Return the error for the first entry of a header that is invalid.
+
+    It names the entry, as in "meshes[0].primitives[1].mode".
+    """
     first_error = error.errors(include_url=False)[0]
     # As in "meshes[0].primitives[1].mode".
     keys = (
@@ -158,7 +164,7 @@ def _find_extensions(path: Path, content: JsonValue) -> set[str]:
         FileFormatError: some are no objects.
     """
     extensions: set[str] = set()
-    # A walk through all lists and objects but `extras`, which are free.
+    # Walk through all lists and objects except `extras`, which may hold anything.
     pending: list[JsonValue] = [content]
     while pending:
         entry = pending.pop()
@@ -182,8 +188,10 @@ def _find_extensions(path: Path, content: JsonValue) -> set[str]:
 def _split_chunks(path: Path, data: bytes) -> tuple[bytes, bytes | None]:
     """Return the JSON of a file, and the binary chunk of a .glb file or None.
 
-    A .glb has a header, then chunks with a header each (glTF 2.0, section 4.4). Raises
-    FileFormatError if it is shorter than it states.
+    A .glb has a header, then chunks with a header each (glTF 2.0, section 4.4).
+
+    Raises:
+        FileFormatError: it is no .glb of version 2, or shorter than it states.
     """
     if path.suffix.lower() == ".gltf":
         return data, None
@@ -216,8 +224,12 @@ def _split_chunks(path: Path, data: bytes) -> tuple[bytes, bytes | None]:
 def _read_binary_chunk(data: bytes, chunk_start: int, file_end: int) -> bytes | None:
     """Return the content of the binary chunk of a .glb file; None if it has none.
 
-    `chunk_start` is the position of the chunk's header, which follows the JSON, and
-    `file_end` the end that the file states. The content may be cut short.
+    The content may be cut short; that is reported when it is read.
+
+    Args:
+        data: the bytes of the file.
+        chunk_start: position of the chunk's header, which follows the JSON.
+        file_end: end of the file, as it states.
     """
     content_start = chunk_start + _CHUNK_HEADER_SIZE
     if content_start > file_end:
@@ -301,7 +313,8 @@ def check_header(path: Path, header: Header) -> None:
         for entry in header.accessors
     )
     view_size = sum(view.byteLength for view in header.bufferViews)
-    # Accessors may share a view or have none (zeros), and views may hold images.
+    # Both sums are limited. Accessors may share a view, or have none and be zeros, and
+    # views may also hold images, so neither sum bounds the other.
     check_most(
         path,
         max(view_size, sum(accessor_sizes)),
@@ -335,11 +348,14 @@ def find_unread_extensions(entry: Entry) -> list[str]:
 
 
 def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
-    """Check the accessors of a primitive; raise FileFormatError if one is wrong.
+    """Check the accessors of a primitive.
 
     Types have to be those of the format, attributes need as many values as positions,
-    and indices are unsigned integers. An accessor without numbers is an error if an
-    extension that is not supported may have them, compressed.
+    and indices have to be unsigned integers. An accessor without data is an error if
+    the primitive has an unsupported extension: that may hold the data, compressed.
+
+    Raises:
+        FileFormatError: an accessor is wrong, or an extension is needed.
     """
     attributes = {
         name: header.accessors[index] for name, index in primitive.attributes.items()
@@ -406,9 +422,11 @@ def _check_attributes(
 def _check_tree(path: Path, header: Header) -> None:
     """Check the number of triangles and primitives, and that nodes form trees.
 
-    A mesh counts as often as nodes draw it, and once if none does. Nodes have one
-    parent at most, no cycles, and are at most `DEEPEST_TREE` deep. Raises
-    FileFormatError.
+    A mesh counts as often as nodes draw it, and once if none does. Nodes must have one
+    parent at most, form no cycles, and be at most `DEEPEST_TREE` deep.
+
+    Raises:
+        FileFormatError: nodes are no trees, or a limit is exceeded.
     """
     children = _find_children(path, header)
     _check_tree_sizes(path, header)
@@ -463,8 +481,8 @@ def _check_tree_sizes(path: Path, header: Header) -> None:
 def _count_max_triangles(header: Header, primitive: Primitive) -> int:
     """Return an upper bound of the number of triangles of a primitive.
 
-    Triangles have three corners of their own (mode 4); strips and fans one for each
-    further corner.
+    In mode 4 each triangle has three corners of its own. In strips and fans each corner
+    after the first two makes a triangle.
     """
     index = primitive.indices
     if index is None:
@@ -500,6 +518,7 @@ class GltfFile:
     """
 
     def __init__(self, path: Path, data: bytes) -> None:
+        """Read the header; buffers are loaded when they are first used."""
         self.path = path
         self.header = read_header(path, data)
         self.references = References(path)
@@ -541,8 +560,11 @@ class GltfFile:
     def _load_buffer(self, index: int) -> bytes:
         """Return the bytes of a buffer, which are loaded on first use.
 
-        They are those of its URI, or for the first buffer of a .glb file its binary
-        chunk. Raises FileFormatError if there are none.
+        They are those that its URI names. The first buffer of a .glb file may have no
+        URI: it is the binary chunk.
+
+        Raises:
+            FileFormatError: the buffer has no data, or its file is missing.
         """
         if index in self._buffers:
             return self._buffers[index]
@@ -585,8 +607,8 @@ class GltfFile:
     def read_values(self, index: int) -> npt.NDArray[Any]:
         """Return the values (count, width) of an accessor as they are stored.
 
-        They are zeros, or those of the buffer view; sparse values replace some rows
-        (section 3.6.2.3).
+        They are those of the buffer view, or zeros if the accessor has none. Sparse
+        values replace some of the rows (section 3.6.2.3).
 
         Raises:
             FileFormatError: they reach beyond their view.
@@ -691,8 +713,8 @@ class GltfFile:
     def read_numbers(self, index: int, rows: IntArray) -> Float64Array:
         """Return rows (N,) of an accessor as float64 (N, width).
 
-        Normalised integers are converted to the numbers in [-1, 1] for which they
-        stand.
+        Normalised integers become numbers in [-1, 1]: they are divided by the largest
+        value of their type. The smallest signed one would be below -1, and is clipped.
         """
         values = self.read_values(index)[rows]
         numbers: Float64Array = values.astype(np.float64)

@@ -87,9 +87,11 @@ class Entry(BaseModel):
 
     @classmethod
     def list_extension_keys(cls) -> dict[str, set[str]]:
-        """Return the keys that are read of each extension.
+        """Return, for each extension of this type of entry, the keys that are read.
 
-        They are empty if an extension is an entry itself.
+        They are those to which fields are aliased: for a node
+        `{"KHR_lights_punctual": {"light"}}`. The set is empty if a field is the
+        extension itself, as an entry of its own.
         """
         keys_of_extension: dict[str, set[str]] = {}
         for info in cls.model_fields.values():
@@ -102,8 +104,8 @@ class Entry(BaseModel):
     def iterate_references(self) -> Iterator[tuple[str, int]]:
         """Yield a list of the header, and an index in it, for each reference.
 
-        References are fields named in `REFERENCED_LISTS`: an index, or lists or
-        dictionaries of some.
+        References are fields named in `REFERENCED_LISTS`. Their values are an index, or
+        lists or dictionaries of indices.
         """
         for name, value in vars(self).items():
             queue: list[Any] = [value] if name in REFERENCED_LISTS else []
@@ -370,7 +372,8 @@ class MaterialEntry(Entry):
     def surface(self) -> MetallicRoughness:
         """Base color, roughness and metallic.
 
-        Those of KHR_materials_pbrSpecularGlossiness have its diffuse color.
+        A material of KHR_materials_pbrSpecularGlossiness is read as one without metal:
+        the base color is its diffuse color, and roughness is 1 - glossiness.
         """
         glossy = self.glossiness
         if glossy is None:

@@ -89,8 +89,12 @@ def note_left_out(header: Header, notes: Notes) -> None:
     """Note what a file has that is not imported.
 
     These are sentences of the converter from OpenUSD, extensions, and then maps,
-    materials, scenes, nodes and keys that are not read. It is the same whether one node
-    of the file or all of it is the object.
+    materials, scenes, nodes and keys that are not read. The notes do not depend on
+    whether the object is one node of the file or the full file.
+
+    Args:
+        header: the parsed JSON of the file.
+        notes: notes about the file, to which sentences are added.
     """
     _note_converter_sentences(header, notes)
     _note_extensions(header, notes)
@@ -119,7 +123,8 @@ def _note_extensions(header: Header, notes: Notes) -> None:
         notes.warn(
             f" has Gaussian splats, which are left out: a model that {SPLATS_ADVICE}"
         )
-    # Of some supported extensions a part is left out: these have a note of their own.
+    # Some supported extensions are read only in part; `EXTENSION_NOTES` has a sentence
+    # about each of these.
     partly_read = used_extensions & set(EXTENSION_NOTES)
     unread = used_extensions - set(SUPPORTED_EXTENSIONS)
     for name in sorted(partly_read | unread):
@@ -132,8 +137,8 @@ def _find_left_out_entries(header: Header) -> dict[str, Iterable[bool]]:
     """Find the maps, materials, scenes and nodes of a file that are left out.
 
     Returns:
-        A phrase about each kind, and for each entry whether it is left out; `{s}`
-        stands for the plural.
+        For each kind a phrase, in which `{s}` is the ending of the plural, such as
+        "occlusion map{s}: left out"; and for each entry whether it is left out.
     """
     roots: Iterable[int] = range(len(header.nodes))
     if header.scenes:
@@ -190,8 +195,8 @@ them.
 def _note_unread(header: Header, notes: Notes) -> None:
     """Note the keys of entries, and the attributes of primitives, that are not read.
 
-    Extensions that are understood have their own keys; others are noted elsewhere, by
-    their names.
+    Keys inside extensions that are read are noted too. All other extensions are noted
+    by name, in `_note_extensions`.
     """
     for entry in header.iterate_entries():
         kind = ENTRY_KINDS.get(type(entry).__name__)
@@ -200,7 +205,8 @@ def _note_unread(header: Header, notes: Notes) -> None:
                 notes.record(kind, key)
     for kind in set(ENTRY_KINDS.values()):
         is_of_material = "material" in kind or "texture" in kind
-        # Elsewhere, extras are notes of applications.
+        # In a material or a texture, extras may change how it looks. Elsewhere they are
+        # private data of applications, which need no note.
         for key in IGNORED_KEYS if is_of_material else {*IGNORED_KEYS, "extras"}:
             notes.mark_read(kind, key)
     for mesh in header.meshes:
@@ -214,8 +220,8 @@ def _find_unread_keys(entry: Entry) -> list[str]:
     extensions = keys.get_nested("extensions")
     for name, read_keys in entry.list_extension_keys().items():
         extension = extensions.get_nested(name)
-        # Without keys of its own, the extension is an entry, whose keys are noted as
-        # those of other entries are.
+        # Without a list of keys the extension is an `Entry` itself, whose unread keys
+        # are noted when it is iterated over. Here all of its keys count as read.
         all_keys = {key for key, _ in extension.items()}
         extension.mark_read(*(read_keys or all_keys))
     # Extensions that are not understood are noted once for the file.
@@ -224,7 +230,11 @@ def _find_unread_keys(entry: Entry) -> list[str]:
 
 
 def _note_unread_attributes(header: Header, primitive: Primitive, notes: Notes) -> None:
-    """Note the vertex attributes of a primitive that are not read."""
+    """Note the vertex attributes of a primitive that are not read.
+
+    Attributes of skins and Gaussian splats are left out here: the former are read, and
+    the latter have a note of their own.
+    """
     read_names = {"POSITION", "NORMAL", "COLOR_0", "TEXCOORD_0"}
     if primitive.material is not None:
         material = header.materials[primitive.material]
@@ -273,7 +283,7 @@ def describe_changed_lights(header: Header, file: str) -> list[str]:
 
 
 def _count_phrases(kinds: Mapping[str, Iterable[bool]]) -> list[str]:
-    """Return one phrase with a count for each kind of thing that is there at all.
+    """Return a phrase with a count, such as "2 cameras", for each kind that occurs.
 
     Args:
         kinds: for each phrase whether each thing is of that kind; {s} and {es} in it
@@ -320,6 +330,7 @@ class GltfSurfaces:
     texture_limit: int | None = None
 
     def __post_init__(self) -> None:
+        """Prepare to decode images, whose size depends on the number of materials."""
         materials = len(self.file.header.materials)
         self._images = FileImages(
             materials, self.file.references, self.notes, self.texture_limit
@@ -363,9 +374,9 @@ class GltfSurfaces:
     ) -> tuple[Float32Array | None, Float32Array | None]:
         """Return the base color (3 or 4,) and its texture (H, W, 3 or 4), in sRGB.
 
-        The factor multiplies the texture; opacity counts only in the modes that have
-        some. The color is None if it is plain white and there is a texture, even one
-        that is missing.
+        The base color factor multiplies the texture. Opacity, the fourth channel, is
+        there only for the alpha modes "MASK" and "BLEND". The color is None if it is
+        plain white and the material names a texture, even if its file is missing.
         """
         entry = material.surface
         stated_factor = entry.baseColorFactor
@@ -411,7 +422,9 @@ class GltfSurfaces:
         """Return the radiance (H, W, 3) that a material emits, or None.
 
         Its unit is that of environments, as in Blender (section 3.9.3, and
-        KHR_materials_emissive_strength).
+        KHR_materials_emissive_strength). It is None if the material emits no light, if
+        its texture cannot be read, or if it has other texture coordinates than the base
+        color.
         """
         factor = np.array(material.emission)
         use = material.emissiveTexture
@@ -432,6 +445,10 @@ class GltfSurfaces:
 
         The mean is taken over the faces that show the texture, or over all of it if
         they have no texture coordinates.
+
+        Args:
+            material: the material.
+            pieces: all primitives with the material.
         """
         entry = material.surface
         use = entry.metallicRoughnessTexture
@@ -452,10 +469,10 @@ class GltfSurfaces:
     def _load_image(
         self, use: TextureUse | None, kind: ImageKind, note_template: str
     ) -> Float32Array | None:
-        """Return the texels (H, W, C) of a texture, as they are to be shown.
+        """Return the texels (H, W, C) of a texture for a renderer that filters.
 
-        Of a texture that is not to be filtered each texel is repeated, so that
-        filtering is not visible; a large one is filtered, with a note.
+        If the file wants sharp texels (filter NEAREST), each texel is repeated, so that
+        filtering is not visible. A texture too large for that is filtered, with a note.
 
         Args:
             use: the texture; None returns None.
@@ -470,7 +487,8 @@ class GltfSurfaces:
         is_single_texel = texels is not None and texels.shape[:2] == (1, 1)
         if texels is None or not is_unfiltered or is_single_texel:
             return texels
-        # Each texel is repeated up to this size, where filtering is not visible.
+        # Texels are repeated until the image has up to this size. Then the texels of
+        # the result are so small that filtering is not visible.
         max_sharp_size = min(self._images.max_side, TEXTURE_LIMIT) // 2
         repeats = max_sharp_size // max(texels.shape[:2])
         if repeats < 2:
@@ -483,7 +501,11 @@ class GltfSurfaces:
     ) -> Float32Array | None:
         """Return the texels (H, W, C) of a texture as the file has them.
 
-        Arguments are those of `_load_image`.
+        Args:
+            use: the texture.
+            kind: what it holds, such as "colours".
+            note_template: the note if it has no texels, with `{name}` for the image and
+                `{why}` for the reason; then None is returned.
         """
         image_index = self.file.header.textures[use.index].image
         if image_index is None:
@@ -522,10 +544,15 @@ class GltfSurfaces:
         material: MaterialEntry,
         uvs: Sequence[Float64Array],
     ) -> tuple[ImportedSurface, Float64Array, Float64Array]:
-        """Make the images of a surface behave under repetition as their wrap modes say.
+        """Change a surface's images so that repeating them looks like their wrap modes.
 
-        The renderer repeats all textures. Mirrored images are doubled, clamped ones and
-        those with a border are padded, as far as texture coordinates reach.
+        The renderer repeats all textures. Mirrored images are doubled. Clamped images
+        and those with a border are padded, as far as texture coordinates reach.
+
+        Args:
+            surface: the surface.
+            material: its material in the file, which has the wrap modes.
+            uvs: texture coordinates (V, 2) of all primitives with the material.
 
         Returns:
             The surface, and the scale (2,) and shift (2,) of texture coordinates.
@@ -606,7 +633,8 @@ class GltfSurfaces:
         if reaches_out and len(set(wraps)) > 1:
             self.notes.warn(EDGES_NOTE)
         if first_wrap == gltf_entries.BORDER and reaches_out:
-            # Filtering blends the border with half a texel: texels become small.
+            # Filtering blends the border into half a texel of the image. With smaller
+            # texels that is not visible.
             images = [_enlarge(image, axis) for image in images]
         if first_wrap == gltf_entries.MIRRORED and reaches_out:
             # An image of twice the size, of which old coordinates cover a half.
@@ -709,6 +737,10 @@ def _average_where_visible(
     """Return the mean (C,) of an image over the faces of some primitives that show it.
 
     It is the mean of all texels if no primitive has texture coordinates for it.
+
+    Args:
+        image: (H, W, C) values.
+        pieces: the primitives with the material.
     """
     mapped_parts = [
         (piece.part, piece.packed_uvs)
@@ -730,7 +762,8 @@ def _average_where_visible(
 def _edges_differ(image: Float32Array, axis: int) -> bool:
     """Return whether a repeated image would blend visibly at its edges along an axis.
 
-    Only in small images half a texel at an edge is visible.
+    Filtering blends half a texel at an edge with the opposite edge. That is visible
+    only in small images, and only if the two edges differ.
     """
     if image.shape[axis] > SMALL_IMAGE_SIZE:
         return False
@@ -742,7 +775,11 @@ def _pad(
 ) -> Float32Array:
     """Pad an image along an axis by a number of texels before and after it.
 
-    The pad has the value `border`, or repeats the texel at the edge if that is None.
+    Args:
+        image: (H, W, C) texels.
+        axis: axis of the array, 0 for rows.
+        before, after: width of the pads in texels.
+        border: (1,) or (C,) value of the pads; None repeats the texel at the edge.
     """
     size = image.shape[axis]
     texel_index = np.clip(np.arange(-before, size + after), 0, size - 1)
@@ -766,7 +803,8 @@ def _enlarge(picture: Float32Array, axis: int) -> Float32Array:
     factor = -(-SMALL_IMAGE_SIZE // size)
     if factor == 1:
         return picture
-    # of the new texels' centers, in old texels with integers at their centers
+    # Positions of the new texels' centers, in units of old texels. The centers of old
+    # texels are at integers.
     position = ((np.arange(size * factor) + 0.5) / factor - 0.5).clip(0.0, size - 1.0)
     lower = np.floor(position).astype(np.int64)
     shape = [1] * picture.ndim
@@ -830,8 +868,13 @@ def _select_with_faces(
 def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     """Read the primitives of a glTF file that its nodes draw, as one part each.
 
-    Arguments, results and errors are those of all readers
-    (`advsearch.scene.importing.objects.read_parts`).
+    Args:
+        path: path of the file.
+        data: its bytes, of a .gltf or a .glb file.
+        notes: notes about the file, to which sentences are added.
+
+    Raises:
+        FileFormatError: the file is corrupt, or no primitive has faces.
     """
     file = GltfFile(path, data)
     header = file.header
@@ -851,6 +894,7 @@ def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
         _note_skeleton(skeleton, notes)
 
     parts = _pose_parts(file, instances, parts_by_key, with_faces, skins, skeleton)
+    # The faces of a mesh count as often as nodes draw it.
     check_faces(path, sum(len(part.faces) for part in parts))
     return parts
 
@@ -866,9 +910,15 @@ class SkinPose(NamedTuple):
 def _read_pieces(
     file: GltfFile, mesh_nodes: Sequence[int]
 ) -> dict[PrimitiveKey, PrimitiveData | None]:
-    """Read the primitives that some nodes draw, by mesh and index in the mesh.
+    """Read the primitives that some nodes draw.
 
-    None is a primitive that is not made of faces.
+    Args:
+        file: the glTF file.
+        mesh_nodes: indices of nodes that have a mesh.
+
+    Returns:
+        The primitives by the indices of the mesh and of the primitive in it. The value
+        is None for a primitive of points or lines.
     """
     header = file.header
     meshes = dict.fromkeys(header.nodes[node].mesh for node in mesh_nodes)
@@ -911,11 +961,14 @@ def _note_pieces(
 ) -> None:
     """Note primitives without faces or material, and with transparent vertices.
 
-    `keys` are all primitives: indices of the mesh, and of the primitive in it. Those of
-    them with faces are in `with_faces`. The faceless ones of Gaussian splats are noted
-    elsewhere.
+    Args:
+        header: the parsed JSON of the file.
+        keys: all primitives, by the indices of the mesh and of the primitive in it.
+        with_faces: those of them with faces.
+        notes: notes about the file, to which sentences are added.
     """
     primitives = [header.meshes[mesh].primitives[index] for mesh, index in keys]
+    # Gaussian splats have no faces either; `_note_extensions` notes them.
     n_splats = sum(
         any(map(is_splat_name, find_unread_extensions(primitive)))
         for primitive in primitives
@@ -940,10 +993,14 @@ def _note_pieces(
 def _make_parts(
     surfaces: GltfSurfaces, with_faces: Mapping[PrimitiveKey, PrimitiveData]
 ) -> dict[PrimitiveKey, ImportedPart]:
-    """Return the parts of pieces with their surfaces and final UVs.
+    """Return the primitives as parts with their surfaces and final UVs.
 
-    Keys are mesh and index of the primitive in it. Pieces with the same material share
-    one surface, whose images fit the texture coordinates of all of them.
+    Primitives with the same material share one surface, whose images fit the texture
+    coordinates of all of them.
+
+    Args:
+        surfaces: converts the file's materials.
+        with_faces: the primitives, by the indices of the mesh and of the primitive.
     """
     groups = dict[int | None, dict[PrimitiveKey, PrimitiveData]]()
     for key, piece in with_faces.items():
@@ -963,10 +1020,12 @@ def _make_parts(
 def _read_skins(file: GltfFile, mesh_nodes: Sequence[int]) -> dict[int, SkinPose]:
     """Return the skins of some nodes, in the pose of the scene, by index.
 
-    A skin's matrices are the poses of its joints times its inverse bind matrices.
+    A skin's matrices are the poses of its joints times its inverse bind matrices, so
+    that they lead from the mesh to the scene (section 3.7.3).
     """
     header = file.header
-    # Joints may be outside of the scene that is shown.
+    # Joints may be outside of the scene that is imported. Without scenes in the header,
+    # all nodes are iterated over.
     all_poses = dict(
         gltf_skeleton.iterate_poses(header.model_copy(update={"scenes": []}))
     )
@@ -1001,8 +1060,8 @@ def _pose_parts(
 ) -> list[ImportedPart]:
     """Return the primitives that nodes draw, in the pose of each node.
 
-    One with a skin is posed by its joints alone; others by their node. A mesh that
-    several nodes draw is there several times.
+    A primitive with a skin is posed by its joints alone, as glTF wants it; others are
+    posed by their node. A mesh that several nodes draw becomes several parts.
 
     Args:
         file: the glTF file.
@@ -1044,7 +1103,13 @@ def _make_movable(
 ) -> ImportedPart:
     """Return a part with its morph targets at rest, and with what moves it.
 
-    `piece` is the data of the part, which `node` draws, perhaps with a skin.
+    Args:
+        file: the glTF file.
+        part: the part.
+        piece: its primitive as the file stores it.
+        node: index of the node that draws it.
+        skin: skin of the node; None if it has none.
+        skeleton: skeleton of the file.
     """
     # Without a skin, all vertices are bound to the node itself.
     joints = np.zeros((len(part.vertices), 1), np.int64)
@@ -1095,8 +1160,13 @@ def _read_vertex_colors(
 ) -> tuple[Float64Array | None, bool]:
     """Return vertex colors at the corners of faces, and whether an alpha is below 1.
 
-    They are linear, (F, 3, 3), or None if the primitive has none. `used` are the
-    vertices that are used, and `faces` (F, 3) indices into these.
+    The colors are linear, (F, 3, 3); None if the primitive has none.
+
+    Args:
+        file: the glTF file.
+        attributes: indices of the primitive's accessors, by names such as "COLOR_0".
+        used: (V,) the vertices that faces use.
+        faces: (F, 3) indices into `used`.
     """
     if "COLOR_0" not in attributes:
         return None, False
@@ -1114,7 +1184,13 @@ def _read_packed_coordinates(
 ) -> Float64Array | None:
     """Return the UVs (V, 2) of the texture of roughness and metallic, if there is one.
 
-    None also if the primitive lacks them. `used` are the vertices that faces use.
+    The result is None also if the primitive lacks them.
+
+    Args:
+        file: the glTF file.
+        attributes: indices of the primitive's accessors, by name.
+        material: its material.
+        used: (V,) the vertices that faces use.
     """
     texture = material.surface.metallicRoughnessTexture
     if texture is None:
@@ -1182,6 +1258,10 @@ def _find_used_vertices(
     Primitives may share accessors, so not every vertex is used. Faces (F, 3) are
     indices into the used vertices.
 
+    Args:
+        file: the glTF file.
+        primitive: entry of the primitive.
+
     Raises:
         FileFormatError: a face refers to a vertex that is not there.
     """
@@ -1214,8 +1294,9 @@ def _read_texture_coordinates(
 
     Args:
         file: the glTF file.
-        attributes: accessors of the primitive, by name.
-        use: the texture for which they are; None: the first coordinates as they are.
+        attributes: indices of the primitive's accessors, by name.
+        use: the texture that they are for; None returns the first coordinates as they
+            are.
         used: (N,) the vertices that are used.
     """
     name = "TEXCOORD_0" if use is None else use.uv_attribute
@@ -1224,7 +1305,9 @@ def _read_texture_coordinates(
     accessor = file.header.accessors[attributes[name]]
     vertex_count = file.header.accessors[attributes["POSITION"]].count
     if accessor.type != "VEC2" or accessor.count != vertex_count:
-        return None  # those of the base color are checked with the header
+        # No error: the coordinates of the base color were checked with the header, and
+        # these are of a texture that can be left out.
+        return None
     uvs = file.read_numbers(attributes[name], used)
     if use is None:
         return uvs
@@ -1258,6 +1341,7 @@ def _make_triangles(order: IntArray, mode: int) -> IntArray:
     else:  # all faces of a fan share the first vertex
         corners = np.stack([index + 1, index + 2, np.zeros_like(index)], axis=1)
     faces = order[corners]
-    # Faces with a repeated vertex join strips that are far apart.
+    # Exporters repeat vertices to join strips that are far apart. The faces with a
+    # repeated vertex have no area, and are left out.
     is_joint = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
     return np.asarray(faces[~is_joint], np.int64)

@@ -104,8 +104,14 @@ def read_vertex_joints(
 
     Weights of a vertex are scaled to add up to 1.
 
+    Args:
+        file: the glTF file.
+        primitive: entry of the primitive.
+        used: (V,) the vertices that faces use.
+
     Raises:
-        FileFormatError: joints are those of other vertices, or have no weights.
+        FileFormatError: the number of joints is not that of the vertices, or joints
+            have no weights.
     """
     # A file has sets of four joints and weights a vertex: JOINTS_0, JOINTS_1, ...
     sets = list[VertexJoints]()
@@ -133,8 +139,16 @@ def _read_joint_set(
 ) -> VertexJoints:
     """Return four joints of each used vertex, with their weights as stored.
 
-    They are those of the attributes ``JOINTS_<index>`` and ``WEIGHTS_<index>``. Raises
-    FileFormatError as `read_vertex_joints`.
+    They are those of the attributes ``JOINTS_<index>`` and ``WEIGHTS_<index>``.
+
+    Args:
+        file: the glTF file.
+        primitive: entry of the primitive.
+        used: (V,) the vertices that faces use.
+        index: index of the set of four.
+
+    Raises:
+        FileFormatError: there are not four joints and four weights for each vertex.
     """
     attributes = primitive.attributes
     accessors = file.header.accessors
@@ -182,7 +196,7 @@ def pose_part(
 ) -> ImportedPart:
     """Return a part as its joints pose it in the scene, by linear blend skinning.
 
-    The transform of the part's own node does not count.
+    As in glTF, the transform of the part's own node has no effect.
 
     Args:
         path: the file, for messages.
@@ -266,7 +280,17 @@ def _read_offsets(
 ) -> Float64Array | None:
     """Return what a morph target adds to an attribute of used vertices, (V, 3).
 
-    None if the target leaves the attribute as it is.
+    The result is None if the target does not change the attribute.
+
+    Args:
+        file: the glTF file.
+        primitive: entry of the primitive.
+        attributes: accessors of the target, by name.
+        name: the attribute, "POSITION" or "NORMAL".
+        used: (V,) the vertices that faces use.
+
+    Raises:
+        FileFormatError: the offsets are of another type or number, or not finite.
     """
     if name not in attributes:
         return None
@@ -291,13 +315,13 @@ def apply_targets(
 ) -> ImportedPart:
     """Return a part, in its mesh's coordinates, with morph targets applied.
 
-    Targets of weight 0 are skipped; the part itself stays as it is.
+    Each target adds its offsets times its weight to the vertices and normals.
 
     Args:
-        part: a part as the file stores it.
+        part: a part as the file stores it, which is not changed.
         targets: its T morph targets.
-        normal_offsets: what each adds to the normals.
-        weights: (T,).
+        normal_offsets: what each target adds to the normals, (V, 3) or None.
+        weights: (T,) weights of the targets.
     """
     vertices = part.vertices
     normals = part.normals
@@ -316,7 +340,7 @@ def apply_targets(
 def read_rest_weights(file: GltfFile, node: int, count: int) -> Float64Array:
     """Return the weights (T,) at rest of a node's morph targets.
 
-    The node's own win over those of its mesh; without either they are 0.
+    The node's own weights are used, or else those of its mesh, or else 0.
 
     Raises:
         FileFormatError: there are not `count` weights, one for each target.
@@ -345,6 +369,10 @@ def _count_vertices(header: Header, primitives: Sequence[Primitive]) -> int:
 
 def count_targets(file: GltfFile, mesh_nodes: Sequence[int]) -> dict[int, int]:
     """Return the number of morph targets of each node with a mesh.
+
+    Args:
+        file: the glTF file.
+        mesh_nodes: indices of the nodes with a mesh.
 
     Raises:
         FileFormatError: the primitives of a mesh have different numbers of targets, or
@@ -444,11 +472,11 @@ def _count_key_numbers(
 def _read_clips(
     file: GltfFile, target_counts: Mapping[int, int], skins: Collection[int]
 ) -> tuple[Clip, ...]:
-    """Return the clips of a file, of which only what moves geometry is read.
+    """Return the clips of a file, with only those channels that move geometry.
 
-    That is what sets the transform of a node with a mesh, of a joint or of an ancestor
-    of one, and the weights of morph targets. A clip without any such channel is left
-    out.
+    A channel moves geometry if it sets the weights of morph targets, or the transform
+    of a node with a mesh, of a joint, or of an ancestor of one. A clip without any such
+    channel is left out.
 
     Args:
         file: the glTF file.
@@ -481,7 +509,13 @@ def _read_clips(
 def _find_moving_channels(
     header: Header, target_counts: Mapping[int, int], skins: Collection[int]
 ) -> list[list[Channel]]:
-    """Return the channels of each animation that move geometry; see `_read_clips`."""
+    """Return the channels of each animation that move geometry; see `_read_clips`.
+
+    Args:
+        header: the parsed JSON of the file.
+        target_counts: the nodes with a mesh, and their number of morph targets.
+        skins: indices of the skins of these nodes.
+    """
     joints = (joint for skin in skins for joint in header.skins[skin].joints)
     moving_nodes = with_ancestors(header.parents, {*target_counts, *joints})
 
@@ -509,9 +543,10 @@ def _read_track(
 ) -> Track:
     """Read one channel of a clip: the keys of one property of a node.
 
-    The file has a flat list of values: for each key one value, or for a cubic spline
-    the tangent before it, the value and the tangent after it; and each of these for
-    every morph target if the property is their weights.
+    The file has a flat list of values. For each key it has one value, or for a cubic
+    spline three: the tangent before the key, the value, and the tangent after it. If
+    the property is the weights of morph targets, each of these is one number for every
+    target.
 
     Args:
         file: the glTF file.
@@ -557,7 +592,8 @@ def _read_keys(
         file: the glTF file.
         index: accessor of the values.
         property_name: the property that they set, a key of `VALUE_WIDTHS`.
-        shape: how many keys there are, values a key, and targets that a value is for.
+        shape: number of keys, of values for each key, and of the morph targets that a
+            value is for (1 for other properties).
 
     Raises:
         FileFormatError: there are more or fewer values, or others.
@@ -586,8 +622,13 @@ def _count_numbers(count: int) -> str:
 def _read_times(file: GltfFile, index: int) -> Float64Array:
     """Return the times (K,) in seconds of the keys of a clip, which must rise.
 
-    `index` is that of their accessor. Raises FileFormatError: it is of another type, or
-    times do not rise from 0 or later.
+    Args:
+        file: the glTF file.
+        index: accessor of the times.
+
+    Raises:
+        FileFormatError: the accessor is of another type, or the times do not rise from
+            0 or later.
     """
     path = file.path
     accessor = file.header.accessors[index]

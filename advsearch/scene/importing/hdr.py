@@ -84,8 +84,12 @@ def _suppress_output() -> Iterator[None]:
 def read_exr(file: Path, data: bytes) -> tuple[Planes, list[str]]:
     """Read the image of an OpenEXR file.
 
-    Of several parts and layers, the one with a name for the image itself is read, or
-    else the first with colors.
+    Of several parts and layers, the one with a name for the image itself is read, such
+    as "beauty", or else the first one with colors.
+
+    Args:
+        file: path of the file, for messages.
+        data: its bytes.
 
     Returns:
         Red, green and blue, each (H, W) in half or float, of its display window, black
@@ -131,8 +135,12 @@ def _read_layer(
 ) -> tuple[dict[str, Any], dict[str, Plane], list[str]]:
     """Return the header, the planes and the notes of the layer that is the image.
 
-    Planes are by `CHANNEL_NAMES`. The file is opened twice: first its header alone, to
-    check its size before pixels are read. Raises ValueError if channels are missing.
+    Planes are named by the values of `CHANNEL_NAMES`, such as "R". The file is opened
+    twice: first its header alone, to check its size before pixels are read.
+
+    Raises:
+        FileFormatError: the image is too large, or has no colors.
+        ValueError: the pixels of channels are missing, which the caller reports.
     """
     with OpenEXR.File(
         io.BytesIO(data), separate_channels=True, header_only=True
@@ -156,6 +164,11 @@ def _check_planes(
     """Raise FileFormatError unless channels are floats of the size of the image.
 
     Chroma (RY, BY) may have fewer pixels.
+
+    Args:
+        file: path of the file, for messages.
+        planes: channels by name, such as "R".
+        size: rows and columns of the data window.
     """
     has_size = all(
         plane.shape == size
@@ -188,8 +201,8 @@ def _has_srgb_primaries(header: Mapping[str, Any]) -> bool:
 def _check_size(file: Path, picture: Any) -> None:
     """Raise FileFormatError for a picture that is deep, or over a limit.
 
-    The limit is on the values of all parts, and on the display window of each, which
-    may be larger than its data.
+    There are two limits: one for the number of values of all parts, and one for the
+    display window of each part, which may be larger than its data.
     """
     n_values = 0
     for part in picture.parts:
@@ -250,8 +263,9 @@ def _select_layer(
 ) -> tuple[dict[str, Any], dict[str, Any], list[str]]:
     """Select the layer that is the image.
 
-    That is the one whose name stands first in `MAIN_LAYER_NAMES`; of equal ones, and if
-    there is none, one with colors before one with luminance, and then the first.
+    It is the layer whose name comes first in `MAIN_LAYER_NAMES`. If several have the
+    same rank, or none has such a name, a layer with colors is preferred to one with
+    luminance, and then the first one counts.
 
     Args:
         file: the file, for messages.
@@ -281,7 +295,12 @@ def _select_layer(
 
 
 def _describe_other_layers(selected: _Layer, layers: list[_Layer]) -> list[str]:
-    """Return a clause about the layers that are left out; none if there are none."""
+    """Return a clause about the layers that are left out; none if there are none.
+
+    Args:
+        selected: the layer that is read.
+        layers: all layers with colors.
+    """
     other_names = ", ".join(
         # not more, so that the note stays readable
         format_name(layer.name)
@@ -301,12 +320,14 @@ def _find_color_layers(
 ) -> list[_Layer]:
     """Return every layer with color or luminance.
 
-    A channel's name is that of its layer, a dot, and what it holds: "diffuse.R". Those
-    without a dot are of the layer "", which has the name of its part if the file has
-    several. A layer counts if it has R, G and B, or luminance Y: alone, or with both
-    chroma channels RY and BY. Y beside X or Z is a color of XYZ and does not count.
+    A channel's name is the name of its layer, a dot, and what it holds: "diffuse.R". A
+    name without a dot belongs to the layer "", which gets the name of its part if the
+    file has several parts. A layer counts if it has R, G and B, or luminance Y, alone
+    or with both chroma channels RY and BY. Y together with X or Z is a color of XYZ and
+    does not count.
 
-    `parts` are the header and the channels of each part.
+    Args:
+        parts: the header and the channels of each part.
     """
     layers = list[_Layer]()
     for header, channels in parts:
@@ -334,9 +355,12 @@ def _convert_luminance(
 ) -> dict[str, Plane]:
     """Convert luminance, and chroma if there is any, to red, green and blue.
 
-    RY is (R - Y) / Y and BY is (B - Y) / Y, so that R and B follow; G follows from Y,
-    the weighted mean of the three. Chroma may have fewer pixels than `size`, and is
-    interpolated. Without chroma the image is grey.
+    RY is (R - Y) / Y and BY is (B - Y) / Y, which give R and B. G follows from Y, the
+    weighted mean of the three. Without chroma the image is grey.
+
+    Args:
+        planes: luminance "Y", and perhaps chroma "RY" and "BY".
+        size: rows and columns of the image; chroma may have fewer, and is interpolated.
     """
     if "RY" not in planes:
         return dict.fromkeys("RGB", planes["Y"])
@@ -356,8 +380,11 @@ def _convert_luminance(
 def _resample(plane: Plane, size: tuple[int, ...]) -> Plane:
     """Interpolate chroma, which has a value at every n-th row and column, to a size.
 
-    Linearly, first along rows and then along columns. Past the last value it is
-    repeated.
+    The interpolation is linear along each axis. Past the last value it is repeated.
+
+    Args:
+        plane: (h, w) chroma.
+        size: rows and columns of the result.
     """
     for axis in (0, 1):
         last_index = plane.shape[axis] - 1
@@ -392,9 +419,14 @@ def _crop_to_display_window(
 ) -> Planes:
     """Crop or pad planes from the data window to the display window.
 
-    Both windows are rectangles in one grid of pixels, which may overlap in part: a
-    file's data need not be all of its image. Pads are black; data that is cropped away
-    is noted in `notes`. Planes have the size of the data window.
+    Both windows are rectangles in the same grid of pixels: the display window is the
+    image, and the data window is where the file has pixels. They may overlap in part.
+    Pixels without data are black.
+
+    Args:
+        header: the header, which has both windows.
+        planes: red, green and blue, of the size of the data window.
+        notes: a note about cropped data is added.
     """
     data_corner, data_size = _read_window(header, "dataWindow")
     corner, size = _read_window(header, "displayWindow")
@@ -469,6 +501,10 @@ def _read_upright_pixels(path: Path, body: bytes) -> Bytes:
 def read_radiance(path: Path, data: bytes) -> tuple[Bytes, Float32Array, list[str]]:
     """Unpack a Radiance RGBE picture.
 
+    Args:
+        path: path of the file, for messages.
+        data: its bytes.
+
     Returns:
         Pixels (H, W, 4) uint8, three mantissas and an exponent, row 0 on top:
         `decode_rgbe` makes floats of them, which take three times the memory. Factors
@@ -500,9 +536,10 @@ def read_radiance(path: Path, data: bytes) -> tuple[Bytes, Float32Array, list[st
 def _read_color_corrections(header: bytes) -> tuple[Float32Array, list[str]]:
     """Return the inverse (3,) of all COLORCORR lines, and notes on invalid ones.
 
-    A line has three factors that were already applied to the pixels. One that would
-    take the product out of range is invalid too. EXPOSURE lines are ignored, as
-    everywhere: exposure is metered.
+    A line has three factors that were already applied to the pixels, so they are
+    divided by. A line that would take the result out of float32's range is invalid too.
+    EXPOSURE lines are ignored, since the brightness of environments is set by metering
+    anyway.
     """
     factors = np.ones(3)
     notes = list[str]()
@@ -522,7 +559,8 @@ def _read_color_corrections(header: bytes) -> tuple[Float32Array, list[str]]:
 def decode_rgbe(pixels: Bytes) -> Float32Array:
     """Convert RGBE pixels (H, W, 4) to linear values (H, W, 3) float32.
 
-    A value is mantissa x 2^(exponent - 136), as in Mitsuba.
+    A value is mantissa x 2^(exponent - 136), as in Mitsuba: the exponent has a bias of
+    128, and the mantissa is in 256ths. An exponent of 0 is black.
     """
     scale = np.ldexp(np.float32(1.0), pixels[:, :, 3].astype(np.int32) - 136)
     scale = np.where(pixels[:, :, 3] == 0, np.float32(0.0), scale)
@@ -534,7 +572,12 @@ def decode_rgbe(pixels: Bytes) -> Float32Array:
 def _decode_scanlines(path: Path, body: bytes, height: int, width: int) -> Bytes:
     """Decode scanlines to pixels (height, width, 4), run-length encoded or plain.
 
-    Each line is of one kind or the other; only widths from 8 to 32767 may be encoded.
+    Each line is either encoded or plain. Only widths from 8 to 32767 may be encoded.
+
+    Args:
+        path: path of the picture, for messages.
+        body: the scanlines' bytes.
+        height, width: number of scanlines, and of pixels in each.
     """
     result = np.empty((height, width, 4), np.uint8)
     position = 0
@@ -559,11 +602,19 @@ def _decode_scanlines(path: Path, body: bytes, height: int, width: int) -> Bytes
 def _decode_runs(body: bytes, position: int, line: Bytes) -> int:
     """Fill a line (W, 4) from its four run-length encoded channels, one by one.
 
-    A run is a byte n and then, if n is above 128, one value that is repeated n - 128
-    times; otherwise n values.
+    A run begins with a byte n. If n is above 128, one value follows, which is repeated
+    n - 128 times; otherwise n values follow.
 
-    Returns the position after them. Raises IndexError or ValueError if they end early,
-    or do not fit.
+    Args:
+        body: the scanlines' bytes.
+        position: where the runs begin.
+        line: the pixels, which are filled in.
+
+    Returns:
+        The position after the runs.
+
+    Raises:
+        IndexError, ValueError: the runs end early, or do not fit.
     """
     for channel in range(4):
         runs = []
@@ -588,11 +639,20 @@ def _decode_runs(body: bytes, position: int, line: Bytes) -> int:
 def _decode_plain_line(body: bytes, position: int, line: Bytes) -> int:
     """Fill a line (W, 4) from pixels of four bytes.
 
-    A pixel (1, 1, 1, n) is no color: it repeats the last one n times. A second one
-    right after it repeats it 256 n times, a third one 65,536 n times: they are the
-    bytes of one count.
+    A pixel (1, 1, 1, n) is no color: it repeats the pixel before it n times. If several
+    of these follow one another, they are the bytes of one count, the lowest first: the
+    second one means 256 n times, the third one 65,536 n times.
 
-    Returns the position after the line. Raises ValueError if a repeat does not fit.
+    Args:
+        body: the scanlines' bytes.
+        position: where the line begins.
+        line: the pixels, which are filled in.
+
+    Returns:
+        The position after the line.
+
+    Raises:
+        ValueError: a repeat does not fit.
     """
     width = len(line)
     # Usually there are no repeats, and the line is copied at once.

@@ -85,9 +85,12 @@ class MtlReader:
     def read_library(self, name: str) -> None:
         """Read a material file; of materials with the same name, the first counts.
 
-        Its materials are kept by name for `get_surface`. A file that is missing is
-        noted, and so is a second material of a name in one file, unless its statements
-        are the same. Statements before the first material are recorded as left out.
+        Its materials are stored by name for `get_surface`. A missing file is noted. So
+        is a second material with the same name in a file, unless its statements are the
+        same. Statements before the first material are recorded as left out.
+
+        Args:
+            name: name of the file, as the mesh file writes it.
         """
         try:
             text = decode_text(self.references.get(name))
@@ -161,10 +164,12 @@ class MtlReader:
         """Return the UDIM squares for which a material has images: all candidates, or
         none.
 
-        The first of its images that has a square in its name decides. There are images
-        for all squares if the name has the placeholder ``<UDIM>``, or if there is an
-        image for a candidate that is not the square in the name. Otherwise the image is
-        taken for an ordinary one that repeats, which is noted.
+        A UDIM texture has one image for each unit square of texture coordinates, with
+        the number of the square in its name, such as "wood.1002.png". The material's
+        first image with such a number decides. There are images for all squares if the
+        name has the placeholder ``<UDIM>``, or if the file of another candidate square
+        exists. Otherwise the image is taken for an ordinary one that repeats, which is
+        noted.
 
         Args:
             name: the material.
@@ -216,7 +221,8 @@ class MtlReader:
             square: the UDIM square whose images are used, 0 for none.
             name: the name by which the mesh file uses it.
         """
-        # Statements are noted once, not for each square.
+        # A material becomes one surface for each UDIM square, but its unread statements
+        # are noted only once.
         are_noted = any(
             material_id == id(material) for material_id, _ in self._surfaces
         )
@@ -248,8 +254,8 @@ class MtlReader:
     def _parse_uses(self, material: MtlMaterial, square: int) -> dict[str, MapUse]:
         """Return the maps of a material by keyword, with the images of a UDIM square.
 
-        They count as read; but of normal maps, `_make_normal_map` reads only the first
-        that it can use.
+        The maps count as read, so that they are not noted. Normal maps do not yet:
+        `_make_normal_map` reads only the first one that it can use.
         """
         uses = dict[str, MapUse]()
         for key in (*UV_MAPS, "map_pr", "map_pm"):
@@ -270,8 +276,13 @@ class MtlReader:
     ) -> None:
         """Remove maps whose texture coordinates differ from those of the first.
 
-        A surface has one layout, by scale and offset. Those removed are noted. `uses`
-        are the maps by keyword, which is changed.
+        A surface has one layout of texture coordinates: scale (``-s``) and offset
+        (``-o``). Removed maps are noted.
+
+        Args:
+            material: the material.
+            uses: its maps by keyword; maps are removed from it.
+            first_use: the map whose layout counts.
         """
         for key in [key for key in UV_MAPS if key in uses]:
             if (uses[key].scale, uses[key].offset) != (
@@ -294,8 +305,13 @@ class MtlReader:
     ) -> tuple[Float32Array | None, Float32Array | None]:
         """Return the color (3,) of ``Kd`` and the texture (H, W, 3) of ``map_Kd``.
 
-        A texture is not multiplied by Kd, which is an exporter's default more often
-        than a tint.
+        A texture is not multiplied by ``Kd``: beside a texture that is more often an
+        exporter's default than a tint. The color is None if it is plain white and there
+        is a texture.
+
+        Args:
+            material: the material.
+            use: its ``map_Kd``, or None.
         """
         color = self._read_color(material)
         substitute = f"{describe_substitute(color)} is used instead"
@@ -335,10 +351,11 @@ class MtlReader:
     def _note_unread(self, material: MtlMaterial) -> None:
         """Note the statements that are not read, unless they change nothing.
 
-        Nothing is changed by zeros, by ignored keywords, by a clear coat's roughness
-        without a coat, by a grey filter of transmission, and by an ambient map that is
-        the color's. Also noted are statements that were overridden, a fourth number of
-        Kd, and illumination models with more than highlights.
+        These change nothing: numbers that are all 0, ignored keywords, the roughness of
+        a clear coat that is absent, a grey transmission filter, and an ambient map that
+        is the same image as the color's. Also noted are statements that were
+        overridden, a fourth number of Kd, and illumination models above 2, such as
+        ray-traced glass.
         """
         zero_keys = {
             key for key in material.statements if _is_zero(material.peek_argument(key))
@@ -373,8 +390,9 @@ class MtlReader:
     def _parse_use(self, material: MtlMaterial, key: str) -> MapUse | None:
         """Parse a statement that names an image, and note options that are not read.
 
-        None if it names none. What follows a # belongs to the name if there is such a
-        file, and is a comment otherwise. Each statement is parsed once.
+        The result is None if it names none. Text from a # on belongs to the name if a
+        file with that name exists, and is a comment otherwise. Results are cached, so
+        that options are noted only once.
         """
         if (id(material), key) in self._uses:
             return self._uses[id(material), key]
@@ -394,7 +412,10 @@ class MtlReader:
     ) -> None:
         """Note the options of an image that are not read, unless they change nothing.
 
-        `key` is the keyword of the statement with the image, in lower case.
+        Args:
+            material: the material.
+            key: keyword of the statement with the image, such as "map_kd".
+            use: the image and its options.
         """
         has_colors = key in ("map_kd", "map_ke")
         read_options = ["s", "o", "mm", "clamp"]
@@ -423,9 +444,14 @@ class MtlReader:
     ) -> ImportedSurface:
         """Return a surface with its opacity.
 
-        That is ``d``, or 1 - ``Tr``, times the image of ``map_d``, which is resized to
-        that of the color. The single color, which counts where there is no texture, has
-        only the first factor.
+        The opacity is a number, ``d`` or 1 - ``Tr``, times the image of ``map_d``. The
+        image is resized to the size of the color texture. The single color, which
+        counts where there is no texture, is multiplied by the number alone.
+
+        Args:
+            material: the material.
+            use: its ``map_d``, or None.
+            surface: the surface with its color and texture.
         """
         factor = self._read_opacity(material)
         image = self._load_image(
@@ -457,8 +483,9 @@ class MtlReader:
     def _read_opacity(self, material: MtlMaterial) -> float:
         """Return the opacity in [0, 1] that ``d`` or ``Tr`` states, 1 by default.
 
-        ``d`` wins; a ``Tr`` that agrees with it neither as a transparency nor as an
-        opacity is noted. Alone, ``Tr`` is a transparency, which is noted.
+        If both are there, ``d`` counts. Programs mean either transparency or opacity by
+        ``Tr``; one that agrees with ``d`` in neither sense is noted. Alone, ``Tr`` is
+        taken for a transparency, which is noted too.
         """
         if "-halo" in material.read_argument("d").lower().split():
             self.notes.record("option", "-halo of d")
@@ -527,8 +554,12 @@ class MtlReader:
     ) -> Float32Array | None:
         """Return the first usable normal map (H, W, 3) of a material, or None.
 
-        Bump maps are usable if they hold normals, and no heights. All statements with
-        the same image count as read.
+        A bump map is usable if it holds normals; one of heights is left out with a
+        note. All statements with the same image count as read.
+
+        Args:
+            material: the material.
+            uses: its maps by keyword.
         """
         note_template = "the normal map {name} {why}; it is left out"
         for key in NORMAL_MAPS:
@@ -553,8 +584,12 @@ class MtlReader:
     ) -> Float32Array | None:
         """Return the radiance of ``Ke`` and ``map_Ke``, (H, W, 3), or None.
 
-        They are multiplied; without a map the radiance is (1, 1, 3). A map that cannot
-        be read leaves no emission, with a note.
+        Both are multiplied; without a map the radiance is (1, 1, 3). If the map cannot
+        be read, there is no emission, with a note.
+
+        Args:
+            material: the material.
+            use: its ``map_Ke``, or None.
         """
         values = parse_numbers(material.read_argument("ke") or "0")  # by default black
         if values is None or len(values) not in (1, 3) or min(values) < 0:
@@ -583,7 +618,11 @@ class MtlReader:
     ) -> Float32Array | None:
         """Return the values (H, W, C) of an image with its ``-mm`` applied.
 
-        None, and a note, if it cannot be read.
+        Args:
+            use: the image; None returns None.
+            kind: what it holds, such as "colours".
+            note_template: the note if it cannot be read, with `{name}` for the image
+                and `{why}` for the reason; then None is returned.
         """
         if use is None:
             return None
@@ -599,8 +638,9 @@ class MtlReader:
 def _select_channel(picture: Float32Array, use: MapUse) -> Float32Array:
     """Return the values (H, W) of an image for a map of numbers.
 
-    They are the channel that ``-imfchan`` names; or else the alpha, if it is not opaque
-    everywhere; or else the mean of the colors, also for an alpha that is not there.
+    They are those of the channel that ``-imfchan`` names, such as "r". Without one,
+    they are the alpha if it is not 1 everywhere, or else the mean of the colors. The
+    mean is also taken if ``-imfchan`` names the alpha of an image without alpha.
     """
     alpha_index = 3
     has_alpha = picture.shape[2] == 4
@@ -617,9 +657,10 @@ def _select_channel(picture: Float32Array, use: MapUse) -> Float32Array:
 def find_libraries(arguments: Sequence[str], references: References) -> list[str]:
     """Return the names of the material files that ``mtllib`` lines name.
 
-    A line may name several files, and a name may have blanks. So a line that is itself
-    the name of a file is one name. Otherwise it is split after each ``.mtl``, and the
-    rest at blanks, if these are names; if not, the line is one name after all.
+    A line may name several files, and a name may have blanks. If the full line is the
+    name of a file that exists, it is one name. Otherwise it is split after each
+    ``.mtl``, and the rest at blanks. The pieces are taken if all of them end in
+    ``.mtl`` or one of them exists. If not, the line is taken as one name.
 
     Args:
         arguments: what follows ``mtllib`` in each line.
@@ -803,6 +844,10 @@ class MapUse:
 def parse_mtl(text: str, file: str) -> tuple[list[MtlMaterial], list[str]]:
     """Parse the text of a material file.
 
+    Args:
+        text: the text.
+        file: name of the file, for notes.
+
     Returns:
         Its materials, and the keywords of statements before the first of them.
     """
@@ -835,9 +880,10 @@ def without_comment(text: str) -> str:
 def parse_map(argument: str) -> MapUse | None:
     """Parse the arguments of a statement that names an image; None if it names none.
 
-    Known options are taken out wherever they stand; what is left is the name, which may
-    have blanks. What then stands before the name with a dash is an option that is not
-    known; its value is left out.
+    In "-s 2 2 -clamp on old wood.png" the name is "old wood.png". Known options are
+    taken out wherever they stand. Words with a dash at the beginning of the rest are
+    unknown options, which are removed together with their values. What is left is the
+    name, which may have blanks.
     """
     options: dict[str, str] = {}
     for match in _OPTION.finditer(argument):

@@ -180,7 +180,7 @@ def find_front(path: Path, header: Header | None, up: str | None = None) -> File
 
     The front of a glTF asset faces +Z (Khronos, glTF 2.0, section 3.4), which is -Y in
     Blender. VRM 1.0 has the same rule, VRM 0.x has -Z. OBJ, PLY, STL and OpenUSD have
-    no rule, nor does it hold for a glTF file that the user declares to be z up.
+    no rule. The rule does not hold for a glTF file that the user declares to be z up.
 
     Args:
         path: the file.
@@ -227,8 +227,9 @@ def make_object(
         notes: warnings about them so far.
         file: the file that they are from.
         name: name of the object.
-        up: as for `import_object`.
-        front: the axis along which its front faces.
+        up: the axis of the file that points up, "y" or "z"; None: that of the format,
+            or else the one that its shape suggests.
+        front: the axis of the file along which its front faces.
 
     Raises:
         InputError: the geometry has NaN, infinite, or coincident vertices only.
@@ -243,7 +244,7 @@ def make_object(
     soup, maps = apply_textures(soup, surfaces, object_notes)
     opacity = _find_opacity(maps.color, object_notes)
     material = _compute_mean_material(soup, surfaces, object_notes)
-    # The soup's extent is 1 but for faces that the repair has removed.
+    # The soup's extent is 1, or less if the repair has removed faces.
     extent = compute_extent(parts) * float(
         np.ptp(soup.points[soup.faces].reshape(-1, 3), axis=0).max()
     )
@@ -288,7 +289,14 @@ def _find_up(
 ) -> FileAxis:
     """Return the axis that points up: the user's, the format's, or a guess.
 
-    A front along y or z leaves one axis only; a guess is by the shape.
+    A front along y or z rules out that axis. Otherwise the axis is guessed from the
+    shape.
+
+    Args:
+        parts: the parts of the file.
+        file: the file.
+        up: the axis that the user named, or None.
+        front: the axis along which the front faces.
     """
     if up:
         return FileAxis(up)
@@ -306,7 +314,8 @@ def _find_up(
 def _find_opacity(color: Float32Array, notes: Notes) -> Float32Array | None:
     """Return the opacity (H, W) in a map of colors (H, W, 3 or 4); None if opaque.
 
-    What is transparent all over would be invisible, and counts as opaque, with a note.
+    An object that is transparent everywhere would be invisible. It counts as opaque,
+    with a note.
     """
     if color.shape[2] < 4:
         return None
@@ -322,8 +331,13 @@ def _compute_mean_material(
 ) -> Material:
     """Return the roughness and metallic of all surfaces, averaged by area.
 
-    The renderer has one value of each for an object. A note says so, unless all of them
-    are the same. Surfaces without faces do not count.
+    The renderer has one roughness and one metallic for an object. If the surfaces
+    differ, a note says that means are used. Surfaces without faces do not count.
+
+    Args:
+        soup: the object.
+        surfaces: the surface of each of its parts.
+        notes: notes about the file.
     """
     visible_area = np.bincount(
         soup.part_ids,
@@ -365,7 +379,15 @@ def _make_mesh(
 ) -> Mesh:
     """Return the normalised mesh with its materials, and a rig if something moves it.
 
-    Its largest extent becomes 1. `turn` (3, 3) leads from the file's axes to ours.
+    Its largest extent becomes 1. A rig is there if the file has joints or morph
+    targets.
+
+    Args:
+        soup: the repaired object.
+        surfaces: the surface of each of its parts.
+        file: the file, for messages.
+        parts: the parts of the file.
+        turn: rotation (3, 3) from the file's axes to ours.
     """
     material_names, material_of_face = index_materials(soup, surfaces)
     # Groups end with the last material that has faces.
@@ -382,7 +404,8 @@ def _make_mesh(
         raise InputError(f"{file}: {error}") from None
     if stored_vertices is None:
         return normalised_mesh
-    # The soup was divided by the first extent, the mesh is divided by the second.
+    # A vertex of the file was divided by the extent of all parts when they were joined,
+    # and then by the mesh's own extent. The rig needs both.
     soup_extent = compute_extent(parts)
     mesh_extent = float(np.ptp(mesh.vertices.astype(np.float64), axis=0).max())
     # Imported late: torch takes seconds, and most objects have no joints.
@@ -400,9 +423,13 @@ def _compute_file_to_mesh(
 ) -> Float64Array:
     """Return the map (4, 4) from the file's coordinates to the normalised mesh's.
 
-    `join_parts` maps a vertex v to turn (v - lowest corner) / extent, and
-    `normalise_mesh` that point p to (p - origin) / size; this is the one after the
-    other. `turn` (3, 3) leads from the file's axes to ours.
+    `join_parts` maps a vertex v to p = turn (v - lowest corner) / extent, and
+    `normalise_mesh` maps p to (p - origin) / size. This is the composition of both.
+
+    Args:
+        parts: the parts of the file.
+        soup: the repaired object.
+        turn: rotation (3, 3) from the file's axes to ours.
     """
     used_points = list_used_vertices(parts)
     lowest_corner = np.min([points.min(axis=0) for points in used_points], axis=0)
@@ -416,9 +443,15 @@ def _compute_emitted(
 ) -> Float32Array | None:
     """Return the radiance (H, W, 3) that leaves a surface: emission times opacity.
 
-    Both maps are brought to the size of the wider one (of the higher one, if they are
-    equally wide): the opacity is interpolated, texels of the emission are repeated.
-    None: it emits nothing. An emission (h, w, 3) without opacity is returned as it is.
+    Both maps get the size of the wider one (of the higher one, if they are equally
+    wide): the opacity is interpolated, and texels of the emission are repeated.
+
+    Args:
+        emission: (h, w, 3) linear radiance, or None.
+        opacity: (h', w') opacity in [0, 1]; None returns the emission as it is.
+
+    Returns:
+        The radiance; None if the surface emits no light.
     """
     if emission is None or opacity is None:
         return emission
@@ -447,11 +480,11 @@ MIN_UP_RATIO = 1.1
 def guess_up(points: Float64Array, name: str) -> FileAxis:
     """Guess which axis of a mesh points up, y or z, from its shape alone.
 
-    What stands on a table touches it with a large fraction of what it covers, seen from
-    above: the foot of a vase, the four wheels of a car. Lying on its side it touches
-    with less. Of 39 meshes of several authors and the bundled objects, each written
-    with y and with z up, this finds the right axis for all that have only one stable
-    upright pose.
+    An object that stands upright touches the ground with a large fraction of its
+    footprint, seen from above: the foot of a vase, the four wheels of a car. An object
+    that lies on its side touches it with a smaller fraction. Tested on 39 meshes of
+    several authors and the bundled objects, each with y and with z up, this finds the
+    right axis for all that have only one stable upright pose.
 
     Args:
         points: vertices (P, 3).
@@ -461,6 +494,7 @@ def guess_up(points: Float64Array, name: str) -> FileAxis:
         The axis, z if the shape does not tell, and a note with the reason.
     """
     fractions = {
+        # with the axes in the order z, x, y: then y is the third axis, up
         "y": compute_touching_fraction(points[:, [2, 0, 1]]),
         "z": compute_touching_fraction(points),
     }

@@ -54,6 +54,7 @@ def make_normal_map(picture: Float32Array, scale: float = 1.0) -> Float32Array:
     clamped_scale = min(max(scale, -MAX_NORMAL_SCALE), MAX_NORMAL_SCALE)
     normals = picture * 2.0 - 1.0  # stored as (n + 1) / 2
     normals[..., :2] *= clamped_scale
+    # a normal must not point into the surface
     normals[..., 2] = np.maximum(normals[..., 2], MIN_NORMAL_Z)
     return encode_normals(normals)
 
@@ -190,7 +191,8 @@ def apply_opacity(
 ) -> Float32Array | None:
     """Return a base color with its opacity.
 
-    Cut-out texels get the nearest visible color, lest theirs bleeds over the edges.
+    Cut-out texels get the color of the nearest visible one. Otherwise filtering would
+    blend their own color into the edges.
 
     Args:
         color: (..., 3 or 4) base color; None returns None.
@@ -274,7 +276,8 @@ def select_visible(parts: Sequence[ImportedPart]) -> list[ImportedPart]:
 def transform_part(part: ImportedPart, matrix: Float64Array) -> ImportedPart:
     """Return a part transformed by an affine matrix (4, 4).
 
-    One that mirrors keeps the fronts of its faces outside.
+    If the matrix mirrors, the winding of the faces is reversed, so that their fronts
+    stay outside.
     """
     if np.array_equal(matrix, np.eye(4)):
         return part
@@ -301,8 +304,14 @@ def replace_geometry(
 ) -> ImportedPart:
     """Return a part with other vertices and normals.
 
-    Mirroring turns the winding of faces around and, by the cofactors, normals: if
-    `is_mirrored`, both are turned back. Colors of corners go with their corners.
+    Mirroring reverses the winding of faces, and normals that were transformed by the
+    cofactors. Both are reversed again here.
+
+    Args:
+        part: the part.
+        vertices: (V, 3) new positions.
+        normals: (V, 3) new normals, or None.
+        is_mirrored: whether the new positions are mirrored.
     """
     part = replace(part, vertices=vertices, normals=normals)
     if not is_mirrored:
@@ -339,12 +348,12 @@ def split_at_corners(
 
     Args:
         triangles: (T,) the triangles, out of F.
-        points: (N, 3) values; every corner has a point.
-        normals: (N, 3) values.
-        uvs: (N, 2) values.
-        colors: (F, 3, 3) of the corners.
-        surface: as in `ImportedPart`.
-        flat: as in `ImportedPart`.
+        points: positions (N, 3) and their rows; every corner has one.
+        normals: normals (N, 3) and their rows, or None.
+        uvs: texture coordinates (N, 2) and their rows, or None.
+        colors: (F, 3, 3) linear colors of the corners, or None.
+        surface: surface of the part.
+        flat: whether faces without normals are shaded flat.
     """
     corner_number = _number_corners(triangles, points, normals, uvs)
     # for each vertex its first corner, and for each corner its vertex
@@ -374,19 +383,25 @@ def split_at_corners(
 
 
 def _number_corners(triangles: IntArray, *columns: IndexedValues | None) -> IntArray:
-    """Return a number for each corner of triangles (T,), equal where all rows are.
+    """Return one number for each corner, which is equal for corners with equal values.
 
-    Its digits are the corner's rows of all columns, each in the base of that column's
-    number of values plus 1: a missing row is -1, which is the digit 0.
+    The rows of a corner's values become the digits of the number. The base of a digit
+    is the column's number of values plus 1; the digit 0 stands for a missing value (row
+    -1).
+
+    Args:
+        triangles: (T,) indices of the triangles.
+        columns: values of the corners, such as points and normals; None is skipped.
 
     Returns:
-        (3 T,), corner by corner.
+        (3 T,) numbers, corner by corner.
     """
     corner_number = np.zeros(3 * len(triangles), dtype=np.int64)
     bound = 1  # all numbers are smaller
     for indexed in filter(None, columns):
         base = len(indexed.values) + 1
-        # numbered anew, so that the next digit does not overflow
+        # Replace the numbers by consecutive ones, so that the next digit does not
+        # overflow 64 bits.
         if bound * base >= 2**63:
             _, corner_number = np.unique(corner_number, return_inverse=True)
             corner_number = corner_number.reshape(-1)

@@ -37,7 +37,13 @@ _BAND = 1 << 22  # pixels of a large picture that are averaged at a time
 def read_image(
     path: Path, limit: int | None = TEXTURE_LIMIT, *, is_raw: bool = False
 ) -> Float32Array:
-    """Read an image file; arguments and result are those of `load_display_image`.
+    """Read an image file as display-referred values (H, W, 3) in [0, 1].
+
+    Args:
+        path: the file.
+        limit: longest side of the result; larger images are averaged down. None: no
+            limit.
+        is_raw: whether it holds numbers, as a normal map does, and no colors.
 
     Raises:
         FileFormatError: the file is missing, no ordinary file, no image, too large or
@@ -120,8 +126,12 @@ def _average_colors(
 ) -> Float32Array:
     """Return an image of colors averaged down in linear light, display-referred.
 
-    Its shape is (height, width, 3), or 4 with the opacity if `keep_alpha`. Transparent
-    pixels do not count in the mean of colors.
+    Colors are weighted by opacity, so that transparent pixels do not count.
+
+    Args:
+        image: the image.
+        target_shape: height and width of the result.
+        keep_alpha: whether opacity is returned as a fourth channel.
     """
     width, height = image.size
     linear_of_level = srgb_to_linear(_VALUE_OF_LEVEL)
@@ -158,7 +168,8 @@ def average_in_bands(
 ) -> Float32Array:
     """Average down an image that is too large to hold in floats.
 
-    The result is that of `average_area` for the full image.
+    The image is loaded and averaged band by band. The result is the same as that of
+    `average_area` for the full image.
 
     Args:
         load_band: returns rows from its first argument to before its second, (n, W, C)
@@ -200,8 +211,11 @@ def _average(
 ) -> Float32Array:
     """Average an image (R, C, K) by weights of rows (H, R) and of columns (W, C).
 
-    Returns (H, W, K). First along rows and then along columns; for each the other two
-    axes are made one, since a sparse matrix multiplies matrices only.
+    The weights of rows are applied first, then those of columns. Each time the other
+    two axes are merged into one, since a sparse matrix can only multiply a matrix.
+
+    Returns:
+        The averaged image (H, W, K).
     """
     rows, columns, channels = image.shape
     height = row_weights.shape[0]
@@ -226,10 +240,11 @@ def _average(
 def _compute_overlaps(source: int, target: int) -> sparse.csr_array:
     """Return the weights (target, source) of source cells in target cells.
 
-    Both grids divide the same length, into `source` and into `target` equal cells. A
-    weight is the length that two cells have in common, normalised so that rows sum to
-    1. The edges of both grids cut the length into pieces, each of which lies in one
-    cell of either: its length is added to the weight of these two.
+    Both grids divide the same length, one into `source` and the other into `target`
+    equal cells. A weight is the length of the overlap of two cells, normalised so that
+    each row sums to 1. To find overlaps, the length is cut at the edges of both grids.
+    Each piece then lies in one source cell and in one target cell, and its length is
+    their overlap.
     """
     target_edges = np.arange(target + 1) * (source / target)
     all_edges = np.unique(
@@ -281,7 +296,8 @@ class FileImages:
     def max_side(self) -> int:
         """Longest side of a texture.
 
-        The more materials there are the smaller, so that their memory is bounded.
+        It is halved until the textures of all materials together have at most as many
+        texels as `MAX_FULL_TEXTURES` of full size, so that memory is bounded.
         """
         if self.limit is not None:
             return self.limit
@@ -312,9 +328,10 @@ class FileImages:
         at each call.
 
         Args:
-            key: the same for the same image.
-            read_bytes: returns its file; raises OSError or ValueError if there is none.
-            kind: what it holds.
+            key: identifies the image in the cache, such as its name.
+            read_bytes: returns the content of its file; raises OSError or ValueError if
+                there is none.
+            kind: what it holds, such as "colours".
             name: its name in the file.
             message: the note, with {name} and {why}.
         """
@@ -340,7 +357,12 @@ class FileImages:
     ) -> Float32Array | str:
         """Return the values of an image, or the reason why there are none.
 
-        A note says so if it was made smaller.
+        A note is added if the image was made smaller.
+
+        Args:
+            read_bytes: returns the content of its file.
+            kind: what it holds, such as "numbers".
+            name: its name in the file, for notes.
         """
         try:
             image = Image.open(io.BytesIO(read_bytes()), formats=FORMATS)
@@ -365,8 +387,12 @@ class FileImages:
     def _load_within_limits(self, image: Image.Image, kind: ImageKind) -> Float32Array:
         """Return the values of an opened image, and count its pixels.
 
-        Those of all images of its sort, numbers or colors, are limited in total. Raises
-        what `load_display_image` does.
+        The pixels of all images with numbers are limited in total, and so are those of
+        all images with colors.
+
+        Raises:
+            FileFormatError: a limit is exceeded, or the format is not read.
+            OSError, ValueError, SyntaxError: the pixels are truncated or corrupt.
         """
         width, height = image.size
         is_raw = kind == "numbers"

@@ -89,7 +89,11 @@ class Element:
 
 
 def read_elements(data: bytes, notes: Notes) -> tuple[dict[str, Element], list[str]]:
-    """Return the elements of a PLY file by name, and its comments.
+    """Return the elements of a PLY file by name, such as "vertex", and its comments.
+
+    Args:
+        data: the bytes of the file.
+        notes: notes about the file.
 
     Raises:
         FileFormatError: the file is no PLY file, has an unknown header, or is shorter
@@ -100,7 +104,7 @@ def read_elements(data: bytes, notes: Notes) -> tuple[dict[str, Element], list[s
     ends_in_returns = data.startswith(b"ply\r") and not data.startswith(b"ply\r\n")
     header_end = _END.search(data.replace(b"\r", b"\n") if ends_in_returns else data)
     if not has_magic or header_end is None:
-        # Of bytes, the message says what kind of file they are.
+        # Given bytes, `damaged` tells in its message what kind of file they are.
         got = "half of one" if has_magic else data
         raise notes.damaged("a PLY file with a complete header", got)
     elements, comments, byte_order = _parse_header(
@@ -108,7 +112,8 @@ def read_elements(data: bytes, notes: Notes) -> tuple[dict[str, Element], list[s
     )
     notes.check_faces(elements["face"].count if "face" in elements else 0)
     body = data[header_end.end() :]
-    # `cells` are bytes to read from: of an ASCII file, those of its numbers as float64.
+    # `cells` are the bytes that rows are read from. The numbers of an ASCII file are
+    # parsed to float64 first; then their bytes are read as those of a binary file.
     if byte_order:
         cells = np.frombuffer(body, np.uint8)
         text = b""
@@ -116,8 +121,7 @@ def read_elements(data: bytes, notes: Notes) -> tuple[dict[str, Element], list[s
         cells = parse_number_array(body, np.float64).view(np.uint8)
         text = body
     position = 0
-    # All rows are assumed to be as long as the first, so that values are gathered at
-    # once. Where lists turn out to differ in length, rows are walked one by one.
+    # Each element begins where the one before it ends.
     for element in elements.values():
         position = _RowReader(notes, element, cells, text).read(position)
     return elements, comments
@@ -128,8 +132,11 @@ def _parse_header(
 ) -> tuple[dict[str, Element], list[str], str]:
     """Parse the lines of a PLY header.
 
-    A property belongs to the element before it; its type has the byte order of the
-    format, which stands first. Raises FileFormatError for any other line.
+    A property belongs to the element above it. Its type has the byte order of the
+    `format` line, which is above all elements.
+
+    Raises:
+        FileFormatError: a line is not understood, or there is no `format` line.
 
     Returns:
         The elements by name, with the types of their properties and no values yet; the
@@ -203,6 +210,7 @@ class _RowReader:
     text: bytes
 
     def __post_init__(self) -> None:
+        """Make the views of the bytes, and find the sizes of scalars and counts."""
         element = self.element
         self.values = {
             name: self._view_from_any_byte(kind) for name, kind in element.types.items()
@@ -227,9 +235,11 @@ class _RowReader:
         """
         if not self.element.count or not self.widths:
             return position
-        # At least the scalars and counts have to be there, before memory is taken for
-        # rows.
+        # The header may state any number of rows. Before memory is allocated for them,
+        # check that the file is long enough at least for their scalars and counts.
         self._check_end(position + self.element.count * sum(self.widths.values()))
+        # Rows are first assumed to be as long as the first one, which is fast. If the
+        # lists at these positions differ in length, rows are walked one by one.
         starts, end = self._find_even_rows(position)
         lists_differ = end > len(self.cells) or any(
             np.ptp(numbers[starts[name]]) != 0 for name, numbers in self.counts.items()
@@ -260,6 +270,8 @@ class _RowReader:
 
     def _walk_rows(self, position: int, n_rows: int) -> tuple[dict[str, IntArray], int]:
         """Walk through rows one by one, from the byte at a position.
+
+        A row is its properties in their order. A list is a count and then its values.
 
         Returns:
             For each property the bytes at which it begins, (n_rows,); and the byte
@@ -331,7 +343,10 @@ def _gather_lists(
 
 
 def _make_length_error(notes: Notes, element: Element, text: bytes) -> FileFormatError:
-    """Return the error for a file that ends within an element."""
+    """Return the error for a file that ends within an element.
+
+    An ASCII file seems to end where a word is not a number; then the error names it.
+    """
     words = map(decode_text, text.split())
     odd_word = next((word for word in words if not is_number(word)), None)
     got = "fewer; the file is cut short"
@@ -366,6 +381,11 @@ _TEXTURE = re.compile(r"texture_?file\s*[:=]?\s+(.*)", re.IGNORECASE)
 def read_ply(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     """Read a PLY file as one part for each texture.
 
+    Args:
+        path: path of the file.
+        data: its bytes.
+        notes: notes about the file, to which sentences are added.
+
     Raises:
         FileFormatError: the file is corrupt, refers to vertices that are not there, or
             has no faces.
@@ -396,6 +416,12 @@ def _combine_colors(
     """Return the surface of some faces and the colors that tint it.
 
     A texture has precedence over the colors of vertices and faces.
+
+    Args:
+        surface: the surface of the faces.
+        colors: (T, 3, 3) linear colors of the corners of all triangles, or None.
+        group: indices of the triangles with the surface.
+        notes: notes about the file.
     """
     if colors is None:
         return surface, None
@@ -409,9 +435,15 @@ def _combine_colors(
 def _make_parts(
     reader: _Properties, points: Float64Array, texture_names: Sequence[str]
 ) -> list[ImportedPart]:
-    """Return the faces of a file as parts, given its points (N, 3) and textures.
+    """Return the faces of a file as parts.
 
-    A part for each texture, and others for faces without texture coordinates.
+    There is a part for each texture. Faces without texture coordinates are parts of
+    their own.
+
+    Args:
+        reader: reads the properties of vertices and faces.
+        points: (N, 3) positions of the vertices.
+        texture_names: files of textures that the comments name.
     """
     notes = reader.notes
     corners, corner_counts = reader.read_polygons(len(points))
@@ -511,7 +543,12 @@ class _Properties:
     ) -> tuple[str, ...]:
         """Return the first group of names that are all properties, () if none is.
 
-        These properties of the element count as read.
+        The properties of that group count as read.
+
+        Args:
+            element: name of the element.
+            properties: names of the element's properties.
+            groups: groups of names, such as ("red", "green", "blue").
         """
         for group in groups:
             if all(name in properties for name in group):
@@ -551,8 +588,8 @@ class _Properties:
     def _find_corner_lists(self) -> ListValues | None:
         """Return the vertices of the corners of each face, or None.
 
-        If no list of faces has one of the known names, any other counts, but those of
-        texture coordinates.
+        If no list of the faces has one of the known names, any other list is taken,
+        except for those of texture coordinates.
         """
         names: tuple[str, ...] = CORNER_NAMES
         if "face" in self.elements:
@@ -563,7 +600,17 @@ class _Properties:
     def _check_polygons(
         self, corners: IntArray, counts: IntArray, n_points: int
     ) -> None:
-        """Check what `read_polygons` returns. Raises FileFormatError as it does."""
+        """Check the polygons of the file.
+
+        Args:
+            corners: (C,) the vertex of each corner of the polygons.
+            counts: (P,) how many corners each polygon has.
+            n_points: how many vertices there are.
+
+        Raises:
+            FileFormatError: there is no polygon with 3 corners, one has too many, or
+                refers to a vertex that is not there.
+        """
         if (counts < 3).all():
             got = "points or lines only; export triangles"
             if self.has_splats:
@@ -586,8 +633,8 @@ class _Properties:
     ) -> IndexedValues | None:
         """Return the texture coordinates of triangles, or None if there are none.
 
-        Files store them with the corners of faces (wedges), or else with vertices.
-        Faces that have not two numbers for each corner have none, which is noted.
+        Files store them with the corners of faces (MeshLab calls these wedges), or else
+        with vertices.
 
         Args:
             corners: (C,) the vertex of each corner of the polygons.
@@ -607,7 +654,13 @@ class _Properties:
     ) -> IndexedValues:
         """Return the texture coordinates of triangles from the lists of faces.
 
-        `counts` and `triangles` are as for `read_uvs`.
+        A face must have two numbers for each of its corners. Others have no texture
+        coordinates, which is noted.
+
+        Args:
+            wedges: the list of each face: u, v, u, v, ...
+            counts: (P,) how many corners each polygon has.
+            triangles: (T, 3) corners of the polygons.
         """
         # Triangles of strips, which come after the faces, have no wedges.
         wedge_counts = np.zeros(len(counts), np.int64)
@@ -662,7 +715,12 @@ class _Properties:
     ) -> Float64Array | None:
         """Return the linear colors (..., 3) of rows of an element, or None.
 
-        An index past the last row has neutral grey: triangles of strips have no row.
+        Triangles of strips have no row among the faces. Their index is past the last
+        row, and gives neutral grey.
+
+        Args:
+            element: name of the element, "vertex" or "face".
+            index: (...) rows of the element.
         """
         values = self.read_columns(element, COLOR_NAMES)
         if values is None:
@@ -682,7 +740,10 @@ class _Properties:
     def _mark_opaque_alphas(
         self, element: str, color_type: np.dtype[np.generic]
     ) -> None:
-        """Count the alphas of an element as read that are opaque in all rows."""
+        """Mark alphas of an element as read, so unnoted, if they are opaque everywhere.
+
+        Other alphas are left out, with the note that all unread properties get.
+        """
         scalars = self.elements[element].scalars
         for name in set(ALPHA_NAMES) & set(scalars):
             alphas = scalars[name].astype(np.float64)
@@ -697,9 +758,9 @@ class _Properties:
     ) -> IntArray:
         """Return the index of each polygon's texture, (P,); -1 for none.
 
-        It is the `texnumber` of faces, or that of a face's first vertex. Without any,
-        all polygons have the first texture. A number of a texture that there is not is
-        noted.
+        It is the `texnumber` of faces, or that of a face's first vertex. Without
+        either, all polygons have the first texture. A number for which the file names
+        no texture is noted.
 
         Args:
             names: the textures of the file.
@@ -721,7 +782,7 @@ class _Properties:
         if element == "face":
             texture[: len(numbers)] = numbers  # triangles of strips keep -1
         else:
-            # The first corner of an empty polygon at the end would be out of range.
+            # A polygon without corners at the end would begin past the last corner.
             first_corner = np.cumsum(counts) - counts
             texture = numbers[corners[np.minimum(first_corner, len(corners) - 1)]]
         is_wrong = (texture < -1) | (texture >= len(names))
@@ -746,8 +807,11 @@ class _Properties:
     ) -> list[ImportedSurface]:
         """Return the surface of each texture.
 
-        Its alpha is left out, with a note if it is not opaque. `has_no_colors` is
-        whether the file has no colors that could replace a texture.
+        Its alpha is left out, with a note if it is not opaque.
+
+        Args:
+            names: the texture files that the file names.
+            has_no_colors: whether the file has no colors that could replace a texture.
         """
         pictures = FileImages(len(names), References(Path(self.notes.path)), self.notes)
         surfaces = {}
@@ -778,9 +842,10 @@ def _to_integers(values: npt.NDArray[np.generic]) -> IntArray:
 def _find_scale(values: Float64Array, kind: np.dtype[np.generic]) -> float:
     """Return the value of full brightness in colors (N, C) of a type.
 
-    Of floats it is 1, or 255 if some are clearly over 1. Of integers of 8 bits it is
-    255, and of 16 bits 65535. Wider ones often hold values of a narrower type: it is
-    the smallest of 255, 65535 and their type's largest value that all of them fit.
+    For floats it is 1, or 255 if some are clearly over 1. For integers of 8 bits it is
+    255, and for 16 bits 65535. Wider integers often hold values of a narrower type. For
+    these it is the smallest of 255, 65535 and the type's largest value that no color
+    exceeds.
     """
     largest = float(np.nan_to_num(values).max(initial=0.0))
     if kind.kind == "f":
@@ -798,12 +863,12 @@ def _find_scale(values: Float64Array, kind: np.dtype[np.generic]) -> float:
 def _split_strips(vertices: IntArray, counts: IntArray) -> IntArray:
     """Return the triangles (T, 3) of triangle strips.
 
-    A strip's triangles are each three successive vertices of it. Every second one is
-    wound backwards, and turned here. A vertex of -1 ends a strip and starts a new one
-    after it. Triangles with a repeated vertex are left out.
+    Each three successive vertices of a strip are a triangle. Every second triangle is
+    wound backwards, so two of its corners are swapped here. A vertex of -1 ends a
+    strip; a new one begins after it. Triangles with a repeated vertex are left out.
 
     Args:
-        vertices: those of all strips, concatenated.
+        vertices: the vertices of all strips, concatenated.
         counts: (S,) how many vertices each strip has.
     """
     is_strip_start = np.zeros(len(vertices) + 1, dtype=np.bool_)

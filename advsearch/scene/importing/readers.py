@@ -52,8 +52,14 @@ def get_reader(suffix: str) -> Reader:
 def read_mesh_bytes(path: Path, what: str, suffixes: tuple[str, ...]) -> bytes:
     """Return the content of a mesh or scene file, converted to binary glTF if needed.
 
+    Args:
+        path: the file.
+        what: what it should hold, such as "object", for messages.
+        suffixes: suffixes that it may have, in lower case with the dot.
+
     Raises:
-        FileFormatError: as for `read_bytes`; or the file cannot be converted.
+        FileFormatError: the file has another suffix, cannot be read, or cannot be
+            converted.
     """
     data = read_bytes(path, what, suffixes)
     converter = _CONVERTERS.get(path.suffix.lower().removeprefix("."))

@@ -109,9 +109,9 @@ def import_scene(path: Path, node: str) -> ImportedScene:
 
     Raises:
         UnknownNameError: no node of that name has a mesh, or one below it.
-        FileFormatError: as for `import_object`.
-        InputError: as for `import_object`; or several nodes have the name; or there are
-            too many other meshes and lights.
+        FileFormatError: the file is missing, corrupt, or has no faces.
+        InputError: the geometry cannot be used; several nodes have the name; or there
+            are too many other meshes and lights.
     """
     data = read_mesh_bytes(path, "scene", GLTF_SUFFIXES)
     header = gltf.read_header(path, data)
@@ -124,6 +124,7 @@ def import_scene(path: Path, node: str) -> ImportedScene:
     n_other_meshes = len({part.node for part in parts} - object_nodes)
     _check_surroundings(path, n_other_meshes + len(lights))
     front = find_front(path, header)
+    # y is up in glTF. Everything around the object is put into the object's frame.
     frame = _compute_frame(object_parts, compute_rotation("y", front.axis))
     names = UniqueNames(RESERVED_NAMES)
     surroundings = _make_surrounding_meshes(
@@ -201,9 +202,19 @@ def _make_lamps(
     names: UniqueNames,
     frame: FileFrame,
 ) -> list[ScenePart]:
-    """Return the lights of nodes as lamps; arguments and errors as for `_make_lamp`.
+    """Return the lights of nodes as lamps.
 
-    Nodes are indices; `names` are those that are taken, to which theirs are added.
+    Args:
+        path: the file, for messages.
+        header: header of the file.
+        lights: the light of each node that has one, by the node's index.
+        candela_per_unit: how many candela are one unit of radiant intensity.
+        node_poses: pose (4, 4) of each node, by its index.
+        names: names that are taken; those of the lamps are added.
+        frame: frame of the object.
+
+    Raises:
+        InputError: a light is too far away or too bright.
     """
     lamps: list[ScenePart] = []
     for index, light in lights.items():
@@ -216,8 +227,15 @@ def _make_lamps(
 def _find_node(
     path: Path, header: Header, parts: Sequence[ImportedPart], name: str
 ) -> int:
-    """Return the index of the node of a name that has geometry, or a descendant with
-    it.
+    """Return the index of the node with a name that draws geometry.
+
+    A node counts if it or one of its descendants draws something.
+
+    Args:
+        path: the file, for messages.
+        header: header of the file.
+        parts: what its nodes draw.
+        name: name of the node, or "node 3" for the one with that index.
 
     Raises:
         UnknownNameError: there is none.
@@ -270,7 +288,8 @@ def _make_surrounding_mesh(
     """
     frame = _compute_frame(parts, object_frame.rotation)
     shape = make_object(parts, notes=[], file=path, name=name, up="y", front=front)
-    # Both are meshes of extent 1, so their sizes in the file make the scale.
+    # Both meshes are normalised to an extent of 1. The scale restores the ratio of
+    # their sizes in the file.
     mesh_to_object = np.eye(4)
     mesh_to_object[:3, :3] *= frame.size / object_frame.size
     mesh_to_object[:3, 3] = object_frame.to_frame(frame.origin)
@@ -282,10 +301,11 @@ def _make_surrounding_mesh(
 def list_node_names(path: Path) -> list[str]:
     """Return the node names that `import_scene` accepts for a glTF file.
 
-    A name that several nodes have is listed once.
+    Nodes are listed if they or their descendants have a mesh. A name that several nodes
+    have is listed once.
 
     Raises:
-        FileFormatError: as for `import_object`.
+        FileFormatError: the file is missing, corrupt, or no glTF.
     """
     header = gltf.read_header(path, read_mesh_bytes(path, "scene", GLTF_SUFFIXES))
     with_mesh = {
@@ -348,11 +368,11 @@ def _group_by_node(parts: Iterable[ImportedPart]) -> dict[int, list[ImportedPart
 def list_contents(path: Path) -> Contents:
     """Return what can be imported from a mesh or glTF file.
 
-    Mitsuba's files have a function of the same name in their own module.
+    For Mitsuba's files see `scene_files.read_contents`.
 
     Raises:
-        FileFormatError: as for `import_object`.
-        InputError: as for `import_object`.
+        FileFormatError: the file is missing, of another kind, corrupt, or has no faces.
+        InputError: the geometry cannot be used, such as vertices that all coincide.
     """
     data = read_mesh_bytes(path, "object", (*list_suffixes(), MITSUBA_SUFFIX))
     parts, notes = read_parts(path, data)
@@ -412,9 +432,12 @@ class FileFrame:
 def _compute_frame(parts: Sequence[ImportedPart], turn: Float64Array) -> FileFrame:
     """Return the frame in which parts have extent 1, stand on z = 0 and are centred.
 
-    The largest extent is meant; parts are centred in x and y. Only visible faces with
-    an area count, as the repair of the geometry leaves no others. `turn` (3, 3) leads
-    from the file's axes to ours.
+    The largest extent becomes 1, and parts are centred in x and y. Only visible faces
+    with an area count, since the repair of the geometry removes all others.
+
+    Args:
+        parts: the parts.
+        turn: rotation (3, 3) from the file's axes to ours.
     """
     face_corners = []
     for part in select_visible(parts):
@@ -440,11 +463,19 @@ def _find_light_unit(
 ) -> tuple[float, str]:
     """Return how many candela are one unit of radiant intensity, and a note on it.
 
-    glTF has lamps in candela and surfaces in nit (candela per square metre); a nit of a
-    surface is one unit here. Exporters write watts times `LUMENS` for lamps. So where
-    there are lamps alone, `LUMENS` candela are one unit. Where there are surfaces that
-    emit light too, what counts is how bright both are relative to each other: as glTF
-    says, or in Blender's files as Blender shows them. The note is empty, or a sentence.
+    glTF states lamps in candela and surfaces in nit (candela per square metre); a nit
+    of a surface is one unit here. Exporters write watts times `LUMENS` for lamps. So if
+    there are only lamps, `LUMENS` candela are one unit. If surfaces emit light too, the
+    ratio of both counts: it is that of glTF, or in Blender's files the one that Blender
+    shows.
+
+    Args:
+        header: header of the file.
+        parts: what its nodes draw.
+        has_lights: whether it has lamps.
+
+    Returns:
+        The candela of one unit; and a sentence for the warnings, or "".
     """
     if header.asset.generator == GENERATOR:
         # A light of USD emits radiance, as its surfaces do.
@@ -524,10 +555,16 @@ def _position_light(
 ) -> tuple[Float64Array, Float64Array]:
     """Return the position (3,) of a light and its radiant intensity (3,).
 
-    A directional light has lux. It becomes a lamp so far away that its rays are
-    parallel, with an intensity of lux times squared distance, which is the same lux at
-    the object. Lengths of others are divided by the object's size, so that intensities
-    are divided by its square. Arguments are those of `_make_lamp`.
+    A directional light is stated in lux. It becomes a lamp so far away that its rays
+    are almost parallel. With the intensity lux times squared distance, it causes the
+    same lux at the object. For other lights, lengths are divided by the object's size,
+    so intensities are divided by its square.
+
+    Args:
+        light: its entry in the header.
+        candela_per_unit: how many candela are one unit of radiant intensity.
+        pose: pose (4, 4) of its node.
+        frame: frame of the object.
     """
     intensity = np.array(light.color) * light.intensity / candela_per_unit
     if light.type == "directional":
@@ -554,21 +591,31 @@ def _make_cameras(
 def _make_camera(
     path: Path, name: str, camera: CameraEntry, pose: Float64Array, frame: FileFrame
 ) -> PosedCamera:
-    """Return a perspective camera of a file, whose node has a pose (4, 4).
+    """Return a perspective camera of a file.
+
+    Args:
+        path: the file, for messages.
+        name: name of the camera.
+        camera: its entry in the header.
+        pose: pose (4, 4) of its node.
+        frame: frame of the object.
 
     Raises:
         InputError: it is too far away, has a singular or sheared pose, or too wide a
             field of view.
     """
     assert camera.perspective is not None
-    # columns are the camera's axes in ours, made unit vectors: the scale does not count
+    # The columns are the camera's axes in our coordinates. The scale of its node has no
+    # effect, so they are made unit vectors.
     axes = frame.rotation @ pose[:3, :3] @ GLTF_CAMERA_AXES
     axes = axes / np.maximum(np.linalg.norm(axes, axis=0), 1e-12)
     matrix = np.eye(4)
     matrix[:3, :3] = axes
     matrix[:3, 3] = frame.to_frame(frame.rotation @ pose[:3, 3])
-    # Without one, the aspect ratio is that of the image (section 5.13), and the field
-    # of view is that of the height.
+    # `yfov` is along the height. In a wide image the larger side is the width, with a
+    # tangent larger by the aspect ratio. If the file states none, it is that of the
+    # rendered image (section 5.13), for which `upright` tells that `fov` is the
+    # height's.
     aspect_ratio = camera.perspective.aspectRatio
     half_tangent = math.tan(camera.perspective.yfov / 2.0)
     fov = math.degrees(2.0 * math.atan(half_tangent * max(aspect_ratio or 1.0, 1.0)))

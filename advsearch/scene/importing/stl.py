@@ -34,9 +34,14 @@ _FACETS_START = _HEADER_SIZE + 4
 def read_stl(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     """Read an STL file as one part.
 
-    It is binary if it has the length that its number of facets asks for, whatever it
-    begins with; text begins with "solid". Its facet normals are ignored and computed
-    anew, as in other programs.
+    A file is binary if its length fits its number of facets, even if it begins with
+    "solid", as text does. Its facet normals are ignored and computed anew, as in other
+    programs.
+
+    Args:
+        path: path of the file.
+        data: its bytes.
+        notes: notes about the file, to which sentences are added.
 
     Raises:
         FileFormatError: the file is corrupt, or has no facets.
@@ -91,7 +96,9 @@ def _read_facets(data: bytes, notes: Notes) -> tuple[Float64Array, Float64Array 
 def _read_magics_color(head: bytes, notes: Notes) -> Float32Array | None:
     """Return the display color (3,) of the object that Magics writes into the header.
 
-    None if it has none. An opacity and a material, which are not read, are recorded.
+    The result is None if it has none. The header has ``COLOR=`` and four bytes: red,
+    green, blue and opacity. An opacity and a ``MATERIAL=`` entry are not read, and are
+    recorded as left out.
     """
     keyword_start = head.find(b"COLOR=")
     color_start = keyword_start + len(b"COLOR=")
@@ -111,14 +118,17 @@ def _read_magics_color(head: bytes, notes: Notes) -> Float32Array | None:
 def _parse_text(data: bytes, notes: Notes) -> Float64Array:
     """Return the points (3 F, 3) of an ASCII file.
 
-    Words that the format does not have are recorded. Raises FileFormatError if the file
-    is cut short, or facets have not three vertices of three numbers.
+    Words that the format does not have are recorded as left out.
+
+    Raises:
+        FileFormatError: the file is cut short, or a facet does not have three vertices
+            of three numbers.
     """
     if not re.search(rb"\bend\s?solid", data, re.IGNORECASE):
         raise notes.damaged(
             "an ASCII STL file that ends in 'endsolid'", "one that is cut short"
         )
-    # Names may have any words.
+    # The lines with the name of the solid may have any words, and are removed.
     data = _NAME_LINE.sub(b"", data.replace(b"\r", b"\n"))
     vertices = _VERTEX.findall(data)
     notes.check_faces(len(vertices) // 3)
@@ -144,10 +154,12 @@ def _read_colors(
 ) -> Float64Array | None:
     """Return the linear color of each facet, (F, 3), or None if there are none.
 
-    Two programs store them with 5 bits for each channel. Magics writes ``COLOR=`` and
-    four bytes, the color of the object, into the header; the lowest bits of a facet are
-    red, and its highest bit is not set. VisCAM has blue in the lowest bits, and sets
-    the highest bit of facets with a color.
+    Two programs store colors in the 16 attribute bits of a facet, 5 bits a channel:
+
+    - Magics writes the color of the object into the header, after ``COLOR=``. Red is in
+      the lowest bits of a facet. The highest bit is not set if the facet has a color.
+    - VisCAM has blue in the lowest bits, and sets the highest bit if the facet has a
+      color.
 
     Args:
         head: the header of the file.

@@ -90,10 +90,10 @@ def apply_textures(
 ) -> tuple[TriangleSoup, SurfaceMaps]:
     """Give every corner of a repaired soup UVs in [0, 1], and make the maps that fit.
 
-    The file's UVs and images are used if all faces share them and they can be used
-    unchanged: then the soup is cropped to the window of its UVs at most. Otherwise it
-    is unwrapped, the images are baked, and a note says why. A soup of one color has a
-    plain map, and keeps its UVs if these are usable.
+    The file's UVs and images are used if all faces have the same images and these can
+    be used without baking; at most they are cropped to the window that the UVs use.
+    Otherwise the soup is unwrapped, the images are baked, and a note says why. A soup
+    of one color gets a small plain map, and keeps its UVs if these are usable.
 
     Args:
         soup: a repaired soup.
@@ -109,7 +109,7 @@ def apply_textures(
     # `soup.colors` are factors of the base color
     has_uniform_factor = bool((soup.colors == soup.colors[0, 0]).all())
     _, material = index_materials(soup, surfaces)
-    # What needs no baking returns; the rest is baked.
+    # Cases that need no baking return here.
     is_lit_twice = False
     if is_uniform and has_uniform_factor:
         if not first_surface.images:
@@ -145,7 +145,16 @@ def _describe_size(
 def _texture_plain(
     soup: TriangleSoup, surface: ImportedSurface, material: IntArray
 ) -> tuple[TriangleSoup, SurfaceMaps]:
-    """Return a soup of one color with UVs, the file's if they do not overlap."""
+    """Return a soup of one color with UVs, and a plain map for it.
+
+    The UVs are those of the file if they are usable and faces of different materials do
+    not share texels; otherwise the soup is unwrapped.
+
+    Args:
+        soup: the object.
+        surface: its only surface, which has no images.
+        material: (F,) index of each face's material.
+    """
     keeps_uvs = _is_usable(soup, soup.uvs) and not _has_overlap(soup.uvs, material)
     if keeps_uvs:
         soup_with_uvs = replace(soup, uvs=np.clip(soup.uvs, 0.0, 1.0))
@@ -181,13 +190,18 @@ def index_materials(
 def _has_overlap(uvs: Float64Array, material: IntArray) -> bool:
     """Return whether faces of different materials share many texels.
 
-    Many is more than `_MAX_SHARED` of the texels that UVs (F, 3, 2) cover, at a size of
-    `BAKED_SIZE`. `material` (F,) is the index of each face's material. The negative
-    tolerance leaves out texels on the border of a face, which neighbours share.
+    Many is more than the fraction `_MAX_SHARED` of the texels that faces cover, in a
+    map of `BAKED_SIZE` texels a side.
+
+    Args:
+        uvs: (F, 3, 2) texture coordinates of the faces.
+        material: (F,) index of each face's material.
     """
     if material.min() == material.max():
         return False
     size = BAKED_SIZE
+    # The negative tolerance leaves out texels on the border of a face, which neighbours
+    # share.
     face, row, column, _ = rasterize_triangles(
         uvs * size - 0.5, (size, size), tolerance=-1e-6
     )
@@ -214,9 +228,9 @@ def _is_lit_twice(
 ) -> bool:
     """Return whether texels that emit light are on several faces.
 
-    Mitsuba would send light from one of these faces only. It is so if more than
-    `_MAX_SHARED` of the lit texels are on several; an emission that is the same
-    everywhere has no texels.
+    Mitsuba would send light from only one of these faces. A fraction of up to
+    `_MAX_SHARED` of the lit texels may be on several faces. An emission that is the
+    same everywhere has no texels to share.
 
     Args:
         uvs: (F, 3, 2).
@@ -250,8 +264,14 @@ def _describe_reason(
 ) -> str:
     """Return the reason why an object was baked, as a sentence for its warnings.
 
-    The first that holds of: several materials or pictures, colors of vertices, missing
-    texture coordinates, unusable ones.
+    The reasons are tried in this order: several materials or images, colors of
+    vertices, missing texture coordinates, unusable texture coordinates.
+
+    Args:
+        soup: the object.
+        used: the surfaces that have faces.
+        is_uniform: whether all of these have the same images and colors.
+        has_uniform_factor: whether vertex colors are the same everywhere.
     """
     if not is_uniform:
         # Materials without a name are told apart as objects.
@@ -305,8 +325,8 @@ def _tint(
 def _is_usable(soup: TriangleSoup, uvs: Float64Array) -> bool:
     """Return whether UVs (F, 3, 2) are in [0, 1], and neither squashed nor tiny.
 
-    Of the surface's area at most the fraction `_MAX_SQUASHED` may have none in UV
-    space, and all faces cover at least `_MIN_UV_AREA` there.
+    At most the fraction `_MAX_SQUASHED` of the surface may have no area in UV space,
+    and all faces together must cover at least the area `_MIN_UV_AREA` there.
     """
     if (
         not np.isfinite(uvs).all()
@@ -326,11 +346,16 @@ def _is_usable(soup: TriangleSoup, uvs: Float64Array) -> bool:
 def _move_into_unit_square(soup: TriangleSoup) -> Float64Array:
     """Move each chart by an integer offset so that it starts in the unit square.
 
-    A repeating texture looks the same. A chart is a set of faces that are connected by
-    corners with the same point and the same UV. The lower corner of its bounding box
-    ends up in [0, 1). Returns UVs (F, 3, 2).
+    The lower corner of each chart's bounding box ends up in [0, 1). As the texture
+    repeats, this changes nothing visible. A chart is a set of faces that are connected
+    by corners with the same point and the same UV.
+
+    Returns:
+        The moved UVs (F, 3, 2).
     """
     flat_uvs = soup.uvs.reshape(-1, 2)
+    # Corners with the same point and UV are one vertex of a graph, whose edges are the
+    # sides of faces; a chart is a component.
     corners = np.column_stack([soup.faces.reshape(-1), flat_uvs])
     _, vertex = np.unique(corners, axis=0, return_inverse=True)
     vertex = vertex.reshape(-1, 3)
@@ -349,8 +374,12 @@ def _crop_images(
 ) -> tuple[Float64Array, Sequence[Float32Array]] | None:
     """Return the file's UVs (F, 3, 2) moved into [0, 1], and the images for them.
 
-    None if these cannot be used: colors change the texture, faces lack UVs, or the UVs
-    are unusable. `surface` is that of all faces, and has images.
+    The result is None if vertex colors change the texture, if faces lack UVs, or if the
+    UVs are unusable.
+
+    Args:
+        soup: the object.
+        surface: surface of all faces, which has images.
     """
     is_untinted = surface.texture is None or soup.colors.min() == 1.0
     if not is_untinted or not np.isfinite(soup.uvs).all():
@@ -367,10 +396,11 @@ def _crop_to_window(
     """Crop images to the window that UVs span; the layout of the charts stays.
 
     The window is the bounding box of the UVs, one texel wider on each side, so that
-    filtering finds its neighbours. Images are cropped if UVs overstep the unit square,
-    or use only a small part of it; then texels are resampled, and keep their size. They
-    are left alone if UVs lie inside and fill enough of the square, or if the window is
-    larger than `_MAX_WINDOW` textures: there the textures repeat.
+    filtering finds the neighbours of its texels. Images are cropped if UVs overstep the
+    unit square, or use only a small part of it. Then they are resampled at texels of
+    the same size. Images stay as they are if UVs lie inside and fill enough of the
+    square, or if the window is larger than `_MAX_WINDOW` textures, since textures
+    repeat there.
 
     Args:
         uvs: (F, 3, 2).
@@ -415,9 +445,10 @@ def _crop_to_window(
 
 
 def _choose_size(n_texels: float) -> int:
-    """Return the width of square maps with room for so many texels.
+    """Return the width of square maps with room for a number of texels.
 
-    It is doubled from `BAKED_SIZE` up to `TEXTURE_LIMIT`, even if that has less room.
+    It is `BAKED_SIZE`, doubled until there is enough room, but at most `TEXTURE_LIMIT`.
+    Charts fill only the fraction `_FILL_FRACTION` of a map.
     """
     size = BAKED_SIZE
     while size < TEXTURE_LIMIT and size * size * _FILL_FRACTION < n_texels:
@@ -527,7 +558,11 @@ class _Texels(NamedTuple):
 
 
 def _make_blank_maps(surfaces: Sequence[ImportedSurface], size: int) -> SurfaceMaps:
-    """Return white, flat and dark maps (N, N, ...), of which surfaces need some."""
+    """Return blank maps (N, N, ...) as far as surfaces need them.
+
+    Colors are white and opaque, normals flat, and the emission black. The color has a
+    fourth channel if a surface has an opacity.
+    """
     has_opacity = any(_get_base_color(surface).shape[-1] == 4 for surface in surfaces)
     n_channels = 4 if has_opacity else 3
     color = np.ones((size, size, n_channels), np.float32)
@@ -548,7 +583,8 @@ def _get_base_color(surface: ImportedSurface) -> Float32Array:
 def _fill_gaps(maps: SurfaceMaps, is_inside: npt.NDArray[np.bool_]) -> SurfaceMaps:
     """Give texels outside of all charts the values of the nearest texel inside.
 
-    They emit light only close to a chart.
+    Such texels emit light only close to a chart, where filtering needs it: further away
+    the renderer would sample light from texels that no face shows.
     """
     distance, nearest = distance_transform_edt(~is_inside, return_indices=True)
     nearest_texel = tuple(nearest)
@@ -569,8 +605,14 @@ def _sample_base_color(
 ) -> Float32Array:
     """Return the base color (T, 3 or 4) of a surface at UVs (T, 2).
 
-    Display-referred. If some UVs are missing (NaN), all texels have the mean of the
-    texture over the faces of the soup that show it. `surfaces` are those of its parts.
+    The color is display-referred. If some UVs are missing (NaN), it is the same for
+    all: the mean of the texture over the faces of the soup that show it.
+
+    Args:
+        surface: the surface.
+        uvs: (T, 2) texture coordinates of the file.
+        soup: the object.
+        surfaces: the surfaces of its parts.
     """
     if surface.texture is not None and np.isfinite(uvs).all():
         return sample_colors(surface.texture, uvs)
@@ -589,8 +631,8 @@ def _sample_base_color(
 def _count_texels(soup: TriangleSoup, surfaces: Sequence[ImportedSurface]) -> float:
     """Return how many texels of the file's images an object shows.
 
-    Of a part that is the area of its UVs times the texels of the largest of its images;
-    where an image repeats, its texels count as often.
+    For a part this is the area of its UVs times the number of texels of its largest
+    image. Texels of an image that repeats count as often as they are shown.
     """
     n_texels = 0.0
     uv_areas = np.nan_to_num(np.abs(compute_doubled_areas(soup.uvs)) / 2.0)
@@ -654,9 +696,9 @@ def _compute_sample_weights(steps: int) -> Float64Array:
     """Return barycentric weights (P, 3) of points evenly spread over a triangle.
 
     Each side is cut into `steps` parts, which divides the triangle into steps**2 equal
-    ones. The points are the centers of these. A small one that points up has its corner
-    at the grid point (i, j) and its center a third of a step beyond it along both
-    sides; one that points down two thirds.
+    small triangles. The points are the centers of these. A small triangle that points
+    up begins at a grid point (i, j), and its center is a third of a step beyond it
+    along both sides. The center of one that points down is two thirds beyond it.
     """
     grid_i, grid_j = np.meshgrid(np.arange(steps), np.arange(steps))
     i = grid_i.reshape(-1)
@@ -676,8 +718,15 @@ def _compute_sample_weights(steps: int) -> Float64Array:
 def sample_colors(colors: Float32Array, uvs: Float64Array) -> Float32Array:
     """Sample a repeating texture of display-referred colors in linear light.
 
-    Interpolation is bilinear; what is transparent does not count. Arguments and result
-    are those of `sample_texture`.
+    Interpolation is bilinear. Transparent texels do not count: colors are weighted by
+    their opacity.
+
+    Args:
+        colors: (H, W, 3 or 4) display-referred colors, perhaps with opacity.
+        uvs: (T, 2), finite.
+
+    Returns:
+        (T, 3 or 4) display-referred float32.
     """
     return _to_display(sample_texture(_to_linear(colors), uvs))
 
@@ -731,11 +780,11 @@ def _unmirror(
 ) -> tuple[TriangleSoup, SurfaceMaps]:
     """Return a soup whose UVs mirror no face, and the maps for it.
 
-    Only a normal map needs it, as the renderer's bitangent differs from the file's on
-    mirrored faces, those whose UVs run clockwise. If (almost) all faces are mirrored,
-    the bumps' y is reversed. If some are, the maps get a second half to the right,
-    which is the first one mirrored, and these faces are moved there. No texel is
-    resampled.
+    A face is mirrored if its UVs run clockwise. There the renderer's bitangent is the
+    opposite of the file's, which matters only for a normal map. If (almost) all faces
+    are mirrored, the y of the normals is reversed. If only some are, the maps are
+    doubled in width: the right half is a mirrored copy of the left one, and the
+    mirrored faces are moved there. No texel is resampled.
 
     Args:
         soup: the object.
@@ -787,10 +836,10 @@ def convert_normals(
 ) -> Float32Array:
     """Convert texels of a normal map from the tangents of old UVs to those of new UVs.
 
-    A texel is the bump along tangent, bitangent and normal, stored as (n + 1) / 2. It
-    is turned within the surface; what is along the normal stays.
-
-    A normal that cannot be converted, where UVs have no area, becomes upright.
+    A texel stores a normal's components n along tangent, bitangent and surface normal
+    as (n + 1) / 2. The first two are rotated within the surface, and the third stays. A
+    normal on a face without area in UV space cannot be converted, and becomes (0, 0,
+    1).
 
     Args:
         texels: (T, 3) of the normal map.
@@ -823,8 +872,13 @@ def _compute_tangents(
 ) -> Float64Array:
     """Return unit tangents (T, 3) along u on faces (T,), orthogonal to normals (T, 3).
 
-    Each is the direction on its face in which u grows and v stays, without the part
-    along the normal. They are NaN where UVs have no area.
+    A tangent is the direction on the face in which u grows and v is constant, minus its
+    component along the normal. It is NaN where UVs have no area.
+
+    Args:
+        soup: the object, with the UVs.
+        normal: (T, 3) unit normals.
+        face: (T,) index of a face for each.
     """
     used_faces, used_index = np.unique(face, return_inverse=True)
     a, b, c = (soup.points[soup.faces[used_faces, k]] for k in range(3))

@@ -35,7 +35,13 @@ class TrackedKeys(Generic[T]):
         fold: Callable[[str], str] = str,
         prefix: str = "",
     ) -> None:
-        """Fold all keys; `prefix` stands before them in what is unread."""
+        """Fold all keys, and find those that a later one of the same form hides.
+
+        Args:
+            values: values by key, as the file spells the keys.
+            fold: turns a key into the form by which it is looked up.
+            prefix: is put before keys in the list of unread ones, such as "camera.".
+        """
         # Keys, as spelled, that a later one of the same form hides.
         self.repeated: list[str] = []
         self._fold = fold
@@ -56,8 +62,8 @@ class TrackedKeys(Generic[T]):
     def get(self, *keys: str) -> T | None:
         """Return the value of the first of some keys, in folded form, that has one.
 
-        None if none has. That key counts as read, and so do those of the others that
-        have no value.
+        The result is None if none has. The key whose value is returned counts as read.
+        So do those of the keys without a value; further keys with a value stay unread.
         """
         keys_with_value = [key for key in keys if self._values.get(key) is not None]
         self._read.update(key for key in keys if key not in keys_with_value[1:])
@@ -91,7 +97,9 @@ class TrackedKeys(Generic[T]):
     def find_unread(
         self, is_quiet: Callable[[str, T], bool] | None = None
     ) -> list[str]:
-        """Return the keys that were not read, as spelled, after those they are within.
+        """Return the keys that were not read, as the file spells them.
+
+        A nested key has the keys that it is in before it, with dots: "camera.k7".
 
         Args:
             is_quiet: returns whether a key, in folded form, with its value needs no

@@ -78,8 +78,8 @@ def _triangulate_faces(
     """Return points, UVs and normals of the triangles, and the polygon of each.
 
     Args:
-        tables: the rows of the file's points, UVs and normals.
-        corners: (C, 3) rows in these tables of the corners of all polygons.
+        tables: points, UVs and normals of the file, by the keywords "v", "vt" and "vn".
+        corners: (C, 3) rows in these three tables of the corners of all polygons.
         corner_counts: the number of corners of each polygon.
         notes: notes about the file.
     """
@@ -96,10 +96,15 @@ def _triangulate_faces(
 def _transform_uvs(
     uv: IndexedValues, square: int, mtl_surface: MtlSurface
 ) -> IndexedValues:
-    """Return texture coordinates as the textures of a material are laid.
+    """Return texture coordinates after the transform of a material's textures.
 
-    They are counted from the corner of their UDIM square, then scaled (``-s``) and
+    They are measured from the corner of their UDIM square, then scaled (``-s``) and
     shifted (``-o``).
+
+    Args:
+        uv: texture coordinates of the file.
+        square: number of the UDIM square, such as 1001; 0 for none.
+        mtl_surface: the material.
     """
     corner = mtl_surfaces.get_square_corner(square)
     uvs = (uv.values - corner) * mtl_surface.scale + mtl_surface.offset
@@ -159,8 +164,13 @@ class _Triangles:
 def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     """Read an OBJ file and the material files that it names.
 
-    Faces with the same material, smoothing and UDIM square become one part, and those
-    among them without texture coordinates another.
+    Faces with the same material, smoothing and UDIM square become one part; those among
+    them without texture coordinates become another one.
+
+    Args:
+        path: path of the file.
+        data: its bytes.
+        notes: notes about the file, to which sentences are added.
 
     Raises:
         FileFormatError: the file is of another kind, is cut short, refers to geometry
@@ -207,9 +217,9 @@ def _make_triangles(
 
     Args:
         lines: lines of the file.
-        tables: the rows of the file's points, UVs and normals.
-        faces: what `ObjLines.read_faces` returns.
-        statements: statements of the file.
+        tables: points, UVs and normals of the file, by the keywords "v", "vt" and "vn".
+        faces: what `ObjLines.read_faces` returns: corners, counts, rows of lines.
+        statements: material and smoothing statements, with the rows of their lines.
         reader: reader of the materials.
     """
     notes = lines.notes
@@ -217,7 +227,7 @@ def _make_triangles(
     position, uv, normal, polygon = _triangulate_faces(
         tables, corners, corner_counts, notes
     )
-    rows = face_rows[polygon]
+    rows = face_rows[polygon]  # of each triangle, the row of its face's line
     names, material = _find_values_in_effect(statements.material_changes, rows)
     notes.check_most(len(names), MAX_MATERIALS, "at most {} materials")
     is_flat = _find_flat_faces(statements.smoothing_changes, rows, normal, notes)
@@ -246,7 +256,7 @@ def _make_part(
         reader: reader of the materials.
         names_libraries: whether the file names material files.
     """
-    first = group[0]  # what holds of one holds of all
+    first = group[0]  # all triangles of the group have the same properties
     name = ""
     if triangles.material[first] >= 0:
         name = triangles.material_names[triangles.material[first]]
@@ -292,10 +302,16 @@ def _find_flat_faces(
     normal: IndexedValues,
     notes: Notes,
 ) -> BoolArray:
-    """Return for each triangle whether its smoothing group is off, (T,).
+    """Return for each triangle whether smoothing is off, (T,).
 
-    Before the first ``s`` it is not. Groups themselves are left out, which is noted
-    where normals have to be computed.
+    Before the first ``s`` statement it is on. The numbers of smoothing groups are not
+    read, which is noted if normals have to be computed.
+
+    Args:
+        smoothing_changes: rows of the ``s`` lines, and their words, such as "off".
+        rows: (T,) row of each triangle's face line.
+        normal: normals of the triangles' corners.
+        notes: notes about the file.
     """
     values, group = _find_values_in_effect(smoothing_changes, rows)
     is_off_by_group = [value in NOT_SMOOTH for value in values]
@@ -344,7 +360,7 @@ def _find_material(
     has_colors: bool,
     names_libraries: bool,
 ) -> MtlSurface:
-    """Return the material of a name, or a plain one and a note if there is none.
+    """Return the material of a name, or a plain one with a note if there is none.
 
     Without a name the surface is plain, and nothing is noted.
 
@@ -353,8 +369,8 @@ def _find_material(
         name: name of the material, perhaps empty.
         square_number: the UDIM square, 0 for none.
         has_colors: whether vertices have colors.
-        names_libraries: whether the file names material files. If so and none could be
-            read, a note says that already.
+        names_libraries: whether the file names material files. If it does and none
+            could be read, another note says so, and none is added here.
     """
     if not name:
         return MtlSurface(ImportedSurface())
@@ -382,8 +398,8 @@ def _combine_colors(
 ) -> tuple[ImportedSurface, Float64Array | None]:
     """Decide how vertex colors and a material's own color are combined.
 
-    A texture wins over vertex colors, and a material without a color has those alone; a
-    color of the material is multiplied by them.
+    If the material has a texture, vertex colors are left out. If it has a color, vertex
+    colors multiply it. If it has neither, vertex colors alone count.
 
     Args:
         surface: the material.
@@ -429,7 +445,10 @@ class _Statements(NamedTuple):
 
 
 def _parse_statements(lines: ObjLines, notes: Notes) -> _Statements:
-    """Parse the statements that are no numbers, and note those that are left out."""
+    """Parse the statements that are no numbers, and note those that are left out.
+
+    Statements that only name groups of faces, or switch something off, need no note.
+    """
     library_lines = list[str]()
     material_changes = list[tuple[int, str]]()
     smoothing_changes = list[tuple[int, str]]()
@@ -455,6 +474,10 @@ def _find_values_in_effect(
 ) -> tuple[list[str], IntArray]:
     """Find the value in effect on each row, given the rows at which it changes.
 
+    Args:
+        changes: rows and the values set there, in the order of rows.
+        rows: the rows at which the value is looked up.
+
     Returns:
         The different values, and for each row the index of the last one set before it,
         -1 if none was.
@@ -464,7 +487,7 @@ def _find_values_in_effect(
     change_rows = np.array([row for row, _ in changes], dtype=np.int64)
     # the last change on a row before; -1 if there is none
     last_change = np.searchsorted(change_rows, rows) - 1
-    # Position -1, of rows before the first change, is the last entry.
+    # Rows before the first change have position -1, which is the last entry: -1.
     index_of_change = np.array([*(index_of_value[value] for _, value in changes), -1])
     return values, index_of_change[last_change]
 
@@ -496,7 +519,8 @@ def _read_colors(
     if stored_colors is None:
         return None
     has_color = np.asarray(np.isfinite(stored_colors).all(axis=1))
-    # In [0, 1] a color may be a little over 1; in [0, 255] one of 2 is black.
+    # A color in [0, 1] may be a little over 1, but not over 2. In [0, 255] a file whose
+    # largest value is 2 would be black, which no one stores.
     is_in_bytes = has_color.any() and stored_colors[has_color].max() > 2.0
     scale = 255.0 if is_in_bytes else 1.0
     colors = np.where(has_color[:, None], stored_colors / scale, NEUTRAL_GREY)
@@ -538,8 +562,12 @@ class ObjLines:
     def __init__(self, data: bytes, notes: Notes) -> None:
         """Find the lines of a file, and the kind of each by its first bytes.
 
-        All lines at once: arrays of their first, second and third bytes are compared
-        with the keywords.
+        All lines are compared at once: the arrays of their first, second and third
+        bytes with those of the keywords.
+
+        Args:
+            data: the bytes of the file.
+            notes: notes about the file.
         """
         if b"\x00" in data:
             raise notes.damaged(EXPECTED, data)
@@ -581,8 +609,8 @@ class ObjLines:
     def read_table(self, kind: str) -> Float64Array:
         """Return the numbers of all lines of a kind, (N, columns) as in `TABLES`.
 
-        Numbers that a line does not have are 0 for ``vt`` and NaN for the others;
-        further ones are left out.
+        Numbers that a line lacks are 0 for ``vt`` and NaN for the others. Numbers
+        beyond the last column are left out.
 
         Raises:
             FileFormatError: a line has too few numbers, or other words.
@@ -598,12 +626,12 @@ class ObjLines:
         ).astype(np.float64, copy=False)
         if counts.min() < min_count or len(values) != counts.sum():
             self._raise_for_numbers(kind, rows)
-        # Where all lines have as many numbers, which is usual, the table is a reshape.
+        # If all lines have equally many numbers, as usual, the table is a reshape.
         if (counts == counts[0]).all():
             table = values.reshape(len(rows), -1)[:, :columns]
             n_missing = columns - table.shape[1]
             return np.pad(table, ((0, 0), (0, n_missing)), constant_values=fill)
-        # Otherwise each number goes to its line's row, and its place in the line.
+        # Otherwise each number is written to the row and column that it has.
         first_of_line = np.cumsum(counts) - counts
         column = np.arange(len(values)) - np.repeat(first_of_line, counts)
         row = np.repeat(np.arange(len(rows)), counts)
@@ -671,9 +699,12 @@ class ObjLines:
     def _check_sizes(self, rows: IntArray, sizes: IntArray) -> None:
         """Raise FileFormatError for a last face cut short, or faces over a limit.
 
-        A face of fewer than 3 corners counts as cut short only where the file ends in
-        its line without a line break. `rows` (P,) are the rows of the faces' lines, and
-        `sizes` (P,) their numbers of corners.
+        A face of fewer than 3 corners counts as cut short only if its line is the last
+        one of the file and has no line break.
+
+        Args:
+            rows: (P,) row of each face's line.
+            sizes: (P,) number of corners of each face.
         """
         is_last_line = rows[-1] == len(self.starts) - 1
         if sizes[-1] < 3 and self.is_unended and is_last_line:
@@ -709,7 +740,7 @@ class ObjLines:
         count_before = np.repeat(count_before_line[rows], sizes)
         if (index < -count_before).any():
             self._raise_for_faces(rows)
-        # -1 is the last row above the line, whose number is their count.
+        # With n rows above the line, -1 is row n (from 1): the index grows by n + 1.
         index[is_relative] += (count_before + 1)[is_relative]
 
     def read_zbrush_colors(self, count: int) -> Float64Array | None:
@@ -757,8 +788,8 @@ class ObjLines:
     def _raise_for_faces(self, rows: IntArray) -> NoReturn:
         """Raise FileFormatError for the first face that has a wrong index.
 
-        An index is a whole number that is not 0, and no further back than the rows
-        before the face's line.
+        An index must be an integer other than 0. A negative one must not go back
+        further than the first row.
         """
         counts_before_line = np.stack(
             [np.cumsum(self.kind == KINDS.index(kind)) for kind in TABLES], axis=1
@@ -821,10 +852,10 @@ def _count_words(data: Bytes) -> IntArray:
 def _find_columns(is_first: BoolArray, is_after_two_slashes: BoolArray) -> IntArray:
     """Return the column of each number in its corner, by the slashes before it.
 
-    In ``7//5`` the 7 is in column 0 and the 5, after two slashes, in column 2: the
-    column is the number of slashes in the corner before the number. As a corner has
-    three numbers at most, that is the sum of the slashes right before the number and
-    right before up to two predecessors in its corner.
+    The column is the number of slashes in the corner before the number: in ``7//5`` the
+    7 is in column 0 and the 5 in column 2. A corner has at most three numbers, so it is
+    enough to add the slashes right before the number and those right before its up to
+    two predecessors in the corner.
 
     Args:
         is_first: whether a number is the first of its corner.
@@ -858,7 +889,8 @@ def _parse_corners(data: Bytes) -> tuple[IntArray, IntArray] | None:
     # a blank is before the first number: the keyword was blanked out
     number_starts = np.flatnonzero(is_digit[1:] & ~is_digit[:-1]) + 1
     is_first = is_blank[number_starts - 1]  # of its corner
-    # whether two slashes are before it, which counts only if it is not the first
+    # The byte two before a number is a slash if two slashes are before it. For the
+    # first number of a corner, `_find_columns` ignores that.
     column = _find_columns(is_first, is_slash[number_starts - 2])
     # three numbers in a row that are not the first of a corner: it has four
     has_fourth = ~(is_first[3:] | is_first[2:-1] | is_first[1:-2])

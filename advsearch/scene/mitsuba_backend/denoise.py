@@ -95,9 +95,11 @@ def denoise_image(
             to 6 are the change of the radiance of the plane that takes the shadow in a
             photograph, 7 to 9 that of what its coat reflects, and 10 to
             12 the environment in the coat.
-        albedo, normal: as for `denoise`.
-        plane_radiance: (3,) of the plane without the object; None if there is no plane.
-        quick: as for `denoise`.
+        albedo, normal: (H, W, 3) float32 reflectance in [0, 1] and shading normal of
+            the first hit.
+        plane_radiance: (3,) radiance of the plane without the object; None if there is
+            no plane.
+        quick: whether to take less time, and leave a little more error.
     """
     color = rendered[..., :3].contiguous()
     coverage = rendered[..., 3:4]
@@ -112,7 +114,8 @@ def denoise_image(
         is_surface = (normal != 0.0).any(dim=-1, keepdim=True)
         channels.append(plane_radiance * is_surface * relative_change)
     if rendered.shape[-1] > 7:
-        # what the coat reflects with the object and without it, each an image by itself
+        # What the coat reflects with and without the object are denoised as two images,
+        # and then subtracted.
         change = rendered[..., 7:10]
         before = rendered[..., 10:].contiguous()
         after = (before + change).clamp_min(0.0)
@@ -142,7 +145,8 @@ def _denoise_shade(
         remove_noise: denoises an image (H, W, 3) of numbers of at least 0.
     """
     both = torch.cat([change, visible], dim=-1)
-    # two box filters; the quotient is the mean change of what is visible nearby
+    # Two box filters are about a Gaussian one. The quotient is the mean change of what
+    # is visible nearby.
     for _ in range(2):
         both = _average(both, FILL_RADIUS)
     mean_nearby = both[..., :3] / both[..., 3:].clamp_min(1e-4)

@@ -99,7 +99,8 @@ def find_libraries(
     for pattern in patterns:
         matches = root.glob(pattern)
         paths += [path for path in matches if _NAME.fullmatch(path.name)]
-    # The dynamic loader knows only the real root, and may answer with a bare name.
+    # The dynamic loader knows only the real root. It may answer with a bare name, such
+    # as "libLLVM.so.19", which is no path.
     library = ctypes.util.find_library("LLVM") if root == Path("/") else None
     if library and os.sep in library:
         paths.append(Path(library))
@@ -139,7 +140,7 @@ def examine_library(path: Path, *, name_hint: Path) -> LibraryFile:
         path: path of the file, symbolic links resolved.
         name_hint: the link through which it was found.
     """
-    # of Python itself; empty where programs are no ELF files
+    # the first bytes of Python's own program; empty on systems without ELF files
     interpreter_header = read_interpreter_header()
     header = b""
     try:
@@ -191,9 +192,8 @@ def parse_version(path: Path) -> Version:
 def ensure_llvm() -> LibraryFile:
     """Choose a libLLVM and set ``DRJIT_LIBLLVM_PATH`` to it for Dr.Jit.
 
-    Dr.Jit reads the variable when it is imported. A file that the variable
-    names already wins, whatever else there is. Call it before the first import of
-    Mitsuba.
+    Dr.Jit reads the variable when it is imported, so call this before the first import
+    of Mitsuba. If the variable already names a file, that file is used.
 
     Raises:
         EnvironmentSetupError: there is no usable file, or the one that the variable
@@ -232,7 +232,7 @@ def get_install_command(
 ) -> str:
     """Return the command that installs a good libLLVM here.
 
-    It is a line for each platform if this one is not known.
+    On an unknown platform, it is one line for each known platform.
 
     Args:
         release: what identifies the Linux distribution; None reads ``/etc/os-release``.

@@ -156,9 +156,9 @@ def material_adjoint(
     view = FilmView(scene, sensor, parameters, moving, cotangent, max_depth)
     total = mi.Float(0)
     if spp > 0:
-        # The gradient of a rough cotangent has no preferred sign within a few pixels:
-        # the noise of the radiance cancels if it is the same there; for a smooth one it
-        # averages out better if it is not.
+        # A rough cotangent changes its sign from pixel to pixel. If neighbouring pixels
+        # have the same random numbers, the noise of their radiance is the same and
+        # cancels. For a smooth cotangent, independent noise averages out better.
         tile = ROUGH_TILE if _is_rough(cotangent) else 1
         total += _compute_interior_term(view, seed, spp, tile)
     for index, mesh in enumerate([*view.moving_meshes, *view.still_meshes]):
@@ -175,9 +175,9 @@ def material_adjoint(
 def _is_rough(cotangent: Tensor) -> bool:
     """Return whether neighbouring pixels of a cotangent (H, W, 3) hardly correlate.
 
-    That is, by less than `ROUGH_COTANGENT`. The mean square of the difference of two
-    neighbours is 2 v (1 - c), where v is the mean square of the values and c their
-    correlation.
+    Hardly means that their correlation c is less than `ROUGH_COTANGENT`. The mean
+    square of the difference of two neighbours is 2 v (1 - c), where v is the mean
+    square of the values.
     """
     values = cotangent.detach().to(torch.float64)
     right_square = torch.diff(values, dim=1).square().mean()
@@ -192,9 +192,16 @@ def _is_rough(cotangent: Tensor) -> bool:
 def _compute_interior_term(view: FilmView, seed: int, spp: int, tile: int) -> Any:
     """Return a value whose gradient by the vertices is the interior term.
 
-    The derivative is taken in two steps, as some samples have one that is not finite:
-    first back to the point and the normals of each sample, and from those that are
-    finite on to the vertices. `spp` and `tile` are as for `_sample_first_hits`.
+    The derivative is taken in two steps, since that of some samples is not finite. The
+    first step goes back to the point and the normals of each sample. The second one
+    goes on to the vertices, without samples whose derivative is not finite.
+
+    Args:
+        view: the scene.
+        seed: seed of the samples.
+        spp: samples per pixel.
+        tile: width in pixels of a tile in which all pixels have the same random
+            numbers.
     """
     with dr.suspend_grad():
         film, hit, sampler = _sample_first_hits(view, seed, spp, tile)
@@ -237,9 +244,15 @@ def _sample_first_hits(
 ) -> tuple[Any, Any, Any]:
     """Sample film positions that see a moving mesh.
 
-    The film is cut into cells of one pixel between pixel centers, one more than pixels
-    along each side, with `spp` stratified samples in each. Cells in the same tile,
-    `tile` cells wide, have the same random numbers.
+    The film is cut into cells between the centers of pixels, one more than pixels along
+    each side, with stratified samples in each.
+
+    Args:
+        view: the scene.
+        seed: seed of the samples.
+        spp: samples in each cell.
+        tile: width of a tile in cells; all cells of a tile have the same random
+            numbers.
 
     Returns:
         Film positions in pixels; their hits; and a sampler that goes on with their
@@ -287,8 +300,9 @@ def _find_largest_divisor(count: int) -> int:
 def _with_relative_gradient(value: Any) -> Any:
     """Return 1, with the derivative of `value` divided by the value itself.
 
-    A factor f of an integrand can so be differentiated without changing the sample: 1
-    has the derivative df / f. Where the value is all but zero, there is no derivative.
+    For a factor f of an integrand that was sampled in proportion to f, the sample's
+    weight is 1, with the derivative df / f. Where the value is almost zero, the
+    derivative is 0.
     """
     constant = dr.detach(value)
     is_usable = dr.abs(constant) > 1e-20
@@ -303,9 +317,15 @@ def _attach_interaction(
 ) -> Any:
     """Return Mitsuba's surface interaction, attached to a point and its normals.
 
-    Its values stay those of `si`; their gradients are those of the point, the normal of
-    its triangle, and the shading normal. The frame's tangent follows the normal without
-    a turn about it.
+    Its values stay those of `si`; only gradients are added. The frame's tangent follows
+    the normal without a rotation about it.
+
+    Args:
+        view: the scene.
+        si: Mitsuba's surface interaction, without gradients.
+        point: the same point with gradients.
+        scaled_normal: normal of its triangle with gradients, of any length.
+        shading_normal: shading normal with gradients, of any length.
     """
 
     def attach_normal(fixed: Any, normal: Any) -> Any:
@@ -330,8 +350,13 @@ def _attach_interaction(
 def _sample_reflected(view: FilmView, moving_si: Any, si: Any, sampler: Any) -> Any:
     """Sample the light reflected towards the camera.
 
-    Directions of incoming light are fixed in the world: they are sampled at `si`, which
-    is detached; `moving_si` is the same interaction, attached.
+    Directions of incoming light are fixed in the world, so they are sampled at the
+    interaction without gradients.
+
+    Args:
+        view: the scene.
+        moving_si, si: the surface interaction, with and without gradients.
+        sampler: random numbers.
     """
     with dr.suspend_grad():
         active = mi.Bool(view.max_depth > 1)
@@ -358,9 +383,13 @@ def _sample_reflected(view: FilmView, moving_si: Any, si: Any, sampler: Any) -> 
 def _sample_light(
     view: FilmView, si: Any, sampler: Any, active: Any
 ) -> tuple[Any, Any, Any]:
-    """Sample a direction to an emitter; return it, its weight, and where there is one.
+    """Sample a direction to an emitter from surface points.
 
-    A surface that only mirrors reflects none of it.
+    Nothing is sampled at a surface that only mirrors: it would reflect none of it.
+
+    Returns:
+        Mitsuba's direction sample; the emitter's radiance over the density; and in
+        which lanes there is a sample.
     """
     is_smooth = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Smooth)
     active_em = active & is_smooth
@@ -376,7 +405,8 @@ def _sample_incoming(
 ) -> tuple[Any, Any, Any]:
     """Sample a direction by the BSDF, and the light that arrives along it.
 
-    Direct light is sampled at emitters too, and counts here by its MIS weight alone.
+    Direct light is also sampled at emitters. Here it counts only by its multiple
+    importance sampling (MIS) weight.
 
     Returns:
         The BSDF sample; its weight times the radiance; and where there is a sample.
@@ -393,7 +423,8 @@ def _sample_incoming(
     ds_next = mi.DirectionSample3f(view.scene, si=si_next, ref=si)
     em_pdf = view.scene.pdf_emitter_direction(si, ds_next, active & is_smooth)
     mis = mi.ad.integrators.common.mis_weight(bsdf_sample.pdf, em_pdf)
-    # the part that the samples at emitters have
+    # `sample_radiance` includes all emission of the next surface. Subtract the fraction
+    # that the samples at emitters cover.
     L -= (1.0 - mis) * ds_next.emitter.eval(si_next, active & is_smooth)
     return bsdf_sample, bsdf_weight * L, active
 

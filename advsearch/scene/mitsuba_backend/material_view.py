@@ -142,12 +142,19 @@ class FilmView:
     ) -> None:
         """Sort the scene's meshes into those that move and others, as `TriMesh`.
 
-        Arguments are those of the class.
+        Args:
+            scene, sensor, parameters: Mitsuba's scene, its camera, and what
+                `mi.traverse` returns for the scene.
+            moving: vertices and normals (V, 3) of the meshes that move, by names such
+                as "object.vertices" and "object.normals".
+            cotangent: (H, W, 3) derivative of the loss by the radiance.
+            max_depth: longest light path in segments.
         """
         self.scene = scene
         self.camera = Camera(sensor)
         self.max_depth = max_depth
-        # one pixel wider on each side, and no channel more
+        # One pixel of zeros on each side. `pad` counts from the last axis, the
+        # channels, to which nothing is added.
         self.padded_cotangent = to_drjit_array(
             torch.nn.functional.pad(cotangent.detach(), (0, 0, 1, 1, 1, 1))
         )
@@ -184,6 +191,7 @@ class FilmView:
         active = active & self.camera.is_in_frame(dr.detach(film))
         # From the center of the first pixel of the padded image, which is half a pixel
         # outside of the film. Cells lie between pixel centers.
+        # + 1 for the border and - 0.5 to the pixel's center
         padded_film = film + 0.5
         cell_position = dr.floor(dr.detach(padded_film))
         cell = mi.Point2u(
@@ -203,12 +211,13 @@ class FilmView:
     def attach_hit(self, hit: Any) -> tuple[Any, Any, Any, Any]:
         """Return the surface point of a hit, attached to the vertices of moving meshes.
 
-        It stays at the same barycentric coordinates of its triangle.
+        When the vertices move, the point moves with its triangle: its barycentric
+        coordinates stay the same. `hit` is Mitsuba's preliminary intersection.
 
         Returns:
-            The point; the normal of its triangle, times twice the area; the shading
-            normal; and whether it is on a moving mesh: elsewhere the three mean
-            nothing.
+            The point; the normal of its triangle, with twice the triangle's area as its
+            length; the shading normal; and whether the hit is on a moving mesh. Where
+            it is not, the first three values are placeholders.
         """
         point = mi.Point3f(0)
         scaled_normal = mi.Normal3f(0, 0, 1)
@@ -240,7 +249,11 @@ class FilmView:
     def sample_radiance(self, ray: Any, sampler: Any, depth: int, active: Any) -> Any:
         """Sample the radiance that arrives along a ray, as a constant.
 
-        Paths have up to `depth` segments.
+        Args:
+            ray: the rays, one in each lane.
+            sampler: random numbers of the paths.
+            depth: longest path in segments; less than 1 counts as 1.
+            active: lanes that are traced.
         """
         tracer = _make_path_tracer(max(depth, 1))
         # without derivatives and state, which only the adjoint modes take
@@ -300,6 +313,11 @@ def make_sampler(stream: int, count: int, index: Any = None) -> Any:
     """Make a sampler with one of `count` random streams in every lane.
 
     Lanes with the same index have the same stream; without an index each has its own.
+
+    Args:
+        stream: starting state, as from `make_stream`.
+        count: how many streams there are, and the number of lanes without an index.
+        index: stream of each lane.
     """
     base = mi.PCG32(count, mi.UInt64(stream))
     index = dr.arange(mi.UInt32, count) if index is None else index
@@ -370,16 +388,17 @@ def compute_outline_term(
 ) -> Any:
     """Return a value whose gradient is the outline term of one mesh.
 
-    Where an outline moves across the film, it replaces what is behind it. A point on it
-    counts by the cotangent times the radiance behind, and by its speed along the
-    normal, relative to that of the surface behind if that moves too. Points that
-    something else hides count nothing.
+    Where an outline moves outwards on the film, it hides what is behind it. A point on
+    the outline contributes the product of three factors: the cotangent at its pixel,
+    the radiance behind it, and its speed along the outline's normal. If the surface
+    behind moves too, its speed is subtracted. A point that another surface hides
+    contributes 0.
 
     Args:
         view: the scene.
         mesh: one that moves, or one that stands still and may hide it.
         seed: seed of the samples.
-        mesh_index: index of the mesh.
+        mesh_index: index of the mesh, which gives it random numbers of its own.
         spp: samples, in multiples of the number of pixels.
     """
     stream = make_stream(seed, _OUTLINES, mesh_index)
@@ -396,6 +415,7 @@ def compute_outline_term(
         ray = view.camera.make_ray(dr.detach(edge_film) + EDGE_OFFSET * film_normal)
         hit = view.scene.ray_intersect_preliminary(ray, coherent=False)
         edge_distance = dr.norm(dr.detach(edge_point) - view.camera.eye)
+        # The ray just past the edge must not hit anything nearer than the edge.
         is_visible = ~hit.is_valid() | (hit.t > edge_distance * (1.0 - DEPTH_TOLERANCE))
         sampler = make_sampler(stream + _PATHS, len(sampled.fraction))
         radiance_behind = view.sample_radiance(ray, sampler, view.max_depth, is_visible)
@@ -424,12 +444,14 @@ class _OutlineSamples(NamedTuple):
 def _to_space_fraction(film_fraction: Tensor, depth: Tensor) -> Tensor:
     """Convert positions along edges on the film to positions along edges in space.
 
-    Both are fractions (N,) from the first end of an edge to the second. They differ as
-    the nearer half of an edge is longer on the film.
+    Both are fractions (N,) from the first end of an edge to the second. They differ
+    because the nearer half of an edge is longer on the film. This inverts
+
+        film = space d1 / ((1 - space) d0 + space d1), with depths d0 and d1 of the ends
 
     Args:
         film_fraction: (N,) fractions on the film.
-        depth: (N, 2) of both ends.
+        depth: (N, 2) depths of both ends.
     """
     weighted = film_fraction * depth[:, 0]
     return weighted / (weighted + (1.0 - film_fraction) * depth[:, 1])
@@ -444,7 +466,7 @@ def _measure_on_film(camera: Camera, a: Tensor, b: Tensor, depth: Tensor) -> Ten
     Args:
         camera: the camera.
         a, b: (N, 2) ends of the edges on the film, pixels.
-        depth: (N, 2) of both ends.
+        depth: (N, 2) depths of both ends, in world units.
     """
     size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
     on_film = (torch.maximum(a, b) > -0.5) & (torch.minimum(a, b) < size + 0.5)
@@ -471,8 +493,12 @@ def _sample_outline(
 ) -> _OutlineSamples | None:
     """Sample points on a mesh's outline, evenly by its length on the film.
 
-    Points that something else hides are among them. `random` are (n,) numbers in [0,
-    1).
+    Points that another surface hides are included.
+
+    Args:
+        camera: the camera.
+        mesh: the mesh.
+        random: (n,) numbers in [0, 1), one for each sample.
 
     Returns:
         The samples; None if no outline is in the image.
@@ -492,7 +518,7 @@ def _sample_outline(
         return None
     edge_index, film_fraction = _sample_along(length, random)
 
-    # A short step away from the mesh tells its side of the edge on the film.
+    # A short step away from the mesh tells on which side of the edge the mesh is.
     midpoints = mesh.vertices[ends].mean(dim=1)
     outwards_on_film = project_to_film(
         camera, midpoints + 1e-3 * mesh.extent * outwards
@@ -508,8 +534,8 @@ def _sample_outline(
 def _find_outline(mesh: TriMesh, eye: Tensor) -> tuple[Tensor, Tensor]:
     """Find the edges of a mesh that an eye at a position (3,) may see as its outline.
 
-    All faces of such an edge, one or several, lie on one side of the plane through the
-    edge and the eye. Edges that something hides are among them.
+    All faces at such an edge, whether one or more, lie on one side of the plane through
+    the edge and the eye. Edges that another surface hides are included.
 
     Returns:
         (E, 2) vertices of the edges, and (E, 3) that plane's unit normal, away from the
@@ -547,6 +573,7 @@ def _sample_along(length: Tensor, random: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         (n,) index of the segment, and (n,) position along it in [0, 1].
     """
+    # Stratified: sample i lies in the i-th of n equal parts of the total length.
     length_sums = length.cumsum(dim=0)
     distance = (torch.arange(len(random)) + random) / len(random) * length_sums[-1]
     last_segment = int(length.nonzero().max())
@@ -574,7 +601,7 @@ def _find_edges(vertices: Tensor, corners: Tensor) -> tuple[Tensor, Tensor, Tens
         index of its edge and (3 F,) the vertex across, which is the face's third
         corner.
     """
-    # (V,) the same number for vertices at one position
+    # (V,) numbers, which are equal for vertices at the same position
     position_id = torch.unique(vertices, dim=0, return_inverse=True)[1]
     face_sides = torch.cat([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
     across = torch.cat([corners[:, 2], corners[:, 0], corners[:, 1]])
@@ -604,8 +631,11 @@ def compute_shadow_term(
     camera sees; its `sample_index` selects them from `sampled`.
 
     Args:
-        view, seed, mesh_index, spp: as for `compute_outline_term`.
+        view: the scene.
         mesh: one that moves, or one that stands still and may cast a shadow.
+        seed: seed of the samples.
+        mesh_index: index of the mesh, which gives it random numbers of its own.
+        spp: samples, in multiples of the number of pixels.
     """
     stream = make_stream(seed, _SHADOWS, mesh_index)
     random = sample_uniform(stream, spp * view.camera.pixels, 4)
@@ -649,8 +679,13 @@ def _sample_shadow_borders(
     """Find the lines whose end is lit and seen by the camera; None if there is none.
 
     A line comes from the light, touches the mesh at an edge and ends at the next
-    surface. Arguments are those of `compute_shadow_term`; `stream` is that of its
-    random numbers.
+    surface.
+
+    Args:
+        view: the scene.
+        mesh: the mesh with the edges.
+        sampled: the sampled edge points and lines.
+        stream: stream of the random numbers, as from `make_stream`.
     """
     edge_points = torch.lerp(
         mesh.vertices[sampled.ends[:, 0]],
@@ -689,13 +724,17 @@ def _sample_shadow_borders(
 
 
 def _eval_lit_points(view: FilmView, si: Any, d: Any) -> Any:
-    """Return the factor (RGB) by which light from direction d at lit points counts in
-    the image.
+    """Return the factor (RGB) by which light at lit points counts in the image.
 
-    It is the cotangent at the point's pixel, times the BSDF with its cosine, times the
-    area on the film of what one unit of a line's spread in space and angle covers
-    around the point: W, f and J' of the formula in `material_adjoint`. It is 0 where
-    the camera does not see the point.
+    It is a product of three factors, W, f and J' of the formula in `material_adjoint`:
+    the cotangent at the point's pixel; the BSDF with its cosine; and the area on the
+    film that a bundle of lines covers there, per unit of its spread in space and angle.
+    It is 0 where the camera does not see the point.
+
+    Args:
+        view: the scene.
+        si: surface interactions of the lit points; their `wi` is set to the camera.
+        d: unit directions from which the light comes.
     """
     camera = view.camera
     film = camera.project(si.p)
@@ -723,7 +762,7 @@ def _sample_radiance_difference(
 ) -> Any:
     """Return the radiance that a lit point gets just past an edge minus just inside.
 
-    0 where something hides the edge from the lit point.
+    The difference is 0 where something hides the edge from the lit point.
 
     Args:
         view: the scene.
@@ -776,9 +815,9 @@ def _orient_outwards(vectors: Tensor, directions: Tensor) -> Tensor:
 def _sample_tangents(mesh: TriMesh, random: Tensor) -> _TangentSamples | None:
     """Sample lines that touch the mesh at points of its edges, evenly.
 
-    Lines through a point of an edge have both of its faces on one side if they lie
-    within the edge's exterior angle, or opposite to it. At an edge with one face every
-    line does.
+    A line through a point of an edge touches the mesh if both faces at the edge are on
+    one side of it. That is so if the line lies within the edge's exterior angle, or
+    opposite to it. At an edge with a single face every line touches the mesh.
 
     Args:
         mesh: the mesh.
@@ -793,6 +832,7 @@ def _sample_tangents(mesh: TriMesh, random: Tensor) -> _TangentSamples | None:
     measure = edge_length * edges.angle
     if len(random) == 0 or not float(measure.sum()) > 0.0:
         return None
+    # only the choice of the edge counts: the point on it has a random number of its own
     edge_index, _ = _sample_along(measure, random[:, 0])
     axis = edges.axis[edge_index]
     along_first = edges.along_first[edge_index]
@@ -848,7 +888,8 @@ def _measure_exterior_angles(mesh: TriMesh) -> _ExteriorAngles:
     """
     vertices = mesh.vertices
     ends, owner, across = _find_edges(vertices, mesh.corners)
-    # Sides of faces, sorted by their edge: those of one edge follow one another.
+    # Sort the sides of faces by their edge, so that those of one edge follow one
+    # another; the first and the last of them belong to its two faces.
     sorted_sides = torch.argsort(owner, stable=True)
     n_faces = torch.bincount(owner, minlength=len(ends))
     # where the last side of each edge is among the sorted ones
@@ -867,7 +908,7 @@ def _measure_exterior_angles(mesh: TriMesh) -> _ExteriorAngles:
             vector - (vector * axis).sum(dim=1, keepdim=True) * axis, dim=1
         )
 
-    # of an edge with a single face both are the same
+    # at an edge with a single face both are the same vector
     along_first = along_face(last_entry - n_faces + 1)
     along_second = along_face(last_entry)
     opening, angle = _measure_between_faces(along_first, along_second, axis, is_single)
@@ -902,7 +943,7 @@ def _measure_between_faces(
     cosine = (along_first * along_second).sum(dim=1, keepdim=True)
     # the part of the first direction that is perpendicular to the second
     perpendicular = along_first - cosine * along_second
-    # away from the first face; of a single face either side will do
+    # away from the first face; at a single face either direction is right
     opening = torch.where(
         is_single[:, None],
         torch.linalg.cross(axis, along_second),

@@ -116,8 +116,9 @@ def make_emitter(part: MeshPart) -> Plugin | None:
 def compute_sampling_weights(parts: Iterable[MeshPart]) -> dict[str, float]:
     """Return how often light is sampled from each mesh that emits some, by its name.
 
-    The environment has the weight 1, and all meshes together have 1 too. They share it
-    by their power, but each has at least `MIN_WEIGHT_FRACTION` of an equal part.
+    The environment has the weight 1, and all meshes together also have 1. Each mesh has
+    a fraction of it in proportion to its power, but at least `MIN_WEIGHT_FRACTION` of
+    an equal part, so that no light is sampled too rarely.
     """
     powers: dict[str, float] = {}
     for part in parts:
@@ -182,6 +183,7 @@ def fill_base_color(
     """
 
     def fill_in(plugin: Mapping[str, object]) -> object:
+        """Return a plugin with base colors put in, or the texture of a placeholder."""
         if plugin.get("type") == BASE_COLOR:
             return fill({key: entry for key, entry in plugin.items() if key != "type"})
         return map_inner_plugins(plugin, fill_in)
@@ -242,7 +244,14 @@ def make_mitsuba_mesh(
 ) -> Any:
     """Make a Mitsuba mesh under a pose, with shading normals and texture coordinates.
 
-    Mitsuba's bitmaps have row 0 at v = 0 while ours have it at v = 1, hence the flip.
+    Mitsuba's bitmaps have row 0 at v = 0 and ours have it at v = 1, so v is flipped.
+
+    Args:
+        name: Mitsuba's id of the mesh.
+        mesh: the mesh.
+        to_world: (4, 4) pose.
+        bsdf: dictionary of its surface.
+        light: dictionary of the light that it emits, or None.
     """
     linear = to_world[:3, :3]
     vertices = multiply_rows(mesh.vertices.astype(np.float64), linear.T)
@@ -253,7 +262,8 @@ def make_mitsuba_mesh(
     normals /= np.maximum(compute_lengths(normals), 1e-12)
     uvs = np.stack([mesh.uvs[:, 0], 1.0 - mesh.uvs[:, 1]], axis=1)
     properties = mi.Properties()
-    # Optimizing merges equal numbers into one: both would change.
+    # Optimizing would merge equal values into one object: to change one would change
+    # all.
     properties["bsdf"] = mi.load_dict(bsdf, optimize=False)
     if light is not None:
         properties["emitter"] = mi.load_dict(light, optimize=False)

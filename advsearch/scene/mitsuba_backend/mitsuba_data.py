@@ -51,7 +51,7 @@ def find_plugin_numbers(
         InputError: there is something else than a number or a color.
     """
     numbers, other_types = _find_numbers(description)
-    # of a channel of a color, such as "KEY.red", the color's key
+    # maps the key of a channel, such as "mug.bsdf.reflectance.red", to its color's key
     color_of_channel: dict[str, str] = {}
     for key, plugin_number in numbers.items():
         if len(plugin_number.values) > 1:
@@ -78,6 +78,8 @@ def _find_numbers(
     description: SceneDescription,
 ) -> tuple[dict[str, PluginNumber], dict[str, str]]:
     """Find all numbers and colors of a scene; the result for the last scene is cached.
+
+    The scene is loaded at a small size, only to list its parameters.
 
     Returns:
         The numbers and colors by Mitsuba's key, with the name of the scene's own input
@@ -110,7 +112,13 @@ def _find_numbers(
 
 
 def _find_valid_estimators(flags: int) -> tuple[str, ...]:
-    """Return the estimators that are valid for a parameter with Mitsuba's flags."""
+    """Return the estimators that are valid for a parameter, the best one first.
+
+    Args:
+        flags: Mitsuba's `ParamFlags`. `Differentiable` alone means that the adjoint is
+            right; with a further flag (`Discontinuous`) it misses what changes at
+            outlines.
+    """
     if flags & mi.ParamFlags.NonDifferentiable.value:
         return DIFFERENCES_ONLY
     if flags == mi.ParamFlags.Differentiable.value:

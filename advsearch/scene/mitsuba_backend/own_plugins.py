@@ -77,13 +77,18 @@ def sample_raindrops(
 def _compute_cap_height(
     distance_squared: Float64Array, radius: float, curvature_radius: float
 ) -> Float64Array:
-    """Return the height of a drop over the sheet: of a cap of a sphere over its cut.
+    """Return the height of a drop's surface over the sheet, in millimetres.
+
+    A drop is the cap that the sheet cuts off a sphere. The height is negative outside
+    of the drop's circle; callers mask that.
 
     Args:
-        distance_squared: distance squared of points from the middle of the drop.
+        distance_squared: squared distances of points on the sheet from the drop's
+            center.
         radius: radius of the drop's circle on the sheet.
-        curvature_radius: curvature radius of the sphere.
+        curvature_radius: radius of the sphere.
     """
+    # Both heights are measured from the center of the sphere.
     cut_height = math.sqrt(curvature_radius**2 - radius**2)
     sphere_height = np.sqrt(np.maximum(curvature_radius**2 - distance_squared, 0.0))
     return np.asarray(sphere_height - cut_height)
@@ -99,13 +104,14 @@ def _find_highest_drops(drops: Float64Array, half_width: float) -> IntArray:
             the radius of its curvature, millimetres.
         half_width: half the width of the grid, which is around 0, millimetres.
     """
-    # along either axis
+    # coordinates of the cells' centers, the same for x and y
     cell_centers = (
         np.arange(GRID_SIZE) + 0.5
     ) / GRID_SIZE * 2.0 * half_width - half_width
     highest_drop = np.full((GRID_SIZE, GRID_SIZE), len(drops))
     max_height = np.zeros((GRID_SIZE, GRID_SIZE))
     for index, (x, y, radius, curvature_radius) in enumerate(drops):
+        # only the cells in the square around the drop are computed
         rows = np.flatnonzero(np.abs(cell_centers - y) <= radius)
         columns = np.flatnonzero(np.abs(cell_centers - x) <= radius)
         dy = cell_centers[rows] - y
@@ -191,8 +197,21 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
         the adjoint modes it begins with the sum, so that what is left of it is the
         light of later events, and δL is the cotangent.
 
-        Arguments and results are those of `mi.ad.integrators.common.RBIntegrator`; the
-        names are those of Mitsuba's `prb`.
+        The argument names and the letters are those of Mitsuba's `prb`.
+
+        Args:
+            mode: primal (trace the image) or an adjoint mode of Dr.Jit.
+            scene, sampler: Mitsuba's scene and random numbers.
+            ray: camera rays, one in each lane.
+            δL: cotangent of the radiance, in the adjoint modes.
+            state_in: the radiance of each path as the primal pass found it, in the
+                adjoint modes.
+            active: lanes that are traced.
+            rest: further arguments of Mitsuba, which are not used.
+
+        Returns:
+            The radiance (or δL), whether anything was met, no further channels, and
+            the state for the adjoint pass.
         """
         primal = mode == dr.ADMode.Primal
         context = mi.BSDFContext()
@@ -204,6 +223,8 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
         δL = mi.Spectrum(δL if δL is not None else 0)
         β = mi.Spectrum(1)
         active = mi.Bool(active)
+        # The event before. The camera counts as one with a single direction: it cannot
+        # sample emitters, so the emission of the first hit has all the weight.
         prev = dr.zeros(mi.Interaction3f)
         prev_pdf = mi.Float(1)
         prev_delta = mi.Bool(True)
@@ -220,6 +241,8 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
                 scattered, flight, weight, albedo, extinction = self._sample_flight(
                     sampler, haze_length, active
                 )
+            # Distances are sampled in proportion to the extinction times the
+            # transmittance, so that only the albedo remains as a factor.
             β = dr.select(scattered, β * albedo, β)
             at_surface = active & ~scattered
             event = _make_event(ray, si, scattered, haze_start + flight)
@@ -299,10 +322,16 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
         return (L if primal else δL, bounces + scatterings != 0, [], L)
 
     def _intersect(self, scene: Any, ray: Any, is_first: Any, active: Any) -> Any:
-        """Return what a ray hits first.
+        """Return Mitsuba's surface interaction of what a ray hits first.
 
         Where the integrator hides emitters, a ray from the camera goes on through the
         surfaces that emit, and hits what is behind them.
+
+        Args:
+            scene: Mitsuba's scene.
+            ray: the rays, one in each lane.
+            is_first: whether a ray comes from the camera.
+            active: lanes that are traced.
         """
         si = scene.ray_intersect(ray, mi.RayFlags.All, is_first, active)
         if self.hide_emitters:
@@ -348,7 +377,10 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
     ) -> tuple[Any, Any, Any, Any, Any]:
         """Sample how far light flies through the haze before it is scattered.
 
-        `haze_length` is the length of the segment in the haze.
+        Args:
+            sampler: Mitsuba's random numbers.
+            haze_length: length of the segment inside the haze.
+            active: lanes that are traced.
 
         Returns:
             Whether it is scattered within the haze; the distance; a weight, attached to
@@ -359,7 +391,8 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
             dr.zeros(mi.MediumInteraction3f)
         )
         extinction = extinction[0]
-        # A haze of extinction 0 scatters infinitely far away.
+        # Invert the distribution 1 - exp(-extinction distance). `MIN_EXTINCTION` avoids
+        # a division by 0: a haze of extinction 0 scatters very far away.
         flight = -dr.log(1.0 - sampler.next_1d()) / dr.maximum(
             dr.detach(extinction), MIN_EXTINCTION
         )
@@ -376,6 +409,12 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
     ) -> tuple[Any, Any, Any, Any]:
         """Sample a direction to an emitter from an event of the path.
 
+        Args:
+            scene, sampler: Mitsuba's scene and random numbers.
+            event: the event, at a surface or in the haze.
+            active: lanes that are sampled.
+            primal: whether no derivatives are needed.
+
         Returns:
             Mitsuba's direction sample; radiance over density, attached to the emitter's
             parameters if not `primal`; the length of the haze in between; and in which
@@ -385,6 +424,7 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
             event, sampler.next_2d(), True, active
         )
         active = active & (ds.pdf != 0.0)
+        # Towards the environment the haze goes on up to the border of the ball.
         is_outside = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
         distance = dr.select(is_outside, dr.inf, ds.dist)
         _, haze_length = self._find_haze_segment(event.p, ds.d, distance)
@@ -413,8 +453,10 @@ def _eval_towards_emitter(
         throughput: throughput of the path up to the event.
     """
     value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active)
+    # The phase function is sampled exactly: its value is its density.
     value = dr.select(scattered, ISOTROPIC_PHASE, value)
     pdf = dr.select(scattered, ISOTROPIC_PHASE, pdf)
+    # no scattered ray can meet a point light by chance: its sample has all the weight
     mis = dr.select(ds.delta, 1.0, common.mis_weight(ds.pdf, pdf))
     return throughput * mis * value
 
@@ -422,12 +464,16 @@ def _eval_towards_emitter(
 def _make_event(ray: Any, si: Any, scattered: Any, distance: Any) -> Any:
     """Return the interaction of one event of a path.
 
-    Where `scattered`, that is the point of the haze at `distance` along the ray, else
-    the surface hit `si`.
+    Args:
+        ray: the segment that leads to the event.
+        si: the surface interaction at its end.
+        scattered: whether the event is a scattering in the haze before that.
+        distance: distance of that scattering along the ray.
     """
     event = dr.zeros(mi.Interaction3f)
     event.t = dr.select(scattered, distance, si.t)
     event.p = dr.select(scattered, ray(distance), si.p)
+    # without a normal, no offset is added to rays that start in the haze
     event.n = dr.select(scattered, mi.Normal3f(0.0), si.n)
     event.time = ray.time
     event.wavelengths = ray.wavelengths
@@ -446,7 +492,7 @@ class _Coat:
     """
 
     def __init__(self, reflectance: float, roughness: float) -> None:
-        """Find the index of refraction; arguments are those of the class."""
+        """Convert the reflectance at a right angle to an index of refraction."""
         self._index = compute_refractive_index(reflectance)
         self._alpha = roughness**2
 
@@ -467,6 +513,8 @@ class _Coat:
             incident: unit direction to the viewer.
             direction: unit direction to the light.
         """
+        # The microfacet model: F D G / (4 cos_i cos_o) times cos_o, with the half
+        # vector as the normal of the facets that reflect (Walter et al. 2007, eq. 20).
         half = dr.normalize(incident + direction)
         cosine = dr.dot(incident, half)
         is_above = (incident.z > 0.0) & (direction.z > 0.0) & (cosine > 0.0)
@@ -506,7 +554,11 @@ class _PlaneHits:
     ) -> None:
         """Intersect camera rays with the plane, and sample what it does to the light.
 
-        Arguments and what is set are those of the class.
+        Args:
+            scene, sampler: Mitsuba's scene and random numbers.
+            ray: camera rays.
+            active: lanes that are traced.
+            coat: coat of the plane; None if it is matt.
         """
         plane = next(shape for shape in scene.shapes() if shape.id() == PLANE_SHAPE)
         hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
@@ -519,7 +571,10 @@ class _PlaneHits:
         self.direct_changes = [
             dr.select(self.is_hit, factor * light, 0.0) for factor in self._factors
         ]
+        # The random number is taken even without a coat, where it has no effect.
         is_off_coat = sampler.next_1d() < COAT_FRACTION
+        # The density is in proportion to the cosine, so that the weight of a path from
+        # the matt ground is its albedo alone.
         direction = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
         self.weights = [self._albedo]
         is_bounced = direction.z > 0.0
@@ -536,10 +591,11 @@ class _PlaneHits:
     def _sample_emitter(self, scene: Any, sampler: Any) -> Any:
         """Sample an emitter from the plane, and return its radiance over the density.
 
-        `_factors` are set to what the object changes: the light that the plane
-        reflects, times -1 for light of the environment that something blocks and 0 for
-        what passes; for a lamp, which the photograph does not have, 0 for what is
-        blocked and 1 for what passes.
+        This also sets `_factors`: one factor of that radiance for each kind of change.
+        A factor is the fraction of the light that the plane reflects, times a sign.
+        For light of the environment, which the photograph already has, the sign is -1
+        where something blocks it and else 0. For a lamp, which the photograph does not
+        have, it is 0 where something blocks it and else 1.
         """
         si = self._si
         ds, light = scene.sample_emitter_direction(
@@ -558,7 +614,8 @@ class _PlaneHits:
         self._factors = [dr.select(is_sampled, sign * reflected, 0.0)]
         if self._coat is not None:
             value, density = self._coat.evaluate(si.wi, direction)
-            # the bounce meets the environment too: the balance heuristic (Veach 1997)
+            # A path off the coat may meet the environment too. The two samples share
+            # its light by the balance heuristic (Veach 1997).
             share = ds.pdf / (ds.pdf + COAT_FRACTION * density)
             value *= dr.select(is_environment, share, 1.0)
             self._factors.append(mi.Color3f(dr.select(is_sampled, sign * value, 0.0)))
@@ -571,13 +628,14 @@ class _PlaneHits:
     ) -> tuple[Any, Any]:
         """Choose whether a path goes on from the matt ground or from its coat.
 
-        `weights` are set, of which one is not 0.
+        This sets `weights`. In each lane only the weight of the chosen bounce is not 0;
+        it is divided by the probability of the choice.
 
         Args:
             coat: coat of the plane.
             matt_direction: local direction of a path from the matt ground.
             is_off_coat: whether it goes on from the coat.
-            sampler: as in the class.
+            sampler: Mitsuba's random numbers.
 
         Returns:
             The local direction of the path, and whether there is one.
@@ -596,15 +654,18 @@ class _PlaneHits:
         return direction, is_bounced
 
     def _reflect_environment(self, scene: Any, coat: _Coat, direction: Any) -> None:
-        """Add the environment that a bounce off the coat meets, or that it does not.
+        """Add the changes by the environment that a bounce off the coat would meet.
 
-        The weight is that of the path times the rest of the balance heuristic in
-        `_sample_emitter`.
+        Where the object blocks it, the light is subtracted from the coat's change. The
+        light itself is added to the last change, the environment in the coat.
+
+        The emitter sample of `_sample_emitter` finds the same light; by the balance
+        heuristic it counts there by one fraction, and here by the rest.
 
         Args:
-            scene: as in the class.
+            scene: Mitsuba's scene.
             coat: coat of the plane.
-            direction: local direction of the bounce.
+            direction: direction of the bounce, in the plane's local axes.
         """
         environment = scene.environment()
         ds = dr.zeros(mi.DirectionSample3f)
@@ -624,7 +685,10 @@ class _PlaneHits:
         self.direct_changes[2] += met
 
     def list_changes(self, path_radiance: Any) -> list[Any]:
-        """Return the changes, three channels each, with the light that paths bring."""
+        """Return the changes, three channels each, with the light that paths bring.
+
+        `path_radiance` is the radiance that arrives along the path's next segment.
+        """
         channels: list[Any] = []
         for weight, change in zip(self.weights, self.direct_changes, strict=True):
             full_change = weight * path_radiance + change
@@ -638,8 +702,8 @@ class _PlaneHits:
         The environment that a bounce meets has none: in a photograph it is fixed.
 
         Args:
-            scene: as in the class.
-            cotangents: those of `list_changes`.
+            scene: Mitsuba's scene.
+            cotangents: cotangents of the channels that `list_changes` returns.
 
         Returns:
             The cotangent of the path's radiance.
@@ -656,7 +720,8 @@ class _PlaneHits:
             with dr.resume_grad():
                 change = cotangent * factor * light
                 if dr.grad_enabled(change):
-                    # The path goes along the same edges later: they are kept.
+                    # The replay of the path needs the same edges of the graph later, so
+                    # only the inner ones are cleared.
                     dr.backward_from(change, dr.ADFlag.ClearInterior)
         return path_cotangent
 
@@ -705,12 +770,26 @@ class PhotographPath(PRBIntegrator):  # type: ignore[misc]
 
         Where a ray meets the plane that takes the shadow, the color is 0, and the
         changes of the plane's radiance are returned in further channels, three each
-        (`δaovs` are their cotangents). Arguments and results are those of
-        `mi.ad.integrators.common.RBIntegrator`.
+        (`δaovs` are their cotangents).
+
+        Args:
+            mode: primal (trace the image) or an adjoint mode of Dr.Jit.
+            scene, sampler: Mitsuba's scene and random numbers.
+            ray: camera rays.
+            δL: cotangent of the radiance, in the adjoint modes.
+            state_in: what the primal pass returned last, in the adjoint modes.
+            active: lanes that are traced.
+            δaovs: cotangents of the further channels, in the adjoint modes.
+            rest: further arguments, which go on to Mitsuba's `prb`.
+
+        Returns:
+            The color, whether a ray hits anything but the plane, the further channels,
+            and the state for the adjoint pass.
         """
         camera_ray = mi.Ray3f(dr.detach(ray))
         plane = _PlaneHits(scene, sampler, camera_ray, mi.Bool(active), self.coat)
         if mode != dr.ADMode.Primal:
+            # Rays that meet the plane count only by the further channels.
             δL = dr.select(plane.is_hit, plane.backpropagate(scene, δaovs), δL)
         L, valid, _, state_out = super().sample(
             mode=mode,
@@ -756,9 +835,15 @@ class Guides(mi.SamplingIntegrator):  # type: ignore[misc]
     def sample(
         self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True
     ) -> Any:
-        """Return reflectance, coverage and guides; see `mi.SamplingIntegrator`.
+        """Return reflectance, coverage and guides of camera rays.
 
         A ray goes on through a surface with the probability with which light passes it.
+
+        Args:
+            scene, sampler: Mitsuba's scene and random numbers.
+            ray: camera rays.
+            medium: Mitsuba's argument, which is not used.
+            active: lanes that are traced.
         """
         active = mi.Bool(active)
         ray = mi.Ray3f(ray)
@@ -798,6 +883,8 @@ def _compute_transmittance(
 ) -> Any:
     """Return Fresnel's transmittance of unpolarised light between two media.
 
+    It is 1 minus the mean reflectance of the two polarisations.
+
     Args:
         cos_incident, cos_refracted: cosines of the angles to the normal.
         ior_incident, ior_refracted: indices of refraction of the two media.
@@ -835,7 +922,7 @@ def _refract_through_drop(
         - inside_direction.y * inside_direction.y
     )
 
-    # From the center of curvature: where the ray enters, and where it leaves.
+    # Entry and exit point are relative to the sphere's center of curvature.
     radius = drop.z
     curvature_radius = drop.w
     entry = mi.Vector3f(
@@ -844,7 +931,8 @@ def _refract_through_drop(
         dr.safe_sqrt(curvature_radius * curvature_radius - radius * radius),
     )
     entry_cosine = dr.dot(entry, inside_direction)
-    # along the ray inside, to the sphere of the cap
+    # length of the ray inside, up to the sphere: the larger root of
+    # |entry + t direction| = curvature radius
     exit_distance = (
         dr.safe_sqrt(
             entry_cosine * entry_cosine
@@ -946,9 +1034,16 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
     def sample_ray_differential(
         self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
     ) -> Any:
-        """Sample rays and weights; see `mi.Sensor.sample_ray_differential`.
+        """Sample camera rays and their weights.
 
         Where the lens has no direction, the ray has weight 0 and hits nothing.
+
+        Args:
+            time: time of the rays.
+            sample1: sample of the wavelength, which is not used.
+            sample2: position in the image, in [0, 1]^2.
+            sample3: sample of the aperture, used only for raindrops.
+            active: lanes that are sampled; all of them are.
         """
         direction, is_inside = self._look_up_direction(sample2)
         transmitted = mi.Float(1.0)
@@ -967,7 +1062,11 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
     def sample_ray(
         self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
     ) -> Any:
-        """Sample rays and weights; see `mi.Sensor.sample_ray`."""
+        """Sample camera rays and their weights, without differentials.
+
+        The arguments are those of `sample_ray_differential`: time, wavelength sample,
+        position in the image, aperture sample, and active lanes.
+        """
         ray, weight = self.sample_ray_differential(
             time, sample1, sample2, sample3, active
         )
@@ -997,7 +1096,7 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         aperture_point = APERTURE_RADIUS * mi.warp.square_to_uniform_disk_concentric(
             sample
         )
-        # along the ray
+        # length of the ray up to the sheet; 1e-3 avoids a division by 0
         sheet_distance = SHEET_DISTANCE / dr.maximum(direction.z, 1e-3)
         x = direction.x * sheet_distance + aperture_point.x
         y = direction.y * sheet_distance + aperture_point.y
@@ -1012,6 +1111,10 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
 
     def _find_drop(self, x: Any, y: Any, active: Any) -> tuple[Any, Any, Any, Any]:
         """Find the drop at a point of the sheet, in millimetres.
+
+        Args:
+            x, y: the point; (0, 0) is on the camera's axis.
+            active: lanes that can meet a drop.
 
         Returns:
             The drop's four numbers, as in `sample_raindrops`; the point's x and y from
@@ -1065,6 +1168,7 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         row = dr.clip(mi.Int32(dr.floor(y)), 0, n_rows - 1)
         x_fraction = x - mi.Float(column)
         y_fraction = y - mi.Float(row)
+        # n cells have n + 1 grid points along a row
         upper_left = mi.UInt32(row * (n_columns + 1) + column)
         upper = self._lerp_rays(upper_left, x_fraction)
         lower = self._lerp_rays(upper_left + (n_columns + 1), x_fraction)

@@ -117,10 +117,18 @@ class SceneInput:
 
 
 def find_key(parameters: Any, scene_input: SceneInput) -> str | None:
-    """Return the one parameter of Mitsuba that an input means; None without one.
+    """Return the key of Mitsuba's parameter for an input; None if there is none.
 
-    The input's key may have an asterisk for any text. If the input has an owner, only
-    that object's parameters count. Raises RuntimeError if there are several.
+    The input's key may have an asterisk that stands for any text, as in
+    "mug.*.base_color.data". If the input has an owner, only that object's parameters
+    count.
+
+    Args:
+        parameters: what `mi.traverse` returns for the scene.
+        scene_input: the input.
+
+    Raises:
+        RuntimeError: several parameters match.
     """
     prefix, asterisk, suffix = scene_input.key.partition("*")
     keys = [scene_input.key] if scene_input.key in parameters else []
@@ -169,7 +177,7 @@ class Translation:
 def translate_part(part: parts.ScenePart) -> Translation:
     """Return what a part is inside Mitsuba.
 
-    Further kinds of parts are registered: `@translation.register`.
+    Each kind of part registers a function of its own, by `@translate_part.register`.
     """
     raise TypeError(
         f"part {part.name}: {type(part).__name__} has no translation for "
@@ -179,9 +187,12 @@ def translate_part(part: parts.ScenePart) -> Translation:
 
 @translate_part.register
 def translate_mesh(part: parts.MeshPart, lobes: Plugin | None = None) -> Translation:
-    """Return what a mesh is inside Mitsuba.
+    """Return what a mesh is inside Mitsuba: its shape, and the inputs that it has.
 
-    `lobes` are further entries of the principled plugin, such as `IDLE_LOBES`.
+    Args:
+        part: the mesh.
+        lobes: further entries of the principled plugin, such as `IDLE_LOBES`; not used
+            if the mesh has a surface of the user's.
     """
     name = part.name
     shape = (len(part.mesh.vertices), 3)
@@ -214,9 +225,14 @@ def translate_mesh(part: parts.MeshPart, lobes: Plugin | None = None) -> Transla
 def _load_user_surface(
     part: parts.MeshPart, surface: Mapping[str, object]
 ) -> tuple[Plugin, list[SceneInput]]:
-    """Return a surface in Mitsuba's words with its base color loaded; and its inputs.
+    """Return a user's surface with its base color loaded as a texture; and its inputs.
 
     The only input is the base color, if the surface has one.
+
+    Args:
+        part: the mesh.
+        surface: Mitsuba's dictionary of the surface, with a placeholder for the base
+            color.
     """
     inputs = list[SceneInput]()
 
@@ -240,10 +256,10 @@ def _load_user_surface(
 
 
 def _make_principled_inputs(name: str) -> list[SceneInput]:
-    """Return the inputs of the principled surface of a mesh of a name.
+    """Return the inputs of the principled surface of the mesh with a name.
 
-    They are its base color and its numbers. None of them moves an outline: the interior
-    adjoint differentiates all.
+    They are its base color and its numbers, such as "object.roughness". None of them
+    moves an outline, so the interior adjoint differentiates all of them.
     """
     base_color = SceneInput(
         f"{name}.base_color", f"{name}.*.base_color.data", is_interior=True
@@ -310,8 +326,8 @@ def _translate_numbers(part: parts.PluginNumbers) -> Translation:
 def _make_number_input(plugin_number: parts.PluginNumber) -> SceneInput:
     """Return the input of a number or a color of a Mitsuba scene.
 
-    A plain number is a constant; a number of a principled surface is clamped as ours
-    are.
+    A plain number is a constant that Mitsuba compiles into its kernels. A number of a
+    principled surface is clamped to the range that Mitsuba renders correctly.
     """
     write: Write
     if plugin_number.plain:
@@ -419,13 +435,15 @@ def _translate_projector(part: parts.ProjectorPart) -> Translation:
 def _translate_beam(part: parts.BeamLamp) -> Translation:
     """Return a headlamp's beam as a projector.
 
-    Mitsuba's projector puts pi times its texture on a plane before it, where an
-    intensity I puts I cos^3: at an angle with that cosine, 1/cos as far away and
-    slanted by it.
+    The table has the intensity I of each direction. On a plane at distance 1 an
+    intensity makes the irradiance I cos^3 of the angle to the axis: the plane is 1 /
+    cos away there (squared), and tilted by the angle. Mitsuba's projector makes pi
+    times its texture there, so the texture is I cos^3 / pi.
     """
     height, width = part.table.shape
-    # Centers of the table's cells on a plane at distance 1, where a field of view of 90
-    # degrees is 2 wide: every second of the points that cut the plane into half cells.
+    # Centers of the table's cells on a plane at distance 1. A field of view of 90
+    # degrees is 2 wide there. Points at half cells are borders and centers in turn, so
+    # that every second one, from index 1 on, is a center.
     x = np.linspace(-1.0, 1.0, 2 * width + 1)[1::2]
     y = np.linspace(-1.0, 1.0, 2 * height + 1)[1::2]
     cosine = (1.0 + x[None] ** 2 + (y[:, None] * height / width) ** 2) ** -0.5
@@ -445,8 +463,8 @@ def _translate_beam(part: parts.BeamLamp) -> Translation:
 def _translate_haze(part: parts.HazePart) -> Translation:
     """Return a haze.
 
-    Mitsuba's medium only holds density and albedo for the integrator: no shape refers
-    to it.
+    No shape refers to Mitsuba's medium. It only holds density and albedo, as parameters
+    that can be set, for our integrator.
     """
     name = part.name
     albedo = _make_rgb(part.albedo)
@@ -454,7 +472,7 @@ def _translate_haze(part: parts.HazePart) -> Translation:
         {"type": "homogeneous", "albedo": albedo, "sigma_t": part.density},
         optimize=False,
     )
-    # for good: Mitsuba does not release it
+    # Owned by the population itself, so never freed: Mitsuba does not release media.
     population.add(population, media=(medium,))
     inputs = (
         SceneInput(
@@ -528,7 +546,8 @@ def make_scene_dict(
     if description.environment is not None:
         radiance = description.environment.radiance
         rotation = description.get_number("environment.rotation")
-        # Mitsuba's maps have y up: turned to z up first, then about it.
+        # Mitsuba's maps have y up. The last rotation is applied first: it turns y to z.
+        # Then the map is rotated about z.
         scene["environment"] = {
             "type": "envmap",
             "bitmap": mi.Bitmap(np.ascontiguousarray(radiance, dtype=np.float32)),
@@ -546,8 +565,9 @@ def make_scene_dict(
 def _make_ground(description: SceneDescription) -> Any:
     """Return the ground: a photographed one, a plain one, or None.
 
-    A plain one is a two-sided square of `ground.size`; a road or a place has meshes of
-    its own instead.
+    A plain ground is a two-sided square of the width `ground.size`. It is None if the
+    size is 0, or if the ground is a road or a square with meshes of its own. In a scene
+    with a photograph in the background, it is the plane that takes the shadow.
     """
     photograph = description.photograph
     if photograph is not None:
@@ -560,8 +580,8 @@ def _make_ground(description: SceneDescription) -> Any:
         return None
     level = 0.0
     if description.backdrop_photograph is not None:
-        # What is rendered into a photograph stands on the ground that this shows; our
-        # plane only takes the shadow, and may be left out.
+        # The photograph shows the ground already. Our plane only takes the shadow of
+        # the object, and the scene may have none.
         if not has_plane(description):
             return None
         level = description.get_number("ground.level")
@@ -643,8 +663,8 @@ def _check_background(
 def _make_lens(description: SceneDescription) -> Plugin:
     """Return the plugin of the camera's lens, without pose and film.
 
-    A pinhole, a thin lens, or our own sensor for a lens model, with raindrops if there
-    are any.
+    It is a pinhole, a thin lens, or our own sensor for a lens model, with raindrops if
+    there are any.
 
     Raises:
         InputError: a plain background with raindrops, or with a lens that leaves parts
@@ -702,6 +722,7 @@ def make_scene_inputs(resolution: tuple[int, int]) -> tuple[SceneInput, ...]:
     height, width = resolution
 
     def to_horizontal_fov(value: Any) -> Any:
+        """Convert a field of view along the larger side to one along the width."""
         half_angle = dr.deg2rad(value.array) / 2.0
         # an upright image is narrower than its larger side
         half_tangent = dr.tan(half_angle) * min(1.0, width / height)

@@ -61,7 +61,14 @@ class PathSamples:
         spp: int = 1,
         is_stratified: bool = True,
     ) -> None:
-        """Seed the generators; Dr.Jit calls it without arguments."""
+        """Seed the generators; Dr.Jit calls it without arguments to make an empty one.
+
+        Args:
+            seed: seed of the image, a number of Dr.Jit.
+            sample: indices of the samples in the image.
+            spp: samples per pixel.
+            is_stratified: whether the sampler is `multijitter`, else `independent`.
+        """
         if sample is None:
             return
         state, increment = mi.sample_tea_32(seed, sample)
@@ -82,7 +89,13 @@ class PathSamples:
         return (mi.Float(stratum) + self.rng.next_float32()) * (1.0 / self.spp)
 
     def next_2d(self) -> Any:
-        """Draw a point in [0, 1)^2 for each sample."""
+        """Draw a point in [0, 1)^2 for each sample.
+
+        With stratification, a pixel's samples have one point in each stratum, and also
+        one in each of `spp` columns and rows (correlated multi-jittered sampling,
+        Kensler 2013). The constants are those of Mitsuba's `multijitter`, whose numbers
+        these are.
+        """
         if not self.is_stratified:
             x = self.rng.next_float32()
             return mi.Point2f(x, self.rng.next_float32())
@@ -189,7 +202,12 @@ class LightPath:
         self.normal = mi.Normal3f(0.0)
 
     def add_emission(self, scene: Any, si: Any) -> None:
-        """Add what is emitted where the path arrives, by its weight."""
+        """Add what is emitted where the path arrives, by its MIS weight.
+
+        Args:
+            scene: Mitsuba's scene.
+            si: surface interaction where the path arrives.
+        """
         ds = mi.DirectionSample3f(scene, si, self.vertex)
         emitter_pdf = scene.pdf_emitter_direction(self.vertex, ds, ~self.is_delta)
         emitted = ds.emitter.eval(si, self.pdf > 0.0)
@@ -197,9 +215,15 @@ class LightPath:
         self.radiance = dr.fma(self.throughput, emitted, self.radiance)
 
     def meet(self, si: Any, bsdf: Any, changed: Sequence[Any]) -> None:
-        """Note whether a surface is of one of the changed shapes, and its guides.
+        """Record whether a surface is one of the changed shapes.
 
-        What guides the denoiser is noted of the first hit.
+        At the first changed surface, the radiance so far is put aside as unchanged. At
+        the first hit, what guides the denoiser is recorded.
+
+        Args:
+            si: surface interaction where the path arrives.
+            bsdf: the BSDF there.
+            changed: shapes whose surfaces may have changed.
         """
         is_changed = si.is_valid() & _is_among(si.shape, changed)
         is_new = is_changed & ~self.has_met
@@ -219,6 +243,13 @@ class LightPath:
         """Add the light of an emitter that a surface reflects, and leave the surface.
 
         The path ends there if it has `max_depth` segments, or has left the scene.
+
+        Args:
+            scene: Mitsuba's scene.
+            si: surface interaction where the path has arrived.
+            bsdf: the BSDF there.
+            numbers: random numbers.
+            max_depth: longest path in segments.
         """
         self.active = (self.depth + 1 < max_depth) & si.is_valid()
         is_lit = self.active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
@@ -246,7 +277,11 @@ class LightPath:
         self.depth = dr.select(si.is_valid(), self.depth + 1, self.depth)
 
     def survive(self, numbers: PathSamples, roulette_depth: int) -> None:
-        """End paths by Russian roulette from a number of bounces on."""
+        """End paths by Russian roulette from a number of bounces on.
+
+        As in Mitsuba's `path`, the probability to survive is the throughput times the
+        squared index of refraction, which cancels the compression of radiance in glass.
+        """
         largest = dr.max(self.throughput)
         survival = dr.minimum(largest * dr.square(self.eta), MAX_SURVIVAL)
         has_roulette = self.depth >= roulette_depth

@@ -118,7 +118,17 @@ class MitsubaScene:
         sampler: str = SAMPLER,
         integrator: str | None = None,
     ) -> None:
-        """Load a description into Mitsuba; arguments are those of the class."""
+        """Load a description into Mitsuba, and find which inputs it has.
+
+        Args:
+            description: the scene.
+            resolution: (height, width) in pixels.
+            filter: reconstruction filter, "box" or "gaussian".
+            leave_out: names of work that is saved, such as "tracing"; see the class.
+            max_depth: longest light path in segments.
+            sampler: Mitsuba's name of the sampler, such as "independent".
+            integrator: Mitsuba's name of the path integrator; None chooses one.
+        """
         with mitsuba_lock:
             # it registers the plugins, which needs the variant
             import advsearch.scene.mitsuba_backend.own_plugins  # noqa: F401
@@ -134,7 +144,7 @@ class MitsubaScene:
             self.max_depth = self.depth = max_depth
             self.window: Window | None = None
             self._leave_out = frozenset(leave_out)
-            # Dr.Jit can record neither of these
+            # Dr.Jit can record neither a thin lens nor a textured emission
             unrecorded = description.thin_lens or any(
                 map(has_textured_emission, description.meshes.values())
             )
@@ -199,7 +209,11 @@ class MitsubaScene:
             self._gradient_roulette_depth = GRADIENT_ROULETTE_DEPTH
 
     def _load_scene(self) -> list[parts.SceneInput]:
-        """Load Mitsuba's scene, and return the inputs that it may have."""
+        """Load Mitsuba's scene, and return the inputs that it may have.
+
+        This also extends `_path`, the entries that every path integrator of the scene
+        needs.
+        """
         description, filter_name = self.definition
         plugins = parts.make_scene_dict(
             description, self.resolution, filter_name, self.sampler
@@ -207,6 +221,7 @@ class MitsubaScene:
         with parts.convert_refusals(description):
             lobes = None if "lobes" in self._leave_out else parts.IDLE_LOBES
             translations = [parts.translate_mesh(description.meshes[OBJECT], lobes)]
+            # each part becomes Mitsuba's plugins, entries of integrators, and inputs
             translations += [
                 parts.translate_part(get_positioned_part(description, part))
                 for part in description.parts
@@ -214,8 +229,8 @@ class MitsubaScene:
             for translation in translations:
                 plugins |= translation.plugins
                 self._path |= translation.integrator
-            # No light is sampled from lamps that are dark by default. One that an input
-            # lights is found by paths that meet it by chance.
+            # Lamps that are dark by default are not sampled as lights. If an input
+            # switches one on, paths still find it when they meet it by chance.
             if "emitters" in self._leave_out:
                 for part in description.parts:
                     if isinstance(part, Lamp) and part.dark:
@@ -229,7 +244,7 @@ class MitsubaScene:
         return inputs
 
     def _declare_inputs(self, inputs: Sequence[parts.SceneInput]) -> None:
-        """Set `declared_inputs`, inputs that the scene really has, and sets of them.
+        """Store the inputs that the scene really has, in `declared_inputs` and in sets.
 
         An input is left out if Mitsuba has no parameter for it.
         """
@@ -265,9 +280,10 @@ class MitsubaScene:
         return tuple(medium for medium in media if medium is not None)
 
     def copy_with(self, **changes: Any) -> MitsubaScene:
-        """Return another scene made with the same arguments but for some changes.
+        """Return another scene, made with the same arguments except for some changes.
 
-        What may change is `max_depth`, `sampler`, `integrator` and `leave_out`.
+        `changes` may have `max_depth`, `sampler`, `integrator` and `leave_out`. The
+        integrator is chosen anew if it is not among them.
         """
         description, filter_name = self.definition
         arguments = {
@@ -363,23 +379,29 @@ class MitsubaScene:
 
         Args:
             inputs: what differs from the base values.
-            seeds: seed of each image: "path", the linear radiance; "hidden", the same
-                without what the environment shows directly, for a backdrop; "guides",
-                what guides the denoiser.
+            seeds: the seed of each image, by its kind. "path" is the linear radiance;
+                "hidden" is the same without the environment that the camera sees
+                directly, for a backdrop; "guides" is what guides the denoiser.
             spp: samples per pixel.
 
         Returns:
-            For each of `seeds` (H, W, 3) float32, of the window if there is one; of a
-            scene with a backdrop (H, W, 4) with the coverage of its surfaces, or with a
-            plane that takes the shadow in a photograph (H, W, 7), where the last three
-            are the change of the plane's radiance, or (H, W, 13) with that of what its
-            coat reflects, and the environment in it; of "guides" (H, W, 6), the first
-            hit's albedo in [0, 1] and its shading normal.
+            For each of `seeds` a float32 image, of the window if there is one. Its
+            shape is
+
+            - (H, W, 3), the radiance;
+            - (H, W, 4) with a backdrop: radiance, and coverage by surfaces;
+            - (H, W, 7) with a plane that takes the shadow in a photograph: the last
+              three are the change of the plane's radiance;
+            - (H, W, 13) if that plane has a coat: then also the change of what the coat
+              reflects, and the environment in the coat;
+            - (H, W, 6) for "guides": the first hit's albedo in [0, 1], and its shading
+              normal.
         """
         INTERRUPTS.look()
         with mitsuba_lock, self._crop_film():
 
             def render(scene: Any, sensor: Any, integrator: Any, seed: Any) -> Any:
+                """Render one image; this is the function that Dr.Jit records."""
                 image = integrator.render(
                     scene,
                     sensor=sensor,
@@ -436,13 +458,24 @@ class MitsubaScene:
     def render_radiance(
         self, inputs: Mapping[str, Tensor], seed: int, spp: int
     ) -> Tensor:
-        """Render linear radiance; arguments as for `pictures`."""
+        """Render the linear radiance (H, W, 3 or more channels), see `render_images`.
+
+        Args:
+            inputs: what differs from the base values.
+            seed: seed of the samples.
+            spp: samples per pixel.
+        """
         return self.render_images(inputs, {"path": seed}, spp)[0]
 
     def render_guides(
         self, inputs: Mapping[str, Tensor], seed: int, spp: int
     ) -> tuple[Tensor, Tensor]:
-        """Render what guides the denoiser; arguments as for `pictures`.
+        """Render what guides the denoiser.
+
+        Args:
+            inputs: what differs from the base values.
+            seed: seed of the samples.
+            spp: samples per pixel.
 
         Returns:
             First-hit albedo and shading normal, each (H, W, 3) float32.
@@ -477,7 +510,12 @@ class MitsubaScene:
     ) -> Surfaces:
         """Find what the camera sees first through the center of each pixel.
 
-        Arguments as for `Renderer.surfaces`; lengths are object sizes.
+        Lengths are in object sizes.
+
+        Args:
+            inputs: what differs from the base values.
+            subdivision: look-ups along each side of a pixel; the images of the result
+                are larger by this factor.
         """
         with mitsuba_lock:
             self._set(inputs)
@@ -487,7 +525,8 @@ class MitsubaScene:
             )
             for part in self.definition[0].parts:
                 if isinstance(part, LampGlass):
-                    # it counts as the face of the carrier that it was cut out of
+                    # The glass of a lamp was cut out of another mesh, its carrier. A
+                    # hit on it counts as a hit on that face of the carrier.
                     on_glass = hits.visible_mask(part.name)
                     carrier_face = torch.from_numpy(part.face_of_carrier)
                     hits.face[on_glass] = carrier_face[hits.face[on_glass]]
@@ -508,7 +547,7 @@ class MitsubaScene:
         """Return the gradient of `sum(cotangent * radiance)` by some inputs.
 
         Args:
-            inputs: as in `radiance`.
+            inputs: what differs from the base values.
             cotangent: (H, W, 3) float32, or of as many channels as the image has; of
                 the window if there is one.
             seed: should differ from the primal's, or the gradient of a noisy image is
@@ -526,7 +565,8 @@ class MitsubaScene:
         """
         with mitsuba_lock:
             requested = tuple(inputs if wrt is None else wrt)
-            # inputs that are differentiated although they are not requested
+            # Inputs that are differentiated although they are not requested. With
+            # "gradients" left out there are none.
             extra = set[str]()
             if "gradients" not in self._leave_out:
                 extra = set(self.interior_inputs)
@@ -563,8 +603,9 @@ class MitsubaScene:
     def _make_image_gradient(self, cotangent: Tensor) -> Tensor:
         """Return a cotangent with the channels of the image that Mitsuba renders.
 
-        That is 3; with a backdrop also coverage, whose cotangent is 0 as it has no
-        derivative here; and with a plane in a photograph also those of its change.
+        Without a backdrop these are the 3 channels of the radiance. With a backdrop,
+        coverage is the fourth; its cotangent is 0, since it has no derivative here. The
+        channels after it, of a plane in a photograph, are copied.
         """
         gradient = cotangent.detach().to(torch.float32)
         image_gradient = gradient[..., :3]
@@ -582,8 +623,12 @@ class MitsubaScene:
         """Set inputs as Dr.Jit tensors with gradients inside the `with`; then restore
         them.
 
-        `inputs` gives their values; those of other `names` stay as they are. Yields the
-        tensors by name.
+        Args:
+            names: the inputs that are tracked.
+            inputs: values of some of them; the others keep the values that they have.
+
+        Yields:
+            The tensors with gradients, by the inputs' names.
         """
         old_values = dict[str, Any]()
         tracked = dict[str, Any]()
@@ -628,9 +673,10 @@ class MitsubaScene:
         material form.
 
         Args:
-            inputs: as in `render_images`; they include `NAME.vertices` and
+            inputs: what differs from the base values; they include `NAME.vertices` and
                 `NAME.normals` of each of the meshes.
-            cotangent, seed: as for `render_adjoint`.
+            cotangent: (H, W, 3) derivative of the loss by the radiance.
+            seed: seed of the samples, which should differ from the primal render's.
             spp: samples per pixel of the interior term.
             meshes: names of the meshes.
         """
@@ -669,9 +715,15 @@ class MitsubaScene:
     ) -> Paths:
         """Trace light paths, and collect where they depend on one texture.
 
-        The texture `name` is a base color or a projector's pattern. Each vertex has the
-        change of its pixel for a unit more of the texture; and the paths have an image.
-        Other arguments as for `render_images`.
+        Each vertex of a path has the derivative of its pixel by the texture there. The
+        result also has the images of the paths.
+
+        Args:
+            inputs: what differs from the base values.
+            name: input of the texture, such as "object.base_color" or a projector's
+                pattern.
+            seed: seed of the samples.
+            spp: samples per pixel.
         """
         with mitsuba_lock, self._crop_film():
             self._set(inputs)
@@ -682,6 +734,7 @@ class MitsubaScene:
             height, width = self.window_size
             noise.seed(dr.opaque(mi.UInt32, seed), height * width * spp)
             part = name.partition(".")[0]
+            # A pattern's part is a projector, an emitter; a base color's is a mesh.
             projector = None
             if name.endswith(PATTERN_SUFFIX):
                 emitters = {emitter.id(): emitter for emitter in self._scene.emitters()}
@@ -724,10 +777,10 @@ class MitsubaScene:
     def _set(self, inputs: Mapping[str, Tensor]) -> None:
         """Set exactly these inputs, and everything else to its base value.
 
-        What is set already is not touched. Vertices are overwritten in their memory, to
-        which recordings refer. Numbers that Mitsuba takes for constants are part of the
-        recordings, so that a change of one makes all recordings stale
-        (`population.changes`).
+        Inputs that already have the requested value are not written again. Vertices are
+        overwritten in the memory that they have, since recordings refer to it. Some
+        numbers are compiled into recordings as constants: if one of them changes, all
+        recordings are stale, which `population.changes` counts.
         """
         self._check_known(inputs)
         if self._every:
@@ -763,7 +816,7 @@ class MitsubaScene:
             )
 
     def _find_changes(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor | None]:
-        """Return the inputs whose values differ from those that are set.
+        """Return the new values of inputs that differ from what is set, by name.
 
         None as a value means that the input goes back to its base value.
         """
@@ -786,6 +839,9 @@ class MitsubaScene:
 
         At the first write the base value is stored. Vertices and normals are written
         into the memory that they have, to which recordings refer.
+
+        Raises:
+            InputError: the value has the wrong number of elements.
         """
         key, scene_input = self.declared_inputs[name]
         current = self.parameters[key]
@@ -810,8 +866,8 @@ class MitsubaScene:
             address = current.torch().data_ptr()
             dr.scatter(current, value, dr.arange(mi.UInt32, len(current)))
             dr.eval(current)
-            # Dr.Jit has copied the memory if something else had it too: then recordings
-            # refer to the old one, and are stale
+            # If another array shared the memory, Dr.Jit has written to a copy. Then the
+            # address differs: recordings refer to the old memory, and are stale.
             population.changes += current.torch().data_ptr() != address
             self.parameters.set_dirty(key)
         else:
@@ -820,9 +876,10 @@ class MitsubaScene:
     def _integrator(self, method: str) -> Any:
         """Return the integrator of a method at the current depth, loaded on first use.
 
-        The methods are "path" for images, "adjoint" for derivatives of them, "hidden"
-        for both without the environment, "guides" for the denoiser, and "boundary" with
-        the terms of moving outlines.
+        Args:
+            method: "path" for images; "adjoint" for derivatives of images; "hidden" for
+                both, without the environment that the camera sees; "guides" for the
+                denoiser; "boundary" for derivatives with the terms of moving outlines.
         """
         key = method, self.depth
         if key not in self._integrators:
@@ -878,7 +935,10 @@ def _check_emission(description: SceneDescription) -> None:
 def _to_repeating(
     uv: Tensor, surface: Mapping[str, object] | None, size: tuple[int, int]
 ) -> Tensor:
-    """Convert texture coordinates so that a look-up which repeats shows the same.
+    """Convert texture coordinates to those for a texture that repeats.
+
+    A look-up that repeats the texture then finds the same texels as Mitsuba's own
+    look-up, which may mirror or clamp.
 
     Args:
         uv: (n, 2) texture coordinates.
@@ -887,7 +947,8 @@ def _to_repeating(
         size: rows and columns of the texture.
     """
     if surface is None:
-        # to the centers of the outer texels, beyond which the image stays the same
+        # Clamp to the centers of the outer texels: beyond them Mitsuba's look-up stays
+        # constant, but one that repeats would blend with the other side.
         half_texel = 0.5 / torch.tensor(size[::-1])
         return uv.clamp(half_texel, 1.0 - half_texel)
     options = next(

@@ -83,12 +83,16 @@ NUMERIC_ENTRIES: Mapping[str, tuple[tuple[int, ...], str]] = {
 def read_scene_dict(scene: Path | Mapping[str, object]) -> tuple[Plugin, list[str]]:
     """Read a scene file or a dictionary, with arrays for transforms.
 
+    Args:
+        scene: path of an XML file, or a dictionary of the type "scene".
+
     Returns:
-        The dictionary, and warnings about its images.
+        The dictionary, and warnings about its images and ignored entries.
 
     Raises:
-        FileFormatError: as for `read_scene` and `check_and_read_files`.
-        InputError: no scene.
+        FileFormatError: the file is missing or corrupt, or it names a plugin or a file
+            that may not be read.
+        InputError: the dictionary is no scene, or an entry is no number.
     """
     notes: list[str] = []
     if isinstance(scene, Path):
@@ -112,11 +116,18 @@ def read_scene_dict(scene: Path | Mapping[str, object]) -> tuple[Plugin, list[st
 def _check_numbers(plugin: Mapping[str, object], where: str) -> None:
     """Check that the entries of a plugin that we read ourselves are numbers.
 
-    They are those of `NUMERIC_ENTRIES`; all others are checked by Mitsuba. Inner
-    plugins are checked too. Raises InputError, which begins with `where`.
+    They are those of `NUMERIC_ENTRIES`; Mitsuba checks all others. Inner plugins are
+    checked too.
+
+    Args:
+        plugin: the plugin's dictionary.
+        where: beginning of error messages.
+
+    Raises:
+        InputError: an entry is no number, or not of the right shape.
     """
     for key, value in plugin.items():
-        # a color is a value, though it is written as a plugin
+        # a color is written as a plugin, but is a value here
         is_color = isinstance(value, Mapping) and value.get("type", "rgb") in (
             "rgb",
             "spectrum",
@@ -151,7 +162,13 @@ class PluginContents:
 
 
 def read_contents(path: Path) -> PluginContents:
-    """Return what is understood of a scene file; errors as for `read_scene_dict`."""
+    """Return what is understood of a scene file.
+
+    Raises:
+        FileFormatError: the file is missing or corrupt, or it names a plugin or a file
+            that may not be read.
+        InputError: an entry of a plugin is no number.
+    """
     named = dict(_list_plugins(read_scene_dict(path)[0]))
     type_by_name = {name: str(plugin["type"]) for name, plugin in named.items()}
     objects = tuple(
@@ -201,7 +218,8 @@ def import_mitsuba_scene(
 
     Raises:
         UnknownNameError: it has no such shape.
-        FileFormatError: as for `read_scene_dict`.
+        FileFormatError: the file is missing or corrupt, or it names a plugin or a file
+            that may not be read.
         InputError: the shape is no mesh and cannot be made one, or the scene is too
             large.
     """
@@ -272,13 +290,16 @@ def _find_shape(
 ) -> str:
     """Return the id of the shape that a user names.
 
-    Without a shape of that id, it is the only one whose id differs in nothing but case
-    and signs. Raises UnknownNameError: there is none, or several.
+    If no shape has that id, it is the only one whose id has the same letters and
+    digits, in any case: "largebox" means "large-box".
 
     Args:
         named: the scene's plugins by name.
         object_id: the name.
         where: the scene, for errors.
+
+    Raises:
+        UnknownNameError: there is no such shape, or several.
     """
 
     def simplify(name: str) -> str:
@@ -297,8 +318,8 @@ def _find_shape(
 def _is_z_up(named: Mapping[str, Mapping[str, object]]) -> bool:
     """Return whether z is the upward axis of a scene, and not y.
 
-    The first camera that has a pose decides: which axis is its own upward axis nearer
-    to?
+    The first camera with a pose decides: z is up if the camera's own upward axis is
+    nearer to z than to y. Without such a camera y is up, as usual in Mitsuba.
     """
     posed_sensors = [
         plugin
@@ -319,7 +340,12 @@ def _import_surroundings(
 ) -> Iterator[ScenePart]:
     """Yield all plugins that stay as they are, in the object's coordinates.
 
-    Plugins that were `used`, integrators and sensors are left out.
+    Integrators and sensors are left out.
+
+    Args:
+        named: the scene's plugins by name.
+        used: names of the plugins that became the object or the haze.
+        frame: the object's coordinates.
     """
     replaced_types = INTEGRATOR_TYPES | SENSOR_TYPES
     for name, plugin in named.items():
@@ -340,10 +366,10 @@ def _paint(
 ) -> tuple[Mesh, Float32Array]:
     """Return a mesh with texture coordinates for its base color, and that base color.
 
-    A textured surface, or one that looks anything else up by texture coordinates or
-    attributes, keeps its own; the base color's own transform is applied to them. A
-    shape of one color gets new ones where its own do not tell its points apart, as on a
-    cube.
+    A mesh keeps its texture coordinates if its surface has a texture or anything else
+    that depends on them; the base color's transform is applied to them. A shape of one
+    color gets new ones if several of its points have the same, as on a cube, since a
+    searched texture needs different ones.
 
     Args:
         mesh: mesh of the shape.
@@ -358,7 +384,7 @@ def _paint(
         mitsuba_uvs = mitsuba_uvs @ surface.to_uv[:2, :2].T + surface.to_uv[:2, 2]
         uvs = (mitsuba_uvs * (1.0, -1.0) + (0.0, 1.0)).astype(np.float32)
         return replace(mesh, uvs=uvs), surface.base_color
-    # On these several points have the same texture coordinates.
+    # On these shapes several points have the same texture coordinates.
     has_shared_uvs = kind in ("cube", "sphere", "cylinder", "disk")
     keeps_uvs = has_uvs and not has_shared_uvs
     surface_color = ImportedSurface(color=surface.base_color[0, 0])
@@ -401,15 +427,22 @@ def _find_surface(
     to.
 
     It is the shape's first inner plugin that is neither a light nor a medium; without
-    one, Mitsuba's default. `named` are the scene's plugins. Raises UnknownNameError: a
-    reference leads nowhere, or in a circle; InputError: it has too many plugins.
+    one, Mitsuba's default.
+
+    Args:
+        shape: the shape's dictionary.
+        named: the scene's plugins by name.
+
+    Raises:
+        UnknownNameError: a reference leads nowhere, or in a circle.
+        InputError: the surface has too many plugins.
     """
     n_plugins = 0  # how many have been resolved
 
     def resolve(plugin: Mapping[str, object], depth: int) -> Mapping[str, object]:
         """Return a plugin with the references in it resolved.
 
-        `depth` references lead to it from the shape.
+        `depth` counts the references on the way from the shape to this plugin.
         """
         nonlocal n_plugins
         n_plugins += 1
@@ -434,10 +467,10 @@ def _find_surface(
 
 
 def _find_radiance(shape: Mapping[str, object]) -> Float32Array | None:
-    """Return the radiance (1, 1, 3) of a shape that emits evenly; None of any other.
+    """Return the radiance (1, 1, 3) of a shape that emits evenly; None for any other.
 
-    It emits evenly if its light has a constant radiance, of at most `MAX_RADIANCE`, and
-    no other entries.
+    It emits evenly if its area light has a constant radiance, of at most
+    `MAX_RADIANCE`, and no other entries.
     """
     for inner in shape.values():
         if not isinstance(inner, Mapping) or inner["type"] != "area":
@@ -473,9 +506,9 @@ def _describe_left_out(
 
     Args:
         tree: the scene.
-        shape: the object's.
-        hazy: whether the camera's medium is rendered, as the scene's haze.
-        lit: whether the object keeps its light.
+        shape: the shape that becomes the object.
+        hazy: whether the medium that cameras stand in is rendered, as a haze.
+        lit: whether the object keeps the light that it emits.
     """
     for name, plugin in _list_plugins(tree):
         if plugin["type"] in INTEGRATOR_TYPES:
@@ -497,7 +530,7 @@ def _describe_left_out(
 
 
 def _describe_integrator(name: str, plugin: Mapping[str, object]) -> Iterator[str]:
-    """Yield clauses about an integrator."""
+    """Yield clauses about what an integrator states and our own does not follow."""
     kind = plugin["type"]
     if kind not in PATH_INTEGRATORS:
         yield (
@@ -518,7 +551,13 @@ def _describe_integrator(name: str, plugin: Mapping[str, object]) -> Iterator[st
 def _describe_sensor(
     name: str, plugin: Mapping[str, object], *, hazy: bool
 ) -> Iterator[str]:
-    """Yield clauses about a sensor."""
+    """Yield clauses about what of a sensor is left out.
+
+    Args:
+        name: name of the sensor.
+        plugin: its dictionary.
+        hazy: whether the medium that it stands in is rendered, as a haze.
+    """
     kind = plugin["type"]
     if kind not in CAMERAS:
         yield f"the sensor {name} is left out: a {kind}"
@@ -547,8 +586,13 @@ class _ObjectFrame:
     def __init__(self, mesh: Mesh, name: str, *, z_up: bool) -> None:
         """Measure a mesh, in the scene's coordinates, for the object of a name.
 
-        Without `z_up` the scene's y axis points up. Raises InputError: it has no
-        extent.
+        Args:
+            mesh: the mesh, in the scene's coordinates.
+            name: name of the object, for errors.
+            z_up: whether the scene's z axis points up; otherwise it is y.
+
+        Raises:
+            InputError: the mesh has no extent.
         """
         to_z_up = np.eye(4) if z_up else Y_TO_Z
         vertices = mesh.vertices.astype(np.float64) @ to_z_up[:3, :3].T
@@ -574,13 +618,13 @@ class _ObjectFrame:
     ) -> Plugin:
         """Return a plugin of the scene in the object's coordinates.
 
-        Shapes and lamps move, distant lights only turn, and media are denser or thinner
-        by the size of the object. All else stays as it is.
+        Shapes and lamps are moved and scaled, distant lights are only rotated, and the
+        density of media is scaled. All other plugins stay as they are.
 
         Args:
             plugin: its dictionary.
-            at_top: it stands at the top of the scene; within another plugin only media
-                and volumes change.
+            at_top: whether it is at the top of the scene; inside another plugin only
+                media and volumes change.
         """
         kind = plugin["type"]
         if kind in MEDIUM_TYPES:
@@ -625,9 +669,9 @@ class _ObjectFrame:
     def _move_lamp(self, plugin: Mapping[str, object]) -> Plugin:
         """Return a lamp in the object's coordinates, with its power scaled.
 
-        Lengths become smaller by the object's size. The intensity of a lamp is an
-        irradiance times a squared length, so it is divided by the squared size; a
-        projector's irradiance too, as it is that at a distance of 1.
+        Lengths are divided by the object's size. The intensity of a lamp is an
+        irradiance times a squared length, so it is divided by the squared size. So is a
+        projector's irradiance, which is that at a distance of 1.
         """
         kind = str(plugin["type"])
         entries = dict(plugin)
@@ -643,7 +687,16 @@ class _ObjectFrame:
 
 
 def _scale_power(value: object, factor: float, kind: str) -> object:
-    """Multiply a light's power in any form that Mitsuba takes; `kind` is for errors."""
+    """Multiply a light's power in any form that Mitsuba takes.
+
+    Args:
+        value: the power: a number, or the dictionary of a spectrum or a bitmap.
+        factor: the factor.
+        kind: type of the light, for errors.
+
+    Raises:
+        InputError: the power is of another form.
+    """
     if isinstance(value, (int, float)):
         return float(value) * factor
     if isinstance(value, Mapping):
@@ -659,8 +712,13 @@ def _scale_power(value: object, factor: float, kind: str) -> object:
 def _scale_spectrum(value: Mapping[str, object], factor: float) -> Plugin | None:
     """Multiply a spectrum's or a bitmap's values; None if it is of another kind.
 
-    The value may be one number, three, or pairs of wavelength and amount; lights of a
-    fixed spectrum have a scale of their own.
+    The value may be one number, three numbers, or pairs of wavelength and amount.
+    Lights with a fixed spectrum (d65, blackbody) have an entry `scale`, which is
+    multiplied instead.
+
+    Args:
+        value: the dictionary of the spectrum or the bitmap.
+        factor: the factor.
     """
     kind = value["type"]
     inner = value.get("value")
@@ -700,8 +758,13 @@ def _read_film_size(film: Mapping[str, object]) -> tuple[float, float]:
 def _import_camera(sensor: Mapping[str, object], frame: _ObjectFrame) -> PosedCamera:
     """Return a sensor's pose and field of view along the larger side.
 
-    The field of view is along the axis that the sensor states, or the diagonal of a
-    focal length; its tangent is proportional to the film's length along it.
+    The sensor's own field of view is along the axis that it states; that of a focal
+    length is along the film's diagonal. The tangent of half the field of view is
+    proportional to the film's length along the axis, by which it is converted.
+
+    Args:
+        sensor: the sensor's dictionary.
+        frame: the object's coordinates.
     """
     matrix = frame.matrix @ shapes.get_pose(sensor)
     # without the scale of the object's frame

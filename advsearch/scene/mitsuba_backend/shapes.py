@@ -72,6 +72,10 @@ SHAPE_ENTRIES = MESH_ENTRIES | {
 def _load_any_buffers(shape: Mapping[str, object], name: str) -> Buffers:
     """Return the buffers of a shape, whether Mitsuba has a mesh of it or not.
 
+    Args:
+        shape: the shape's dictionary, such as `{"type": "sphere", "radius": 2.0}`.
+        name: name of the object, for errors.
+
     Raises:
         InputError: the shape has no triangles.
     """
@@ -121,10 +125,11 @@ def load_shape_mesh(shape: Mapping[str, object], name: str) -> tuple[Mesh, bool]
     if uvs is None or normals is None:
         vertices, faces, normals, uvs, attributes = _separate_faces(buffers)
 
+    # vertices that no face has are left out
     used_vertices, vertex_index = np.unique(faces, return_inverse=True)
     faces = vertex_index.reshape(-1, 3)
     vertices = vertices[used_vertices]
-    # v points up in our meshes, and down in Mitsuba's: 1 - v
+    # v points up in our meshes and down in Mitsuba's, so that it becomes 1 - v
     uvs = uvs[used_vertices] * (1.0, -1.0) + (0.0, 1.0)
     normal_sign = -1.0 if shape.get("flip_normals") else 1.0
     # NaN where a face has no area
@@ -165,8 +170,12 @@ def _separate_faces(
 ) -> tuple[Float64Array, IntArray, Float64Array, Float64Array, dict[str, Float32Array]]:
     """Return buffers in which every corner of a face is a vertex of its own.
 
-    Normals that are missing become those of the faces, and texture coordinates that are
-    missing `DEFAULT_FACE_UVS`.
+    Missing normals are replaced by those of the faces, and missing texture coordinates
+    by `DEFAULT_FACE_UVS`.
+
+    Returns:
+        Vertices (3 F, 3), faces (F, 3), normals (3 F, 3), texture coordinates (3 F, 2),
+        and attributes by name.
     """
     corners = buffers.faces.reshape(-1)
     vertices = buffers.vertices[corners]
@@ -185,10 +194,14 @@ def _separate_faces(
 
 
 def _load_buffers(shape: Mapping[str, object], name: str) -> Buffers:
-    """Load a mesh with Mitsuba; `name` is that of the object, for errors.
+    """Load a mesh with Mitsuba.
 
     Only entries of the geometry are loaded, without surface and light. Normals and
     texture coordinates are None if the mesh has none.
+
+    Args:
+        shape: the shape's dictionary.
+        name: name of the object, for errors.
 
     Raises:
         InputError: Mitsuba refuses the mesh, or it has no faces.
@@ -252,8 +265,13 @@ def _tessellate(kind: str, shape: Mapping[str, object], name: str) -> Buffers:
     its `to_world`. Faces without area are left out; round shapes have `ROUND_SEGMENTS`
     around.
 
+    Args:
+        kind: type of the shape, such as "sphere".
+        shape: its dictionary.
+        name: name of the object, for errors.
+
     Raises:
-        InputError: its pose has no volume.
+        InputError: its pose has a determinant of 0, so that it has no extent.
     """
     vertices, faces, normals, uvs = _make_unit_shape(kind)
     shape_pose = np.eye(4)
@@ -272,7 +290,8 @@ def _tessellate(kind: str, shape: Mapping[str, object], name: str) -> Buffers:
             "without extent; change its numbers"
         )
     posed_vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
-    # rows times the inverse: normals are transformed by the inverse transpose
+    # Normals are transformed by the inverse transpose. They are rows here, so that they
+    # are multiplied by the inverse itself.
     posed_normals = _normalize(normals @ np.linalg.inv(matrix[:3, :3]))
     return Buffers(posed_vertices, faces, posed_normals, uvs, attributes={})
 
@@ -286,7 +305,7 @@ def _make_unit_shape(
         Vertices (V, 3), faces (F, 3), normals (V, 3) and texture coordinates (V, 2).
     """
     fractions = np.linspace(0.0, 1.0, ROUND_SEGMENTS + 1)  # of a turn, for a round kind
-    normals = None  # up, for a flat kind
+    normals = None  # for flat shapes, (0, 0, 1) below
     if kind == "sphere":
         # half as many segments from pole to pole as around
         uvs, faces = _make_grid(fractions, fractions[::2])
@@ -332,8 +351,9 @@ def _compute_cylinder_pose(shape: Mapping[str, object]) -> Float64Array:
     length = float(np.linalg.norm(end - start))
     axis = (end - start) / max(length, 1e-30)  # not by 0
     x, y, z = axis
-    # two axes perpendicular to it, as in Mitsuba's `coordinate_system` (Duff et al.
-    # 2017), which has float32 alone; the sign keeps the divisor away from 0
+    # Two axes perpendicular to it, as in Mitsuba's `coordinate_system` (Duff et al.
+    # 2017), which is not called because it computes in float32. The sign keeps the
+    # divisor away from 0.
     sign = np.copysign(1.0, z)
     factor = -1.0 / (sign + z)
     x_axis = np.array([1.0 + sign * x * x * factor, sign * x * y * factor, -sign * x])
@@ -384,9 +404,9 @@ def find_haze(
 ) -> tuple[HazePart, frozenset[str]] | None:
     """Find the haze of a scene.
 
-    It is one grey medium in a ball that the camera stands in: Mitsuba's `prbvolpath`
-    sees nothing of it up to the first surface, so such a scene is rendered as one with
-    a `HazePart`. All other media stay as they are.
+    A haze is one grey medium in a ball that the camera stands in. Mitsuba's
+    `prbvolpath` does not see it between the camera and the first surface, so our own
+    integrator renders it, from a `HazePart`. All other media stay as they are.
 
     Args:
         named: the scene's plugins by name.
@@ -410,7 +430,7 @@ def find_haze(
     scene_radius = float(_parse_numbers(ball.get("radius", 1.0))[0])
     # the cube root of the determinant is the scale of lengths
     radius = scene_radius * float(np.cbrt(abs(np.linalg.det(pose[:3, :3]))))
-    # Ours is a ball around the object.
+    # Our haze is a ball around the object, which is at the origin of these coordinates.
     is_centered = float(np.linalg.norm(center[:3])) <= MAX_CENTER_OFFSET * radius
     if not (radius > 0.0 and is_centered):
         return None
@@ -425,15 +445,21 @@ def find_haze(
 def _read_haze_medium(
     medium: Mapping[str, object], matrix: Float64Array
 ) -> tuple[float, tuple[float, float, float]] | None:
-    """Return the extinction, per length of the object, and the albedo of a medium.
+    """Return the extinction, per object size, and the albedo (RGB) of a medium.
 
-    None if it is not grey or out of range; numbers that are not understood are NaN, for
-    which all comparisons are false. `matrix` is as in `find_haze`.
+    The result is None if the medium is not grey, or out of range. Numbers that are not
+    understood are NaN, for which all comparisons are false.
+
+    Args:
+        medium: the medium's dictionary.
+        matrix: (4, 4) from the scene to the object's coordinates, with one scale for
+            all directions.
     """
     density = _parse_numbers(medium.get("sigma_t", 1.0))
     scale = _parse_numbers(medium.get("scale", 1.0))
-    # The cube root of the determinant is the scale of lengths, from the scene's to
-    # those of the object. What is per length becomes smaller by it.
+    # The cube root of the determinant is the factor of lengths, from the scene to the
+    # object's coordinates. The extinction is per length, so it is divided by the
+    # factor.
     length_scale = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
     extinction = density * scale / length_scale
     # one value for all channels
@@ -450,9 +476,10 @@ def _read_haze_medium(
 def _find_haze_plugins(named: Plugins) -> tuple[str, str] | None:
     """Return the names of the ball and of the medium of a haze; None without one.
 
-    The only medium of the scene is homogeneous and isotropic, cameras stand in it, and
-    a single sphere with no surface is filled with it. Both have no entries that a haze
-    cannot have, `_OF_BALL` and `_OF_MEDIUM`.
+    The scene has a haze if its only medium is homogeneous and isotropic, if cameras
+    stand in that medium, and if it fills a single sphere without a surface. The ball
+    and the medium may have only the entries in `_OF_BALL` and `_OF_MEDIUM`: a haze has
+    no others.
     """
     # only cameras name a medium that they stand in
     camera_media = {_get_reference(plugin.get("medium")) for plugin in named.values()}
@@ -495,12 +522,15 @@ def _get_reference(plugin: object) -> str | None:
 
 
 def _parse_numbers(value: object) -> Float64Array:
-    """Return a number (1,), or the three of a color; NaN (1,) for anything else."""
+    """Return a number (1,), or the three of a color; NaN (1,) for anything else.
+
+    A color may be a plugin, such as `{"type": "rgb", "value": [0.1, 0.2, 0.3]}`.
+    """
     not_understood = np.full(1, np.nan)
     if isinstance(value, Mapping):
         is_constant = value.get("type") in ("rgb", "uniform", "spectrum", "srgb")
         value = value.get("value") if is_constant else None
-    # NumPy would read both as numbers
+    # NumPy would convert a string or a bool to a number
     if isinstance(value, (str, bool)):
         return not_understood
     try:
@@ -572,9 +602,10 @@ class _Color(NamedTuple):
 def read_surface(bsdf: Mapping[str, object]) -> ShapeSurface:
     """Take the first base color out of a surface: a color, a bitmap or a checkerboard.
 
-    Whatever else is looked up by texture coordinates stays as it is: where the base
-    color has a transform of its own, the others get the inverse before theirs. A base
-    color is cut to [0, 1], and a surface without one is grey: notes say so.
+    If the base color has a transform of texture coordinates, it is applied to the
+    mesh. All other textures of the surface then undo it first, so that they look the
+    same as before. A base color is cut to [0, 1], and a surface without one is grey;
+    the result's notes say so.
     """
     surface, color = _take_base_color(bsdf)
     if color is None:
@@ -606,9 +637,12 @@ def read_surface(bsdf: Mapping[str, object]) -> ShapeSurface:
 
 
 def _take_base_color(bsdf: Mapping[str, object]) -> tuple[Plugin, _Color | None]:
-    """Return a surface with `BASE_COLOR` in the place of its first base color, and it.
+    """Replace the first base color of a surface by the placeholder `BASE_COLOR`.
 
-    The first is that of the outermost plugin which has one; None if there is none.
+    The first is that of the outermost plugin which has one.
+
+    Returns:
+        The surface with the placeholder, and the base color; None if there is none.
     """
     base: _Color | None = None
 
@@ -653,9 +687,14 @@ def _apply_uv_transform(
 ) -> tuple[Plugin, Float64Array]:
     """Apply a base color's transform of texture coordinates to those of the mesh.
 
-    All other textures of the surface get the inverse before theirs. That is possible
-    only if the transform can be undone, and if tangents along u stay as they are where
-    the surface uses them. Otherwise the base color keeps its transform.
+    All other textures of the surface then undo it first, by its inverse. That is
+    possible only if the transform has an inverse. If the surface uses tangents along u,
+    their direction must also stay the same. Otherwise the base color keeps its
+    transform, and the mesh is not changed.
+
+    Args:
+        surface: the surface, with the placeholder of the base color.
+        transform: the base color's `to_uv`, (3, 3) or (4, 4); None if it has none.
 
     Returns:
         The surface with changed transforms, and the (3, 3) transform of the mesh's
@@ -683,8 +722,12 @@ def _with_transform(
     """Return a plugin whose textures of some kinds have one more transform of
     coordinates.
 
-    Texture coordinates go through `before` (3, 3) and then through the texture's own
-    transform. Inner plugins are changed too, at any depth.
+    Inner plugins are changed too, at any depth.
+
+    Args:
+        plugin: the plugin.
+        before: (3, 3) transform that is applied before the texture's own one.
+        kinds: types of the textures that are changed, such as "bitmap".
     """
     changed = map_inner_plugins(
         plugin, lambda inner: _with_transform(inner, before, *kinds)
@@ -755,7 +798,7 @@ def _repeat_texels(texture: Float32Array) -> Float32Array:
     It is for textures that are not interpolated: a control may keep the texture's size
     and interpolate, which then blurs only the borders of texels.
     """
-    # rounded up
+    # twice negated, so that the quotients are rounded up
     row_repeats, column_repeats = (
         -(-MIN_NEAREST_SIZE // size) for size in texture.shape[:2]
     )
@@ -765,8 +808,11 @@ def _repeat_texels(texture: Float32Array) -> Float32Array:
 def _read_pixels(value: Mapping[str, object]) -> Float32Array | None:
     """Return the linear values (H, W, 3) of a bitmap; None if it cannot be read here.
 
-    An array holds linear values already; of one with two channels, grey and alpha, the
-    first is read. A file or one of Mitsuba's bitmaps is converted, unless it is raw.
+    An array holds linear values already; its alpha is left out. A file or one of
+    Mitsuba's bitmaps is converted from sRGB, unless it is raw.
+
+    Args:
+        value: dictionary of the bitmap plugin.
     """
     image = value.get("bitmap")
     if isinstance(image, np.ndarray):

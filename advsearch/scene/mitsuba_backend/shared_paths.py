@@ -62,7 +62,7 @@ class SharedPaths:
     """
 
     def __init__(self, scene: MitsubaScene, inputs: Collection[str]) -> None:
-        """Remember the scene; arguments are those of the class."""
+        """Store the scene and which inputs may change, as "object.roughness"."""
         self.scene = scene
         self._inputs = frozenset(inputs)
         self._shapes = {name.partition(".")[0] for name in inputs}
@@ -73,10 +73,17 @@ class SharedPaths:
     def render_images(
         self, inputs: Mapping[str, Tensor], seeds: Mapping[str, int], spp: int
     ) -> list[Tensor]:
-        """Render images; arguments and results as of `MitsubaScene.render_images`.
+        """Render images of one configuration, as `MitsubaScene.render_images` does.
 
-        What guides the denoiser comes from the same samples as the radiance, so that of
-        `seeds` only that of "path" counts.
+        Args:
+            inputs: values of inputs that differ from the base values.
+            seeds: seed of the image "path", and perhaps of "guides". The guides come
+                from the same samples as the radiance, so only the seed of "path"
+                counts.
+            spp: samples per pixel.
+
+        Returns:
+            The radiance (H, W, 3), and for "guides" albedo and normal (H, W, 6).
         """
         INTERRUPTS.look()
         with mitsuba_lock:
@@ -104,7 +111,11 @@ class SharedPaths:
             }
 
     def _render(self, seed: int, spp: int) -> tuple[Tensor, Tensor]:
-        """Render radiance (H, W, 3) and guides (H, W, 6) of the inputs that are set."""
+        """Render radiance (H, W, 3) and guides (H, W, 6) of the inputs that are set.
+
+        If images of the seed are stored, only the samples that have met a changed
+        surface are traced again.
+        """
         key = (seed, spp, self.scene.depth)
         height, width = self.scene.resolution
         changing = np.zeros((height * width, N_CHANNELS))
@@ -124,7 +135,10 @@ class SharedPaths:
     def _trace_all(self, seed: int, spp: int, changing: Float64Array) -> StoredPaths:
         """Trace all samples, and return what is common to images of the seed.
 
-        The sums over what is not are added to `changing` (pixels, channels).
+        Args:
+            seed: seed of the image.
+            spp: samples per pixel.
+            changing: (pixels, channels) to which the sums of all else are added.
         """
         common = np.zeros_like(changing)
         met_samples = []
@@ -145,7 +159,17 @@ class SharedPaths:
         return StoredPaths(common, met_samples)
 
     def _trace(self, seed: int, spp: int, samples: Any) -> tuple[Any, Any, Any]:
-        """Trace samples of an image by their indices; results as of `trace_paths`."""
+        """Trace samples of an image by their indices.
+
+        Args:
+            seed: seed of the image.
+            spp: samples per pixel.
+            samples: Dr.Jit's indices of the samples in the image.
+
+        Returns:
+            Nine channels (radiance, albedo, normal) that do not depend on the changed
+            surfaces; nine that do; and whether a path has met such a surface.
+        """
         # it needs the variant
         from advsearch.scene.mitsuba_backend import paths
 
@@ -156,6 +180,7 @@ class SharedPaths:
         def trace(
             scene: Any, sensor: Any, changed: Any, seed: Any, samples: Any
         ) -> Any:
+            """Trace paths; this is the function that Dr.Jit records."""
             numbers = paths.PathSamples(seed, samples, spp, is_stratified)
             ray = paths.sample_rays(sensor, numbers, samples)
             return paths.trace_paths(
@@ -183,7 +208,8 @@ class SharedPaths:
 def find_shared_paths_refusal(scene: MitsubaScene) -> str:
     """Return why images of a scene share no paths; "" if they may.
 
-    They pay where light paths are long, and trees and houses are in their way.
+    Sharing saves time where light paths are long, as among trees and houses. The other
+    reasons are cases that `trace_paths` does not cover.
     """
     description, filter_name = scene.definition
     if scene.integrator != "path":

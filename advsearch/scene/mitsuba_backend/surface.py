@@ -139,7 +139,14 @@ class ViewTracer:
     ) -> None:
         """Prepare the tables of all surfaces and of the lens for the kernel.
 
-        Arguments are those of the class.
+        Args:
+            scene: the scene.
+            grids, lobes: texel grid and reflection tables of each surface.
+            widths: root mean square angles, radians, of the blurred maps.
+            photograph_height: height from which a photographed ground was taken; None
+                for any other ground.
+            model: lens model of all cameras; None for pinholes.
+            center: (3,) center of the object.
         """
         self._scene = scene
         self._grids = tuple(grids)
@@ -195,8 +202,8 @@ class ViewTracer:
                 [_make_camera_numbers(inputs, height, width) for inputs in cameras]
             ).astype(np.float32)
 
-            # Maps are arguments of the recorded function, so that it works for other
-            # light of the same sizes.
+            # Maps are arguments of the recorded function, so that the recording also
+            # works for other light whose maps have the same sizes.
             def trace(
                 mitsuba_scene: Any,
                 lane: Any,
@@ -207,6 +214,7 @@ class ViewTracer:
                 sky: Any,
                 blurred: Any,
             ) -> Any:
+                """Trace all rays; arguments are Dr.Jit arrays, see `_trace`."""
                 light_maps = replace(lit, texels=texels, sky=sky, blurred=blurred)
                 return self._trace(
                     mitsuba_scene, lane, tables, cameras, lens, light_maps
@@ -215,7 +223,7 @@ class ViewTracer:
             recording = self._recordings.get_or_record(
                 (count, lit.sky_shape, lit.blurred_shape), trace, []
             )
-            # the kernel's argument cannot be empty
+            # without a lens a single 0, since the kernel's argument cannot be empty
             lens = np.zeros(1, np.float32) if self._lens is None else self._lens
             arrays = [
                 mi.Float(values)
@@ -241,12 +249,13 @@ class ViewTracer:
     ) -> list[Any]:
         """Trace all rays: the recorded kernel.
 
-        Rays go through cut-outs layer by layer. Each layer stops a fraction of what
-        light is left of a ray, and the last one all of it.
+        Rays go through cut-outs layer by layer. Each layer stops a fraction of the
+        light that is left of a ray; the last layer stops all of it.
 
         Args:
             mitsuba_scene: the scene.
-            lane: number of the ray: camera, row, column, ray of the pixel.
+            lane: index of each ray; rays are in the order of camera, row, column, and
+                ray of the pixel.
             tables: tables of `Lobes` of all surfaces, flat.
             cameras: `CAMERA_SIZE` numbers for each camera, flat.
             lens: as from `_make_lens_table`.
@@ -255,7 +264,7 @@ class ViewTracer:
         Returns:
             For each pixel the three channels of radiance without the searched texture,
             and coverage; then for each layer of cut-outs and each ray u, v and weight
-            of the searched texture, negative on its back.
+            of the searched texture. The weight is negative where its back is seen.
         """
         ray, active = self._make_rays(lane, cameras, lens)
         direction = ray.d
@@ -303,8 +312,12 @@ class ViewTracer:
     def _make_rays(self, lane: Any, cameras: Any, lens: Any) -> tuple[Any, Any]:
         """Return the ray of each lane, and whether the lens has one there.
 
-        A lane is (view, row, column, ray of the pixel), the last fastest. `cameras` and
-        `lens` are as for `_trace`; for a camera's numbers see `_make_camera_numbers`.
+        Args:
+            lane: index of each ray; rays are in the order of camera, row, column, and
+                ray of the pixel.
+            cameras: `CAMERA_SIZE` numbers for each camera, flat, as from
+                `_make_camera_numbers`.
+            lens: four numbers for each ray of an image, as from `_make_lens_table`.
         """
         height, width = self._scene.resolution
         pixel = lane // RAYS_PER_PIXEL
@@ -321,7 +334,8 @@ class ViewTracer:
         position = camera[9:12]
         if self._lens is None:
             half_width, half_height, center_x, center_y = camera[12:]
-            # in pixels from the left and from the top; x goes to the left, y up
+            # Columns count from the left and rows from the top. The camera's x points
+            # to the left and its y up, so both are subtracted.
             column = mi.Float(pixel % width) + x_offset
             row = mi.Float(pixel // width) + y_offset
             x = (center_x - 2.0 * column / width) * half_width
@@ -352,10 +366,12 @@ class ViewTracer:
         """Shade what a ray in direction d hit.
 
         Args:
-            mitsuba_scene, tables, lit: as for `_trace`.
+            mitsuba_scene: the scene.
             si: the hit.
             valid: whether there is one.
             d: unit direction of the ray.
+            tables: tables of `Lobes` of all surfaces, flat.
+            lit: the light.
 
         Returns:
             Its radiance, without what the searched texture reflects diffusely; its
@@ -393,9 +409,13 @@ class ViewTracer:
     ) -> list[Any]:
         """Look up the tables of `Lobes` at a cosine of the angle of view.
 
-        Between its entries a table is interpolated linearly. `masks` tell for each
-        surface whether it was hit; where none was, the values are those of the first
-        surface. `tables` are those of all surfaces, one after the other, flat.
+        Between its entries a table is interpolated linearly.
+
+        Args:
+            masks: for each surface whether it was hit; where none was, the values are
+                those of the first surface.
+            cosine: cosine of the angle between the normal and the viewer.
+            tables: tables of all surfaces, one after the other, flat.
 
         Returns:
             One value for each of `LOBE_TABLES`.
@@ -432,18 +452,20 @@ class ViewTracer:
     ) -> Any:
         """Return the radiance in the gloss of what a ray in direction d hit.
 
-        A ray in the mean direction of the lobe finds what is reflected. That is a
-        texel of the object; the environment, blurred by the width of the lobe; or the
-        ground, which gives way to the blurred environment the wider the lobe is.
+        A second ray, in the mean direction of the lobe, finds what is reflected. If it
+        meets the object, that is one texel. If it meets nothing, it is the environment,
+        blurred by the width of the lobe. If it meets the ground, it is a mixture of
+        both: the wider the lobe, the more the blurred environment counts.
 
         Args:
-            mitsuba_scene, lit: as for `_trace`.
+            mitsuba_scene: the scene.
             si: the hit.
             d: unit direction of the ray.
             n: unit shading normal, towards the viewer.
             cosine: cosine of the angle of view.
-            lobe: gloss, up, along, core and tail of `Lobes`.
+            lobe: gloss, up, along, core and tail of `Lobes` at that cosine.
             active: whether there is any gloss.
+            lit: the light.
         """
         _, up, along, core, tail = lobe
         to_local = texel_rays.world_to_map(self._scene)
@@ -469,9 +491,10 @@ class ViewTracer:
         is_ground = mi.Bool(False)
         for grid, mask in zip(self._grids, masks, strict=True):
             is_ground |= mask & grid.is_ground
-        # On the ground one ray meets a single place: the wider the lobe, the more
-        # counts what surrounds the object, which is darker where the ground is darker
-        # there than far off.
+        # A wide lobe reflects much of the ground, but one ray meets a single point of
+        # it. So the wider the lobe, the more the blurred map of the surroundings
+        # counts. It is scaled by how much darker the ground is at this point than far
+        # away.
         far_ground = mi.UInt32(self._grids[-1].first_cell + self._grids[-1].n_cells)
         darkening = texel / _gather_color(lit.texels, far_ground)
         ground = self._look_up_diffuse(hit, masks, lit, to_local)
@@ -501,7 +524,14 @@ class ViewTracer:
     ) -> Any:
         """Return the diffuse radiance of what was hit.
 
-        That of a photographed ground is a fraction of its photograph.
+        On a photographed ground the texels hold fractions; they are multiplied by the
+        photograph in the direction from the point where it was taken.
+
+        Args:
+            si: the hit.
+            masks: for each grid whether the hit is on it.
+            lit: the light.
+            to_local: rotation from the world to the map, as from `world_to_map`.
         """
         radiance = self._look_up_texel(si, masks, lit)
         if self._photograph_height is not None:
@@ -515,7 +545,10 @@ class ViewTracer:
     def _look_up_texel(self, si: Any, masks: Sequence[Any], lit: LightMaps) -> Any:
         """Look up the radiance of the texels around a hit, bilinearly; 0 on no grid.
 
-        `masks` tell for each grid whether the hit is on it.
+        Args:
+            si: the hit.
+            masks: for each grid whether the hit is on it.
+            lit: the light.
         """
         first_cell = mi.UInt32(0)
         n_rows = mi.UInt32(1)
@@ -531,6 +564,7 @@ class ViewTracer:
             first_cell = dr.select(mask, mi.UInt32(grid.first_cell), first_cell)
             n_rows = dr.select(mask, mi.UInt32(grid.shape[0]), n_rows)
             n_columns = dr.select(mask, mi.UInt32(grid.shape[1]), n_columns)
+        # integers at the centers of cells
         row = y * mi.Float(n_rows) - 0.5
         column = x * mi.Float(n_columns) - 0.5
         radiance = _look_up_bilinear(
@@ -544,9 +578,14 @@ def _make_camera_numbers(
 ) -> Float32Array:
     """Return the `CAMERA_SIZE` numbers of a camera as the kernel takes them.
 
-    They are its axes to the left, up and forward (9), its position (3), half its extent
-    along x and y at distance 1, and its center along x and y; the last four are of use
-    for a pinhole only.
+    They are its axes to the left, up and forward (9 numbers), its position (3), half
+    its extent along x and y at distance 1 (2), and the image's center along x and y
+    (2). The last four are used only for a pinhole.
+
+    Args:
+        inputs: the camera's inputs: `camera.to_world` (4, 4), and for a pinhole
+            `camera.fov` in degrees, `camera.shift_x` and `camera.shift_y`.
+        height, width: size of the image in pixels.
     """
     matrix = inputs["camera.to_world"].detach().double().numpy()
     half_tangent = 0.0
@@ -561,12 +600,15 @@ def _make_camera_numbers(
 
 
 def _fetch(channels: Sequence[Any], size: tuple[int, int, int]) -> ViewSamples:
-    """Copy what the kernel has computed into memory of torch.
+    """Copy the kernel's results from Dr.Jit to torch.
 
-    `channels` are those of `ViewTracer._trace`: three of radiance, coverage, and then
-    u, v and weight for each layer of cut-outs, where a negative weight is one on the
-    back. `size` is the number of cameras, rows and columns. Samples without weight are
-    left out.
+    Samples without weight are left out.
+
+    Args:
+        channels: what `ViewTracer._trace` returns: three channels of radiance, the
+            coverage, and then u, v and weight for each layer of cut-outs. A negative
+            weight is that of a back.
+        size: number of cameras, rows and columns.
     """
     with mitsuba_lock:
         radiance = np.stack([channel.numpy() for channel in channels[:3]], axis=-1)
@@ -604,7 +646,8 @@ def _look_up_bilinear(
         first_cell: index of the grid's first cell in it.
         n_rows, n_columns: number of rows and number of columns of the grid.
         y, x: row and column, integers at the centers of cells.
-        wraps: columns go round; otherwise the grid ends at its border.
+        wraps: whether the last column is next to the first; otherwise the grid ends at
+            its border.
     """
     # beyond the border the cells at the border count
     y = dr.clip(y, 0.0, mi.Float(n_rows) - 1.0)
@@ -658,8 +701,13 @@ def _gather_color(values: Any, index: Any) -> Any:
 def _look_up_sky(lit: LightMaps, direction: Any, to_local: Any) -> Any:
     """Look the environment up in a direction, as Mitsuba does.
 
-    The first row is one pole and the last the other, and the map has a copy of a column
-    at each end, where it goes round.
+    The first row is one pole and the last row the other. The map has a copy of the
+    opposite column at each end, so that a look-up there needs no wrapping.
+
+    Args:
+        lit: the light.
+        direction: unit directions in the world.
+        to_local: rotation from the world to the map, as from `world_to_map`.
     """
     n_rows, n_columns = lit.sky_shape
     x, y = texel_rays.compute_map_position(direction, to_local)
@@ -676,9 +724,16 @@ def _look_up_blurred(
 ) -> Any:
     """Look up the environment blurred by a root mean square angle `spread`, in radians.
 
-    There is a map for each of `widths`; each width is double the one before, so that
-    the logarithm to base 2 finds the two maps between which the value is interpolated.
-    A spread outside of all widths has the first or the last map.
+    There is a map for each of `widths`. Each width is twice the one before, so the
+    logarithm to base 2 finds the two maps between which the value is interpolated. For
+    a spread below or above all widths it is the first or the last map.
+
+    Args:
+        lit: the light, with the blurred maps.
+        direction: unit directions in the world.
+        to_local: rotation from the world to the map, as from `world_to_map`.
+        spread: the angle, one in each lane.
+        widths: root mean square angles of the maps, radians.
     """
     n_rows, n_columns = lit.blurred_shape
     level = dr.clip(
@@ -691,6 +746,7 @@ def _look_up_blurred(
     column = x * n_columns - 0.5
 
     def look_up_level(index: Any) -> Any:
+        """Look up the map with an index; maps follow one another in memory."""
         return _look_up_bilinear(
             lit.blurred,
             index * (n_rows * n_columns),

@@ -126,7 +126,10 @@ def _find_sky_cell(
 ) -> Any:
     """Return the index of the environment's cell that lies in a direction.
 
-    The environment is cut into cells, `sky_shape` (rows, columns), counted row by row.
+    Args:
+        scene: the scene.
+        direction: unit directions in the world.
+        sky_shape: rows and columns of the environment's cells, counted row by row.
     """
     n_rows, n_columns = sky_shape
     column, row = compute_map_position(direction, world_to_map(scene))
@@ -157,10 +160,15 @@ def _trace_batch(
     """Trace one launch of `trace_texel_rays`, and return the cell that each ray meets.
 
     Args:
-        scene, grids, sky_shape: as there.
+        scene: the scene, with its inputs set.
+        grids: grids of texels of all surfaces.
+        sky_shape: rows and columns of the cells of the environment.
         normal, position: normal and position of the texel, for each ray.
         square: point of the unit square from which the direction is made, for each ray.
         seed: seed of the random numbers that decide whether a ray passes a cut-out.
+
+    Returns:
+        For each ray the index of the cell, int32; -1 where there is no light.
     """
     mitsuba_scene = scene._scene
     n_layers = count_cut_out_layers(scene)
@@ -169,16 +177,18 @@ def _trace_batch(
     thresholds = _sample_chances(n_layers, dr.width(square), seed)
     si = find_opaque_hits(mitsuba_scene, ray, n_layers, thresholds)
 
-    # What escapes meets a cell of the environment.
+    # Rays that leave the scene meet a cell of the environment. Its cells are counted
+    # after those of all grids.
     n_cells = grids[-1].first_cell + grids[-1].n_cells
     sky_cell = mi.Int32(n_cells + _find_sky_cell(scene, direction, sky_shape))
     met = dr.select(si.is_valid(), mi.Int32(-1), sky_cell)
 
-    # What stops meets a texel, or a shape that has no light.
+    # Other rays meet a texel, or a shape without texels, which counts as dark (-1).
     masks = find_hit_grids(mitsuba_scene, grids, si, direction)
     for grid, is_hit in zip(grids, masks, strict=True):
         if not grid.is_ground and grid.side == 0:
-            # Of a surface with one grid only fronts have texels: its backs are dark.
+            # A surface with a single grid has texels on its fronts only; hits on its
+            # backs stay -1.
             is_hit &= dr.dot(si.n, direction) < 0.0
         met = dr.select(is_hit, _find_nearest_cell(grid, si), met)
     return met
@@ -190,7 +200,9 @@ def compute_visible_cosines(
     normals: Float32Array,
     directions: Float32Array,
 ) -> Float32Array:
-    """Return the fraction of light from given directions that texels receive.
+    """Return how much light from given directions arrives at texels.
+
+    That is the cosine to the normal, times the fraction of light that passes cut-outs.
 
     Args:
         scene: the scene, with its inputs set.
@@ -233,9 +245,14 @@ def is_visible_from_behind(
 ) -> bool:
     """Return whether backs of a shape's faces are visible from outside.
 
-    That is so through a window, for example. Rays from outside and above aim at random
-    at the positions (n, 3), which lie on the shape; more than `MIN_BACK_FRACTION` of
-    those that hit the shape have to hit a back.
+    They are visible through a window, for example. Rays from outside and above aim at
+    random points of the shape. Backs count as visible if they are more than the
+    fraction `MIN_BACK_FRACTION` of all hits on the shape.
+
+    Args:
+        scene: the scene, with its inputs set.
+        name: name of the shape.
+        positions: (n, 3) points on it.
     """
     ray = _sample_outside_rays(positions)
     n_layers = count_cut_out_layers(scene)
@@ -271,12 +288,18 @@ def count_cut_out_layers(scene: MitsubaScene) -> int:
 def find_opaque_hits(
     mitsuba_scene: Any, ray: Any, n_layers: int, chance: Any = 0.5, active: Any = True
 ) -> Any:
-    """Return the first hits of rays that light does not pass.
+    """Return the first hits of rays that stop them; rays pass transparent cut-outs.
 
-    A ray goes on through up to `n_layers` cut-outs, as long as the fraction of light
-    that passes all that it has met is larger than `chance`, a number in [0, 1]: random
-    ones let rays pass as often as light does, and 0.5 lets them pass where most light
-    does.
+    A ray goes on while the fraction of light that passes everything it has met is
+    larger than `chance`. Random chances let rays pass as often as light does; 0.5 lets
+    a ray pass where most light does.
+
+    Args:
+        mitsuba_scene: the scene.
+        ray: the rays.
+        n_layers: how many cut-outs a ray passes at most.
+        chance: one number in [0, 1], or one for each ray.
+        active: lanes that are traced.
     """
     si = mitsuba_scene.ray_intersect(ray, mi.RayFlags.UV, False, active)
     transmittance = mi.Float(1.0)
@@ -308,8 +331,13 @@ def find_hit_grids(
 ) -> list[Any]:
     """Return for each grid a mask of the hits that lie on it.
 
-    A grid has a shape and perhaps one side of its faces; `direction` is that of the
-    rays.
+    A grid belongs to a shape, and perhaps to only one side of its faces.
+
+    Args:
+        mitsuba_scene: the scene.
+        grids: the grids.
+        si: the hits.
+        direction: unit directions of the rays, which tell front from back.
     """
     is_front = dr.dot(si.n, direction) < 0.0
     shapes = {shape.id(): shape for shape in mitsuba_scene.shapes()}
@@ -342,6 +370,7 @@ def compute_map_position(direction: Any, to_local: Any) -> tuple[Any, Any]:
         row[0] * direction.x + row[1] * direction.y + row[2] * direction.z
         for row in to_local
     )
+    # Mitsuba's `envmap`: u is the azimuth around y, from -z towards x
     azimuth = dr.atan2(x, -z) / (2.0 * math.pi)
     return azimuth - dr.floor(azimuth), dr.safe_acos(y) / math.pi
 
@@ -349,8 +378,17 @@ def compute_map_position(direction: Any, to_local: Any) -> tuple[Any, Any]:
 def compute_grid_position(grid: TexelGrid, position: Any, uv: Any) -> tuple[Any, Any]:
     """Return where in a grid something lies: fractions of its height and its width.
 
-    On a mesh that is by its texture coordinates, which repeat; on a plane by the
-    inverse of the grid's warp, and at its border further out.
+    On a mesh it is found by the texture coordinates, which repeat. On a plane it is
+    found by the inverse of the grid's warp,
+
+        coordinate = center + scale sinh(rate s), with s = 2 fraction - 1 in [-1, 1]
+
+    A point outside of a plane's grid gets the fraction 0 or 1, at the border.
+
+    Args:
+        grid: the grid.
+        position: points in the world, which a plane needs.
+        uv: their texture coordinates, which a mesh needs.
     """
     if grid.warp is None:
         return uv.y - dr.floor(uv.y), uv.x - dr.floor(uv.x)
@@ -466,14 +504,14 @@ def measure_lobes(
         no_gloss, -np.sqrt(1.0 - cosine**2), mean_x / np.maximum(length, 1e-12)
     )
     up = np.where(no_gloss, cosine, mean_z / np.maximum(length, 1e-12))
-    # Squared distance of unit vectors, 2 - 2 cos, which is the squared angle where that
-    # is small: from each sample to the mean direction.
+    # The squared angle from each sample to the mean direction, approximated by the
+    # squared distance of unit vectors, 2 - 2 cos(angle).
     squared_angle = 2.0 * np.maximum(
         0.0, 1.0 - samples.x * along[:, None] - samples.z * up[:, None]
     )
     core, tail = _measure_spreads(samples.weight, squared_angle)
-    # The base colors were 0.5 and 0: what reflects more with the grey one is the
-    # diffuse part, and per base color it is twice that.
+    # The base colors were 0.5 and 0. What the grey surface reflects more than the black
+    # one is the diffuse part; dividing by 0.5 gives it for a base color of 1.
     by_color = samples.grey.mean(axis=1) - samples.black.mean(axis=1)
     diffuse = np.maximum(by_color, 0.0) / 0.5
     # the viewer is at positive x, and `Lobes.along` is away from the viewer
@@ -493,6 +531,13 @@ def _sample_bsdf(
 
     Values are divided by the fraction of light that a cut-out stops, so that they are
     those of an opaque surface. The same random numbers serve both base colors.
+
+    Args:
+        scene: the scene.
+        inputs: inputs of the scene; the base color is replaced.
+        grid: grid of the shape.
+        position, normal: (3,) point on the shape and its unit normal.
+        cosines: cosines of the angle of view.
     """
     n_samples = N_ANGLES * N_LOBE_SAMPLES
     # one lane for each sample, angle by angle
@@ -538,7 +583,14 @@ def _set_base_color(
 ) -> Any:
     """Set a scene's inputs with one grey as the base color of a shape, if it has one.
 
-    Returns Mitsuba's scene. `name` is that of the shape.
+    Args:
+        scene: the scene.
+        inputs: inputs that are set; a base color of the shape is replaced.
+        name: name of the shape.
+        grey: linear reflectance of all texels.
+
+    Returns:
+        Mitsuba's scene.
     """
     key = f"{name}.base_color"
     changed = dict(inputs)
@@ -552,8 +604,13 @@ def _hit_point(
 ) -> Any:
     """Return the surface interaction at a point (3,), as seen by viewers.
 
-    A ray onto the point from just above makes it; then its viewer is replaced.
-    `to_viewer` are unit vectors in the frame of the surface, one for each lane.
+    A ray from just above hits the point. Then the direction to the viewer is replaced
+    in the interaction.
+
+    Args:
+        mitsuba_scene: the scene.
+        position, normal: (3,) the point and its unit normal.
+        to_viewer: unit vectors in the frame of the surface, one for each lane.
     """
     # 1e-3: so near that nothing else is in between
     start = mi.Point3f([float(x) for x in position + 1e-3 * normal])
@@ -575,15 +632,16 @@ def _measure_spreads(
 ) -> tuple[Float64Array, Float64Array]:
     """Return root mean square angles (k,) of both halves of weighted samples (k, n).
 
-    The halves have equal weight: the first has the samples with smaller angles, the
-    second the others. A sample at the median counts for both, by fractions.
+    The halves have equal weight. The first half has the samples with smaller angles,
+    the second half the others. The weight of a sample at the median is split between
+    both.
     """
     order = np.argsort(squared_angle, axis=1)
     weight = np.take_along_axis(weight, order, axis=1)
     squared_angle = np.take_along_axis(squared_angle, order, axis=1)
     total = weight.sum(axis=1, keepdims=True)
-    # of the samples with smaller angles; a sample counts for the first half as far as
-    # half of the total is left for it
+    # Weight of all samples with smaller angles. The first half takes samples in this
+    # order until it has half of the total.
     weight_before = weight.cumsum(axis=1) - weight
     inner_weight = np.clip(0.5 * total - weight_before, 0.0, weight)
     half_weight = np.maximum(0.5 * total[:, 0], 1e-12)

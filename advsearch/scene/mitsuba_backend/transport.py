@@ -141,8 +141,12 @@ def _compute_slopes(
 ) -> list[tuple[Any, Any]]:
     """Return for each bounce the derivatives of both BSDF values by the base color.
 
-    The BSDFs are evaluated once more with all texels larger by `COLOR_STEP`. For the
-    first two arguments see `_set_texture`.
+    The BSDFs are evaluated once more with all texels larger by `COLOR_STEP`.
+
+    Args:
+        parameters: what `mi.traverse` returns for the scene.
+        key: Mitsuba's key of the base color's texture.
+        bounces: the bounces of the paths.
     """
     larger_color = mi.TensorXf(parameters[key]) + COLOR_STEP
     with _set_texture(parameters, key, larger_color):
@@ -154,8 +158,16 @@ def _light_by_projector(
 ) -> list[tuple[Any, Any, Any]]:
     """Return the vertices of paths as a projector with a white image lights them.
 
-    They are as those of `_accumulate_radiance`, with texture coordinates in the image
-    of the projector, whose key is `key`. Other light does not count.
+    A vertex is its texture coordinates in the projector's image, its weight, and
+    whether it is seen sharply, as from `_accumulate_radiance`. Other light does not
+    count.
+
+    Args:
+        scene: Mitsuba's scene.
+        parameters: what `mi.traverse` returns for it.
+        key: Mitsuba's key of the projector's image.
+        projector: Mitsuba's projector.
+        bounces: the bounces of the paths.
     """
     white = dr.full(mi.TensorXf, 1.0, mi.TensorXf(parameters[key]).shape)
     with _set_texture(parameters, key, white):
@@ -193,7 +205,8 @@ def _sample_camera_rays(
 ) -> tuple[Any, Any]:
     """Sample `spp` camera rays per pixel, row by row; return rays and weights.
 
-    Samples of a pixel follow one another; a lens without aperture has its center.
+    Samples of a pixel follow one another. For a camera without an aperture, the center
+    of the aperture is passed, which has no effect.
     """
     height, width = size
     pixel = dr.arange(mi.UInt32, height * width * spp) // spp
@@ -221,7 +234,8 @@ def _accumulate_radiance(
     """
     L = mi.Spectrum(0.0)
     vertices = list[tuple[Any, Any, Any]]()
-    # From the last to the first; `emitted[0]`, of the first vertex, is left out.
+    # From the last vertex to the first. The emission of the first vertex, `emitted[0]`,
+    # is left out: the caller adds it.
     for bounce, emitted_next, (slope_em, slope_bsdf) in zip(
         bounces[::-1], emitted[:0:-1], slopes[::-1], strict=True
     ):
@@ -290,8 +304,11 @@ def _fetch_paths(
 def _fetch_vertices(uv: Any, weight: Any, sharp: Any, mask: Any, spp: int) -> Vertices:
     """Fetch one vertex of those paths that a mask selects.
 
-    `uv`, `weight`, `sharp` and the mask are of all samples. Weights are divided by
-    `spp`, so that they add up to the mean of a pixel.
+    Args:
+        uv, weight, sharp: texture coordinates, weight and sharpness of all samples.
+        mask: which samples are fetched.
+        spp: samples per pixel, by which weights are divided, so that they add up to the
+            mean of a pixel.
     """
     index: Any = dr.compress(mask)
     if dr.width(index) == 0:
@@ -334,15 +351,19 @@ class Bounce:
     def compute_slopes(self) -> tuple[Any, Any]:
         """Return the derivatives of both BSDF values by the base color.
 
-        The base color has to be larger by `COLOR_STEP` now. The first derivative is
-        that of `bsdf_value_em`, the second that of the path's direction over its
-        density.
+        The caller has made the base color larger by `COLOR_STEP`, after the bounce was
+        sampled.
+
+        Returns:
+            The derivative of `bsdf_value_em`, and that of the BSDF in the path's
+            direction over the direction's density.
         """
         bsdf_value = self.bsdf_weight * self.bsdf_sample.pdf
         slope_em = self._compute_slope(self.wo_em, self.bsdf_value_em, self.active_em)
         slope_bsdf = self._compute_slope(
             self.bsdf_sample.wo, bsdf_value, self.active_bsdf
         )
+        # 1 instead of a density of 0 to divide by, where there is no derivative anyway
         pdf = dr.select(self.active_bsdf, self.bsdf_sample.pdf, 1.0)
         return slope_em, slope_bsdf / pdf
 
@@ -368,6 +389,7 @@ class Bounce:
             The position in the projector's image, and the light that the vertex
             reflects along the path; 0 where the projector does not reach it.
         """
+        # A projector is a point: the sample (0.5, 0.5) has no effect.
         is_lit = self.si.is_valid()
         ds, light = projector.sample_direction(self.si, mi.Point2f(0.5), is_lit)
         is_lit &= dr.any(light != 0.0)
@@ -406,13 +428,19 @@ def _trace_paths(
 ) -> tuple[list[Any], list[Any], list[Bounce]]:
     """Trace paths from camera rays; rays of weight 0 see nothing.
 
-    All paths have `depth` segments at most. From `roulette_depth` bounces on a path goes
-    on with the probability of its throughput, `MAX_SURVIVAL` at most.
+    Args:
+        scene: Mitsuba's scene.
+        ray: camera rays.
+        weight: their weights.
+        noise: the sampler.
+        depth: longest path in segments.
+        roulette_depth: bounces from which on a path goes on only with a probability:
+            its throughput, but at most `MAX_SURVIVAL`.
 
     Returns:
         What the camera sees, channel by channel in the order of the images of `Paths`
-        after the radiance; what each vertex emits, from the first one on; and how each
-        reflects light, but for the last.
+        after the radiance; what each vertex emits; and how each vertex but the last
+        reflects light.
     """
     count = dr.width(ray.o)
     active = dr.any(weight > 0.0) & dr.full(mi.Bool, True, count)
@@ -459,6 +487,7 @@ def _trace_paths(
         is_delta = mi.has_flag(sampled_type, mi.BSDFFlags.Delta)
         throughput = throughput * bounce.bsdf_weight
         active &= active_next
+        # The last bounce is left out: a path ends after it in any case.
         if roulette_depth <= segment + 1 < depth - 1:
             survival = dr.minimum(dr.max(throughput), MAX_SURVIVAL)
             active &= noise.next_1d(active) < survival
@@ -478,7 +507,8 @@ def _eval_emission(
 ) -> Any:
     """Return the light that a hit emits towards the vertex before it.
 
-    That vertex may have sampled the same light, so the two share it by MIS weights.
+    The vertex before may also have sampled the same emitter directly. The two samples
+    share its light by multiple importance sampling (MIS) weights.
 
     Args:
         scene: Mitsuba's scene.
@@ -554,9 +584,10 @@ def _sample_bounce(
 def find_first_hits(scene: Any, sensor: Any, resolution: tuple[int, int]) -> Surfaces:
     """Find the surface that the camera sees first through the center of each pixel.
 
-    There is no noise: a thin lens is looked through at its center. What lets more than
-    half of the light pass and does not shine towards the camera, as a lamp that is off
-    or a hole in a leaf, is not seen; haze is no shape.
+    There is no noise: rays go through the center of a thin lens. A surface that lets
+    more than half of the light pass and does not emit light towards the camera is not
+    seen, such as a hole in a leaf or the glass of a lamp that is off. Haze is no shape,
+    and is not seen either.
 
     Args:
         scene, sensor: Mitsuba's.
@@ -589,6 +620,7 @@ class _SurfaceLayers:
     """
 
     def __init__(self, shapes: Sequence[Any], count: int) -> None:
+        """Start with pixels in which nothing is seen, infinitely far away."""
         self._shapes = shapes
         self._shape_id = dr.zeros(mi.UInt32, count)  # 0: no shape
         self._face = dr.zeros(mi.UInt32, count)
@@ -654,8 +686,14 @@ def _sample_center_rays(sensor: Any, resolution: tuple[int, int]) -> tuple[Any, 
 def _passes_camera_ray(scene: Any, si: Any, active: Any) -> Any:
     """Return where a camera ray goes on through what it hit.
 
-    That is so if more than half of the light passes, as in a hole of a leaf, or if the
-    surface does nothing but let light pass; and if nothing shines there.
+    It does if the surface emits no light, and if one of two things holds: more than
+    half of the light passes, as in a hole of a leaf, or the surface does nothing but
+    let light pass.
+
+    Args:
+        scene: Mitsuba's scene.
+        si: surface interactions of the hits.
+        active: lanes with a hit.
     """
     bsdf = si.bsdf()
     shining = dr.max(si.emitter(scene, active).eval(si, active)) > 0.0

@@ -55,8 +55,8 @@ def import_mitsuba() -> ModuleType:
         mitsuba.set_log_level(mitsuba.LogLevel.Warn)
         drjit.set_log_level(drjit.LogLevel.Warn)
         threads.apply_to_drjit()
-        # Every change of the scenes calls the collector: what is imported by now would
-        # take it 0.2 s.
+        # Every change of the scenes calls the garbage collector. Without freezing, it
+        # would take 0.2 s each time for the objects of the imported modules.
         gc.freeze()
     return mitsuba
 
@@ -131,10 +131,15 @@ class Recordings(dict[Any, Callable[..., Any]]):
     def get_or_record(
         self, key: Any, render: Callable[..., Any], media: list[Any]
     ) -> Callable[..., Any]:
-        """Return the recording for a key; other arguments as for `record_on_first_use`.
+        """Return the recording for a key, or a function that records at its first call.
 
-        A new one is made at the first call of the returned function. All recordings are
-        dropped if scenes or the number of threads have changed since.
+        All recordings are dropped if scenes or the number of threads have changed since
+        they were made.
+
+        Args:
+            key: what tells recordings apart, such as method and samples per pixel.
+            render: the function that is recorded.
+            media: Mitsuba's media that it uses besides its arguments.
         """
         state = (population.changes, dr.thread_count())
         if self._recorded_at != state:

@@ -62,13 +62,13 @@ def write_scene(
 ) -> None:
     """Write a scene with its inputs set as XML that stock Mitsuba loads.
 
-    Meshes and images are written next to it. Inputs are taken from `remaining_inputs`
-    one by one as they are put into the dictionary: first those of the camera and of the
-    parts, then the others by Mitsuba's keys; if any is left, that is an error.
+    Meshes and images are written next to it. Inputs are put into the scene's dictionary
+    in two steps: first those of the camera and of the parts, which are removed from
+    `remaining_inputs`, then the others by Mitsuba's keys.
 
     Args:
         scene: the scene.
-        inputs: as for `MitsubaScene.render_images`.
+        inputs: values of inputs that differ from the base values.
         path: path of the XML file, in a folder that exists.
         note: becomes a comment.
         hide_environment: hide the visible environment.
@@ -131,10 +131,17 @@ def _put_part(
     part: parts.ScenePart,
     remaining_inputs: Plugin,
 ) -> None:
-    """Put a part into a scene's dictionary, and take its inputs out of the remaining
-    ones.
+    """Put a part into a scene's dictionary, and remove its inputs from the others.
 
-    Both dictionaries are changed. Raises InputError: stock Mitsuba has no such part.
+    Args:
+        xml_scene: the scene's dictionary, which is changed.
+        description: the scene.
+        part: the part.
+        remaining_inputs: inputs that are not in the dictionary yet; those of the part
+            are removed.
+
+    Raises:
+        InputError: stock Mitsuba has no such part.
     """
     if isinstance(part, parts.HazePart):
         _put_haze(xml_scene, part, remaining_inputs)
@@ -180,8 +187,14 @@ def _put_haze(scene: Plugin, haze: parts.HazePart, remaining_inputs: Plugin) -> 
     """Put haze into a scene's dictionary: a ball filled with a medium, and the camera
     in it.
 
-    The haze's inputs are taken out of the remaining ones. Nothing is put in if its
-    density is 0. Light paths may have `EXTRA_DEPTH` more segments then.
+    Nothing is put in if the density is 0. Otherwise light paths may have `EXTRA_DEPTH`
+    more segments, since stock Mitsuba counts scatterings in the haze too.
+
+    Args:
+        scene: the scene's dictionary, which is changed.
+        haze: the haze.
+        remaining_inputs: inputs that are not in the dictionary yet; those of the haze
+            are removed.
     """
     density = remaining_inputs.pop(
         f"{haze.name}.density", np.array([haze.density])
@@ -247,11 +260,15 @@ def _put_input(plugin: Plugin, key_parts: list[str], value: Float32Array) -> boo
 
 
 def _make_mesh(part: parts.MeshPart, remaining_inputs: Plugin) -> Plugin:
-    """Return a mesh's plugin with its inputs, which stop being remaining ones.
+    """Return a mesh's plugin, with the values that its inputs have.
 
     Base color, light and the numbers of the surface are set here. Vertices and normals
-    are dropped: the file that is written has them. Other inputs stay among
-    `remaining_inputs`.
+    are dropped, since the mesh's file has them.
+
+    Args:
+        part: the mesh.
+        remaining_inputs: inputs that are not in the dictionary yet; those that are set
+            here or dropped are removed.
     """
     part_inputs = {
         name.partition(".")[2]: remaining_inputs.pop(name)
@@ -281,7 +298,13 @@ def _make_mesh(part: parts.MeshPart, remaining_inputs: Plugin) -> Plugin:
 
 
 def _make_surface(part: parts.MeshPart, part_inputs: Plugin) -> Plugin:
-    """Return the surface of a mesh, and take its numbers out of the mesh's inputs."""
+    """Return the surface of a mesh, with the values that its inputs have.
+
+    Args:
+        part: the mesh.
+        part_inputs: its inputs by names such as "roughness"; those that are set here
+            are removed.
+    """
     if part.surface is not None:
         base_color = part.base_color
         return fill_base_color(
@@ -328,7 +351,8 @@ def write_xml(path: Path, scene: Plugin, meshes: Mapping[str, Any], note: str) -
             f"out: XML of Mitsuba cannot say the scene: {error}; export another run"
         ) from error
     root = ElementTree.fromstring(text)
-    # Mitsuba names parameters by ids, but writes only those that are referred to.
+    # Mitsuba names parameters by the ids of plugins, but its writer gives an id only to
+    # plugins that are referred to, and a name to the others.
     for entry in root.findall("*[@type]"):
         entry.set("id", entry.attrib.pop("name"))
     text = ElementTree.tostring(root, encoding="unicode")
@@ -379,7 +403,7 @@ class _SceneFiles:
             channels = {"Y": values.reshape(values.shape[:2])}
         else:
             channels = {"RGBA"[: values.shape[2]]: values}
-        # Mitsuba's writer waits forever where Dr.Jit has one thread
+        # Not by Mitsuba's own writer, which waits forever if Dr.Jit has one thread.
         with OpenEXR.File({}, channels) as image:
             image.write(str(file))
         return file.name

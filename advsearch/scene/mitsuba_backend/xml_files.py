@@ -82,7 +82,8 @@ def read_scene(path: Path) -> Plugin:
     state = _parse_with_mitsuba(path, text, root)
     referred_ids: set[str] = set()
     scene = _convert_plugin(path, state, 0, referred_ids)  # 0 is the scene itself
-    # What is referred to has to stand at the top: plugins within others are put there.
+    # Mitsuba's loader resolves a reference only to a plugin at the top of the scene, so
+    # inner plugins that are referred to are copied there.
     for plugin_id in sorted(referred_ids):
         name = _make_plain_name(plugin_id)
         if name not in scene and plugin_id in state.id_to_index:
@@ -144,7 +145,7 @@ class _SceneText:
     def parse(self, data: bytes) -> ElementTree.Element:
         """Parse the bytes of a file, and return the root of its tree.
 
-        The sizes of all parsed files count together.
+        The size limit is for all parsed files together, the scene and its includes.
 
         Raises:
             FileFormatError: they are too large, no XML, or a scene of another version.
@@ -194,11 +195,11 @@ class _SceneText:
     def _set_handlers(
         self, parser: expat.XMLParserType, tree: ElementTree.TreeBuilder
     ) -> None:
-        """Have a parser build a tree, and refuse what no scene needs.
+        """Set the parser's callbacks, which build a tree and refuse some things.
 
-        Refused are document types, entities, the elements alias and path, and more or
-        deeper elements than the limits. Texts and comments outside of the root are left
-        out.
+        They refuse document types, entities, the elements `alias` and `path`, and
+        elements that are more or nested deeper than the limits. Texts and comments
+        outside of the root element are left out.
         """
         depth = 0  # how many elements are open
 
@@ -209,6 +210,7 @@ class _SceneText:
             )
 
         def start(tag: str, attributes: dict[str, str]) -> None:
+            """Begin an element of the tree, after the checks."""
             nonlocal depth
             if not self.elements:  # the root
                 self.lines_before = parser.CurrentLineNumber - 1
@@ -242,7 +244,8 @@ class _SceneText:
         """Replace `$names` by their values and includes by the files' elements, in
         place.
 
-        A default holds from where it stands on, in included files too.
+        A `<default name="x" value="1"/>` gives `$x` its value in everything that comes
+        after it, in included files too.
         """
         children: list[ElementTree.Element] = []
         for child in element:
@@ -258,9 +261,12 @@ class _SceneText:
         element[:] = children
 
     def _include(self, name: str) -> list[ElementTree.Element]:
-        """Return the elements of another file: those in its scene, or its single one.
+        """Return the elements of another file, in which `$names` are filled in.
 
-        Raises FileFormatError if it may not be read, or too many are included.
+        They are the children of its `<scene>`, or else its root element.
+
+        Raises:
+            FileFormatError: the file may not be read, or too many files are included.
         """
         self.included += 1
         if self.included > MAX_INCLUDES:
@@ -284,12 +290,14 @@ class _SceneText:
         return list(root)
 
     def fill_text(self, text: str) -> str:
-        """Replace every `$name` in a text by its value.
+        """Replace every `$name` in a text by its value, as in "$folder/mug.ply".
 
-        Raises FileFormatError: a name has no value, or the text becomes too long.
+        Raises:
+            FileFormatError: a name has no value, or the text becomes too long.
         """
         filled = ""
-        # of the pieces, every second one is a name
+        # the group in the pattern makes `split` return the names too, as every second
+        # piece
         for index, piece in enumerate(re.split(r"\$(\w+)", text)):
             is_name = index % 2 == 1
             if is_name and piece not in self.values:
@@ -298,8 +306,9 @@ class _SceneText:
                     f"{self.path}: ${name} has no value: no <default> has that name"
                 )
             filled += self.values[piece] if is_name else piece
-            # Values may be long: a <default> may name others twice, and those others. A
-            # text that is long by itself, the first piece, is no error.
+            # The length is limited because values may grow exponentially: a <default>
+            # may name another one twice, which names others twice, and so on. A text
+            # that is long without any names (only a first piece) is no error.
             if index > 0 and len(filled) > MAX_TEXT_LENGTH:
                 limit = f"expected at most {MAX_TEXT_LENGTH:,} letters, got more"
                 raise FileFormatError(
@@ -311,7 +320,7 @@ class _SceneText:
 def _convert_plugin(
     path: Path, state: Any, index: int, referred_ids: set[str]
 ) -> Plugin:
-    """Return a parsed plugin with all in it, as `mitsuba.load_dict` takes it.
+    """Convert a parsed plugin, with its inner ones, for `mitsuba.load_dict`.
 
     Args:
         path: path of the file, for errors.
@@ -370,9 +379,17 @@ def _get_node_name(node: Any, argument: str, *, at_top: bool) -> str:
 def _convert_value(where: str, kind: Any, value: Any) -> object:
     """Return a number, a string, a color or a transform of a plugin as Python has it.
 
-    A color or a spectrum becomes a plugin. Raises FileFormatError, which begins with
-    `where`, for a number that is not finite or out of float32's range, and for a
-    transform that is not affine or cannot be inverted.
+    A color or a spectrum becomes a plugin, such as `{"type": "rgb", "value": [1, 0,
+    0]}`.
+
+    Args:
+        where: beginning of error messages.
+        kind: Mitsuba's type of the value, one of `mi.Properties.Type`.
+        value: the value.
+
+    Raises:
+        FileFormatError: a number is not finite or out of float32's range, or a
+            transform is not affine or cannot be inverted.
     """
     types = mi.Properties.Type
     if kind == types.Transform:
@@ -396,7 +413,7 @@ def _convert_value(where: str, kind: Any, value: Any) -> object:
 
 def _check_finite(where: str, numbers: Any) -> None:
     """Raise FileFormatError for a number that is not finite or near float32's limit."""
-    # NaN is not below either
+    # float32 ends at 3.4e38; 1e30 leaves room for products. NaN is not below it either.
     if not (np.abs(np.asarray(numbers, np.float64)) < 1e30).all():
         raise FileFormatError(
             f"{where}: expected a finite number, got "
@@ -502,11 +519,12 @@ class _FileReader:
         }
 
     def check(self, plugin: Mapping[str, object]) -> Plugin:
-        """Return a plugin with all in it checked and read.
+        """Return a plugin in which inner plugins are checked and files are read.
 
-        Raises FileFormatError for a plugin that does not come with Mitsuba, for a file
-        that only Mitsuba reads, and for the name of a material that is no single word:
-        Mitsuba makes the name of a file of it.
+        Raises:
+            FileFormatError: a plugin does not come with Mitsuba; a file can be read
+                only by Mitsuba; or the name of a material is not a single word, which
+                matters because Mitsuba builds the name of a file from it.
         """
         kind = str(plugin["type"])
         if kind not in STOCK_PLUGINS:
@@ -520,7 +538,7 @@ class _FileReader:
                 "material"
             )
         entries = map_inner_plugins(plugin, self.check)
-        # without one Mitsuba's bitmap ends the process
+        # Without a filename Mitsuba's bitmap plugin crashes the process.
         if kind in self._readers and "filename" not in entries:
             raise FileFormatError(
                 f"{self._path}: expected a filename in each {kind}, got none; name the "
@@ -541,8 +559,14 @@ class _FileReader:
         """Return the path of a file that a scene names, which is in the scene's folder.
 
         If there is no file of the full name in the folder, one with the last part of
-        the name counts. `kind` says what needs it, for errors. Raises FileFormatError:
-        there is none.
+        the name counts: for "textures/wood.png" also "wood.png".
+
+        Args:
+            kind: what needs the file, for errors, such as "a texture".
+            name: the name as the scene has it.
+
+        Raises:
+            FileFormatError: there is no such file.
         """
         try:
             # checks that the name is allowed; its content is not needed
@@ -579,7 +603,8 @@ class _FileReader:
     def _read_bitmap(self, plugin: Plugin) -> Plugin:
         """Return a texture's plugin with its file read, as linear values.
 
-        A large file of linear values is averaged down to `TEXTURE_LIMIT`.
+        A file of display colors is decoded from sRGB, unless the plugin says that it is
+        raw. A large file of linear values is averaged down to `TEXTURE_LIMIT`.
         """
         file = self._find_file("a texture", plugin.pop("filename"))
         if file.suffix.lower() not in RADIANCE:

@@ -43,6 +43,13 @@ def is_installed() -> bool:
 def convert_usd(path: Path, data: bytes) -> bytes:
     """Convert an OpenUSD file to binary glTF.
 
+    A separate process reads the file, with limits on its time and memory. It prints the
+    files that it has read, which are recorded as opened.
+
+    Args:
+        path: the file, which that process reads itself.
+        data: its bytes, of which only the first are checked.
+
     Raises:
         FileFormatError: it is no OpenUSD file, names files outside its folder, is too
             large, or `usd-core` is not installed.

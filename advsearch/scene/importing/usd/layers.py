@@ -71,8 +71,16 @@ def open_package(name: str, content: bytes) -> zipfile.ZipFile:
 def _check_entries(name: str, archive: zipfile.ZipFile) -> None:
     """Check number, size, names and headers of the entries of a package.
 
-    Names stay inside the package and have none of the characters that USD's paths use;
-    entries are stored as they are. Raises FileFormatError, or what zipfile raises.
+    Names must stay inside the package, and have none of the characters with a meaning
+    in USD's paths. Entries must be stored without compression.
+
+    Args:
+        name: name of the package, for messages.
+        archive: the opened package.
+
+    Raises:
+        FileFormatError: one of these does not hold, or a limit is exceeded.
+        BadZipFile: the header of an entry is corrupt.
     """
     entries = archive.infolist()
     size = sum(entry.file_size for entry in entries)
@@ -100,7 +108,8 @@ def _check_entries(name: str, archive: zipfile.ZipFile) -> None:
 def _check_without_gaps(name: str, archive: zipfile.ZipFile, content: bytes) -> None:
     """Reject a package with bytes between its files.
 
-    USD reads files one after the other, and not by the index of the archive.
+    USD reads files one after the other, and ignores the index of the archive. Bytes in
+    a gap could be a file that USD reads and the checks do not see.
     """
     position = 0
     for entry in sorted(archive.infolist(), key=lambda entry: entry.header_offset):
@@ -110,7 +119,8 @@ def _check_without_gaps(name: str, archive: zipfile.ZipFile, content: bytes) -> 
                 "bytes in between; "
                 "make it again with usdzip"
             )
-        # Lengths of the name and of the extra field in the local header.
+        # A local header has 30 bytes, of which bytes 26 to 29 are the lengths of the
+        # name and of the extra field after it.
         lengths = content[entry.header_offset + 26 : entry.header_offset + 30]
         name_size = int.from_bytes(lengths[:2], "little")
         extra_size = int.from_bytes(lengths[2:], "little")
@@ -174,8 +184,12 @@ class _LayerCheck:
     def run(self) -> list[Path]:
         """Return the files of all layers and packages, the file itself first.
 
-        What a layer names is followed; a package is checked with all that is in it.
-        Raises FileFormatError as `check_layers`.
+        The layers that a layer names are checked in turn. A package is checked with
+        everything that is in it.
+
+        Raises:
+            FileFormatError: a file is corrupt, names files elsewhere, or is over a
+                limit.
         """
         pending = [self.file.resolve()]
         checked_files = dict[Path, None]()
@@ -207,11 +221,12 @@ class _LayerCheck:
         )
 
     def _find_layer(self, path: Path, name: str) -> Path:
-        """Return the file that a layer names; of a file in a package, the package.
+        """Return the file that a layer names; for a file in a package, the package.
 
         Args:
-            path: the layer, relative to which the name is.
-            name: as it stands there, perhaps with a path in a package.
+            path: the layer, to which the name is relative.
+            name: the name in the layer, such as "parts/wheel.usd" or
+                "car.usdz[wheel.usd]".
 
         Raises:
             FileFormatError: it is missing, or not in the folder.
@@ -252,7 +267,7 @@ class _LayerCheck:
             name: the package, for messages.
             path: its path as USD writes it.
             content: its bytes.
-            depth: in how many packages it is, plus 1.
+            depth: 1 for a file of its own, 2 for a package in a package, and so on.
         """
         stored_files.check_most(
             self.file.name,
@@ -285,8 +300,11 @@ class _LayerCheck:
     ) -> None:
         """Raise FileFormatError if a layer in a package names one outside of it.
 
-        `entry` is the layer's path in the package `package`, `layer` the path that it
-        names, and `entries` are all paths in the package.
+        Args:
+            package: name of the package, for messages.
+            entry: path of the layer in the package.
+            layer: path that it names.
+            entries: all paths in the package.
         """
         outer, _ = Ar.SplitPackageRelativePathOuter(layer)
         from_entry = os.path.normpath(PurePosixPath(entry).parent / outer)
@@ -335,8 +353,8 @@ class _LayerCheck:
 def format_error(error: Exception) -> str:
     """Return the message of an error of usd-core in one line.
 
-    It is the last line with a position, or the last text in quotation marks, or the
-    last line of any kind.
+    It is the last line with a position ("12:5: ..."), or else the last text in
+    quotation marks, or else the last line.
     """
     text = str(error)
     lines = (

@@ -95,8 +95,13 @@ def decode_image(data: bytes, path: str, *, is_srgb: bool) -> Array:
 def _decode_image(data: bytes, path: str, is_srgb: bool) -> Array:
     """Return the stored values (H, W, 4) in [0, 1] of an image file.
 
-    Greys of integers are divided by the largest of 16 bits, those of floats are taken
-    as they are.
+    Grey integers are taken for 16 bits, and divided by 65535. Grey floats stay as they
+    are.
+
+    Args:
+        data: bytes of the file.
+        path: its path, for messages.
+        is_srgb: whether its values are sRGB colors, and not numbers.
     """
     with Image.open(io.BytesIO(data), formats=reading.FORMATS) as image:
         reading.check_decodable(image, path)
@@ -137,14 +142,18 @@ def _is_png_of_16_bits(data: bytes) -> bool:
 def _decode_png_of_16_bits(data: bytes, size: tuple[int, int]) -> Array:
     """Return the values (H, W, 4) in [0, 1] of a PNG file with 16 bits a channel.
 
-    A row is a byte with its filter and then its pixels; all rows are compressed
-    together. `size` is the width and height.
+    All rows are compressed together. A row is one byte, its filter, and then its
+    pixels.
+
+    Args:
+        data: bytes of the file.
+        size: width and height in pixels.
 
     Raises:
         ValueError: it is interlaced or corrupt.
     """
     (width, height) = size
-    # of the first chunk, IHDR (PNG specification, section 11.2.2)
+    # two bytes of the first chunk, IHDR (PNG specification, section 11.2.2)
     color_type = data[25]
     is_interlaced = data[28]
     channels = CHANNELS_OF_PNG.get(color_type)
@@ -200,9 +209,10 @@ def _join_png_data(data: bytes) -> bytes:
 def _unfilter(filters: Array, filtered: Array) -> Array:
     """Undo the filters of a PNG image (PNG specification, section 9).
 
-    A byte was stored minus its prediction from the same byte of the pixels to the left,
-    above, and above to the left, modulo 256. As these have to be known first, pixels
-    are computed diagonal by diagonal: those on one do not depend on each other.
+    A stored byte is the true one minus a prediction, modulo 256. The prediction is
+    computed from the same byte of the pixels to the left, above, and above to the left,
+    which have to be known first. So pixels are computed diagonal by diagonal: those on
+    the same diagonal do not depend on each other.
 
     Args:
         filters: (H,) the filter of each row: 0 none, 1 left, 2 above, 3 their mean, 4

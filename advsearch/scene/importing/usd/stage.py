@@ -301,8 +301,11 @@ class Conversion:
     def _add_content(self, prim: Any, node: dict[str, Any]) -> Array | None:
         """Add the mesh, camera or light of a prim to its node.
 
-        What is invisible, or for guides or proxies, is left out with a note. Returns
-        what `_add_mesh` does; None if the prim is no mesh.
+        A prim that is invisible, or a guide or a proxy, is left out with a note.
+
+        Returns:
+            The matrix (4, 4), for rows, of the skeleton that poses a mesh in the world;
+            None if none does, or if the prim is no mesh.
         """
         is_mesh = prim.IsA(UsdGeom.Mesh)
         is_camera = prim.IsA(UsdGeom.Camera)
@@ -329,8 +332,12 @@ class Conversion:
     def _add_camera(self, camera: Any, node: dict[str, Any]) -> None:
         """Add a camera to a node.
 
-        One that is not perspective becomes an orthographic entry, which the reader of
-        glTF leaves out with a note. A shift of the aperture is left out, with a note.
+        A camera without perspective becomes an orthographic entry, which the reader of
+        glTF leaves out with a note. A shift of the aperture is left out with a note.
+
+        Args:
+            camera: USD's camera.
+            node: entry of its node, to which the index of the camera is added.
         """
         # lengths in the same unit
         width = _get_first(camera, "HorizontalAperture")
@@ -360,8 +367,12 @@ class Conversion:
     def _add_light(self, prim: Any, node: dict[str, Any]) -> None:
         """Add a distant or a spherical light to a node; others are noted.
 
-        USD has radiance, and glTF candela, or lux for a distant light. The light's
-        middle is where the node is.
+        USD states radiance. glTF states candela, or lux for a distant light, so the
+        radiance is integrated over the light's surface or its cone.
+
+        Args:
+            prim: prim of the light.
+            node: entry of its node, to which the index of the light is added.
         """
         light = UsdLux.LightAPI(prim)
         kind = prim.GetTypeName()
@@ -402,6 +413,10 @@ class Conversion:
     def _add_mesh(self, prim: Any, node: dict[str, Any]) -> Array | None:
         """Add a mesh to a node: one primitive for each material and tint.
 
+        Args:
+            prim: prim of the mesh.
+            node: entry of its node, to which the index of the mesh is added.
+
         Returns:
             The matrix (4, 4), for rows, of the skeleton that poses the mesh in the
             world; None if none does.
@@ -428,9 +443,14 @@ class Conversion:
     def _make_primitives(
         self, prim: Any, mesh: Any, mesh_faces: MeshFaces
     ) -> list[dict[str, Any]]:
-        """Return one primitive for each material and tint of a mesh.
+        """Return one glTF primitive for each material and tint of a mesh.
 
-        `prim` is the prim of the mesh.
+        A tint is a color and opacity that faces have from the mesh's own values.
+
+        Args:
+            prim: prim of the mesh.
+            mesh: the same as USD's mesh.
+            mesh_faces: its points and faces.
         """
         primvars = UsdGeom.PrimvarsAPI(prim)
         normals = self._read_normals(
@@ -459,7 +479,14 @@ class Conversion:
     def _check_corners(
         self, prim: Any, n_points: int, counts: Array, corners: Array
     ) -> None:
-        """Raise FileFormatError if faces refer to points that are not there."""
+        """Raise FileFormatError if faces refer to points that are not there.
+
+        Args:
+            prim: prim of the mesh, for messages.
+            n_points: how many points the mesh has.
+            counts: (F,) number of corners of each face.
+            corners: (C,) the points of the corners of all faces.
+        """
         if (
             (counts < 0).any()
             or counts.sum() != len(corners)
@@ -476,7 +503,14 @@ class Conversion:
     ) -> tuple[Array, Array]:
         """Return the triangles (T, 3) of a mesh, as rows of `corners`, and their faces.
 
-        Holes are left out.
+        Faces that the mesh lists as holes are left out. In a left-handed mesh the
+        corners are reversed, since glTF's faces are counter-clockwise.
+
+        Args:
+            mesh: USD's mesh.
+            points: (P, 3) its points.
+            counts: (F,) number of corners of each face.
+            corners: (C,) the points of the corners of all faces.
         """
         self.triangles += int(np.maximum(counts - 2, 0).sum())
         reading.check_faces(self.source, self.triangles, "more")
@@ -493,8 +527,14 @@ class Conversion:
     ) -> MeshValues | None:
         """Return the normals (N, 3) of a mesh and their interpolation, or None.
 
-        A primvar wins over the attribute. A mesh that is to be subdivided has smooth
-        normals instead, with a note.
+        The primvar "normals" is preferred to the attribute. A mesh with a subdivision
+        scheme is not subdivided here; it gets smooth normals instead, with a note.
+
+        Args:
+            mesh: USD's mesh.
+            primvars: its primvars.
+            points: (P, 3) its points.
+            triangles: (T, 3) points of its triangles.
         """
         normals = _flatten_primvar(primvars.GetPrimvar("normals"), 3)
         if normals is None:
@@ -518,8 +558,9 @@ class Conversion:
     ) -> dict[str, Any]:
         """Return a primitive as an entry of the header; its data goes to the buffer.
 
-        USD has values for points, corners or faces; glTF for vertices alone. So corners
-        that have the same point and the same value of every attribute become a vertex.
+        USD has values for points, corners or faces, but glTF only for vertices. So
+        corners with the same point and the same value of every attribute become one
+        vertex.
 
         Args:
             path: path of the prim, for messages.
@@ -567,8 +608,16 @@ class Conversion:
         """Return which values the corners of selected triangles have, (3 T, columns).
 
         The first column is the index of the point. Each attribute has a column with the
-        index of its value, 0 if it has one for all, or none. Arguments and errors are
-        those of `_make_primitive`.
+        index of its value. It is 0 if the attribute has one value for all, or none.
+
+        Args:
+            path: path of the prim, for messages.
+            mesh_faces: the faces of the mesh.
+            is_selected: (T,) which triangles are selected.
+            attributes: attributes by the names of glTF; None for none.
+
+        Raises:
+            FileFormatError: an attribute has fewer values than the mesh needs.
         """
         corner_rows = mesh_faces.triangles[is_selected].reshape(-1)
         corner_points = mesh_faces.corners[corner_rows]
@@ -597,7 +646,12 @@ class Conversion:
     def _read_uvs(self, primvars: Any, layout: TextureLayout) -> MeshValues | None:
         """Return texture coordinates (N, 2) as glTF has them, v down, or None.
 
-        The transform of the material is applied.
+        The material's transform of texture coordinates is applied. If the mesh lacks
+        the primvar, the fallback is used for all of it; without one the result is None.
+
+        Args:
+            primvars: primvars of the mesh.
+            layout: the primvar, its transform and its fallback.
         """
         values = None
         if layout.primvar:
@@ -638,10 +692,11 @@ class Conversion:
     ) -> Iterator[tuple[int, MeshValues | None, Array]]:
         """Split faces with a material by their colors and opacities.
 
-        A material may take both from primvars. If faces have up to `MAX_TINTS` colors,
-        each becomes a glTF material; more, or colors that change within a face, become
-        vertex colors. Opacities always become materials, as glTF's vertex colors are
-        imported without.
+        A material may take both from primvars, values of the mesh. If faces have at
+        most `MAX_TINTS` different colors, each color becomes a glTF material. If there
+        are more, or if colors change within a face, they become vertex colors.
+        Opacities always become materials, since our reader ignores the opacity of
+        glTF's vertex colors.
 
         Args:
             bound: the material.
@@ -695,9 +750,13 @@ class Conversion:
     ) -> Array:
         """Return the opacity of each face, (F, 1); NaN where the material's holds.
 
-        They are rounded to 1/255, so that few are different; more than `MAX_TINTS` are
-        replaced by their mean, with a note. `opacities` are those of a primvar; other
-        arguments are those of `_compute_face_values`.
+        They are rounded to 1/255, so that few are different. If there are more than
+        `MAX_TINTS`, they are replaced by their mean, with a note.
+
+        Args:
+            opacities: opacities of the primvar, or None.
+            faces: (F,) the faces.
+            mesh_faces: all faces of the mesh.
         """
         if opacities is None:
             return np.full((len(faces), 1), np.nan)
@@ -719,8 +778,16 @@ class Conversion:
     ) -> Iterator[tuple[BoundMaterial, Array]]:
         """Yield the materials of a mesh and their faces.
 
-        A face belongs to the first subset that has it, and to the mesh's own material
-        if none has. `faces` is how many there are.
+        A face has the material of the first subset that contains it, or else the mesh's
+        own material.
+
+        Args:
+            prim: prim of the mesh.
+            mesh: the same as USD's mesh.
+            faces: how many faces the mesh has.
+
+        Yields:
+            A material, and the indices of its faces.
         """
         subsets = UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets()
         is_unbound = np.ones(faces, bool)
@@ -737,8 +804,9 @@ class Conversion:
         """Pose the points of a mesh by its skeleton at rest.
 
         Returns:
-            The matrix (4, 4) of the skeleton, for rows, and the points (P, 3) in it;
-            (None, points) if the mesh has no skeleton, or one that cannot be posed.
+            The matrix (4, 4) from the skeleton to the world, for row vectors, and the
+            points (P, 3) in the skeleton's coordinates. If the mesh has no skeleton, or
+            one that cannot be posed, None and the points as they are.
         """
         skinning = self._skins.GetSkinningQuery(prim)
         if not skinning or not skinning.HasJointInfluences():
@@ -762,8 +830,8 @@ class Conversion:
 def _compute_joint_transforms(skinning: Any, skeleton_query: Any) -> list[Any] | None:
     """Return how each joint of a skin moves points at rest, or None if that is unknown.
 
-    It is the inverse of its bind transform, then its rest transform. USD's matrices are
-    for rows, so that the first one is on the left.
+    A joint moves points by the inverse of its bind transform, followed by its rest
+    transform. USD's matrices multiply row vectors, so the first one is on the left.
 
     Args:
         skinning: query of the skin, which may have its joints in an order of its own.
@@ -817,9 +885,10 @@ def _make_point_light(prim: Any) -> dict[str, Any]:
 def _compute_face_values(
     primvar: MeshValues, faces: Array, mesh_faces: MeshFaces
 ) -> Array:
-    """Return the values (F, C) of some faces; those of their corners are averaged.
+    """Return one value (C,) for each of some faces, as (F, C).
 
-    Indices beyond the values have the last of them.
+    Values of points or corners are averaged over the face. If there are too few values,
+    the last one is repeated.
 
     Args:
         primvar: values (N, C) of the mesh.
@@ -837,8 +906,8 @@ def _compute_face_values(
     if interpolation in ("vertex", "varying"):
         corner_index = mesh_faces.corners
     corner_values = values[np.minimum(corner_index, len(values) - 1)]
-    # A row of zeros, since the last faces may have no corners: they begin at the end,
-    # where `reduceat` needs a row.
+    # A row of zeros is appended: the last faces may have no corners, so that they begin
+    # past the last row, where `reduceat` needs one.
     padded_values = np.concatenate([corner_values, np.zeros((1, values.shape[1]))])
     starts = np.cumsum(counts) - counts
     sums = np.add.reduceat(padded_values, starts)
@@ -848,8 +917,8 @@ def _compute_face_values(
 def _compute_illuminance(prim: Any, radiance: float) -> float:
     """Return the lux of a distant light on what faces it.
 
-    Its radiance is integrated over the cone under which it is seen. A "normalised"
-    light of USD states its illuminance, whatever the cone.
+    Its radiance is integrated over the cone of directions that it covers: L pi sin^2 of
+    the half angle. A "normalised" light of USD states its illuminance directly.
     """
     angle = _get_first(UsdLux.DistantLight(prim), "Angle")
     half_angle = math.radians(angle) / 2.0

@@ -162,8 +162,8 @@ class Shader:
     def get_numbers(self, name: str, default: Sequence[float]) -> tuple[float, ...]:
         """Return the finite numbers of an input, or `default`, which has as many.
 
-        Further numbers are left out; if there are too few, or others than finite ones,
-        the default holds for all.
+        Numbers beyond the length of the default are left out. If there are too few, or
+        some are not finite, the default is returned.
         """
         value = self.get_value(name)
         if value is None:
@@ -238,7 +238,8 @@ class UsdSurfaces:
     def find_material(self, prim: Any) -> BoundMaterial:
         """Return the material of a prim, or its display color.
 
-        A material for previews wins over one for all purposes. Each is converted once.
+        A material for previews is preferred to one for all purposes. Each material is
+        converted only once.
         """
         binding = UsdShade.MaterialBindingAPI(prim)
         material = (
@@ -255,7 +256,8 @@ class UsdSurfaces:
     def _make_default_material(self) -> BoundMaterial:
         """Add the material of prims without one, whose color is their display color.
 
-        That is a primvar of each mesh, so that faces are tinted later.
+        The display color is a primvar of each mesh, so it is not known here: faces are
+        tinted when the mesh is converted.
         """
         surface = {
             "baseColorFactor": [*DEFAULT_COLOR, 1.0],
@@ -362,8 +364,9 @@ class UsdSurfaces:
     def load_texels(self, use: UsdTextureUse) -> Array | None:
         """Return an image (H, W, 4) in linear values, before scale and bias.
 
-        None, and a note, if it cannot be decoded. It is kept until the next material is
-        converted, so that one which shows it twice decodes it once.
+        The result is None, with a note, if it cannot be decoded. Images are cached
+        until the next material is converted, so that a material which uses one twice
+        decodes it once.
         """
         key = (use.data, use.is_srgb)
         if key not in self._texels:
@@ -543,7 +546,8 @@ class PreviewSurface:
 
         Args:
             name: the input.
-            kinds: ids of the shaders that count: they read primvars of a type.
+            kinds: ids of the shaders that read primvars of the right type, such as
+                "UsdPrimvarReader_float3"; others do not count.
             default: the default of the input, for its number of channels.
         """
         source = self.shader.find_source(name)
@@ -614,7 +618,8 @@ class PreviewSurface:
             channels: channels of the image that the input takes.
 
         Returns:
-            As `_find_texture`.
+            The texture; or the numbers, one for each channel, that replace a missing
+            image; or None, with a note.
         """
         path = "" if inputs.asset is None else str(inputs.asset.path)
         data = self._load_image(inputs.asset, path, name)
@@ -681,9 +686,12 @@ class PreviewSurface:
     def _find_layout(self, node: Shader) -> TextureLayout:
         """Return the texture coordinates of a texture: a primvar and its transforms.
 
-        The shaders are followed from the texture, input by input, back to the primvar.
-        Texture coordinates run the other way: the transform that is met last is applied
-        first. Shaders of other kinds are taken for the primvar st, with a note.
+        The shaders are followed from the texture back to the primvar. Texture
+        coordinates go the other way, so the transform that is found last is applied
+        first. A shader of another kind is replaced by the primvar "st", with a note.
+
+        Raises:
+            FileFormatError: there are more than `MAX_SHADERS` shaders in a row.
         """
         matrix = np.eye(3)
         input_name = "st"
@@ -751,9 +759,9 @@ class PreviewSurface:
         """Fill in color and opacity.
 
         Each comes from a primvar (numbers on the mesh), a texture or a value. glTF has
-        one texture for both, so that an opacity texture with other texture coordinates
-        than the color's is left out. With a threshold the opacity is a mask, otherwise
-        it is blended.
+        one texture for both, so an opacity texture with other texture coordinates than
+        the color's is left out. If the material has an opacity threshold, the opacity
+        is a mask; otherwise it is blended.
 
         Args:
             entry: the glTF material.
@@ -815,8 +823,8 @@ class PreviewSurface:
     ) -> tuple[int | None, list[float]]:
         """Add the texture of color and opacity: the image itself, or a baked one.
 
-        The image itself does if its sRGB texels are only scaled, and the opacity, if
-        there is any, is its alpha.
+        The image itself is used if its sRGB texels are only scaled, and if the opacity
+        is its alpha or is not textured.
 
         Args:
             color_use: the texture of the color, or None.
@@ -850,9 +858,13 @@ class PreviewSurface:
     ) -> Array | None:
         """Return display-referred values (H, W, 3 or 4) of color and opacity.
 
-        None if neither image can be read. `factor` (3,) is the linear color if it has
-        no image. Images of two sizes are both resized to the larger width and the
-        larger height.
+        Images of two sizes are both resized to the larger width and the larger height.
+        The result is None if neither image can be read.
+
+        Args:
+            color_use: the texture of the color, or None.
+            opacity_use: the texture of the opacity, or None.
+            factor: (3,) linear color, used if there is no image of it.
         """
         colors = None if color_use is None else self.surfaces.compute_values(color_use)
         opacities = (
@@ -942,8 +954,15 @@ class PreviewSurface:
     ) -> tuple[float, tuple[UsdTextureUse, Array] | None]:
         """Return the number of an input, and the image that it is connected to, if any.
 
-        The number is the fallback of a primvar, with a note, or of a missing image; or
-        else that of the input. The image is its texture and values (H, W) in [0, 1].
+        A primvar is replaced by its fallback, with a note, and a missing image by its
+        own fallback.
+
+        Args:
+            name: the input, "roughness" or "metallic".
+            default: its value if the shader has none.
+
+        Returns:
+            The number; and None, or the texture and its values (H, W) in [0, 1].
         """
         number = self.shader.get_number(name, default)
         primvar = self._find_primvar(name, (READER_OF_NUMBERS,), (0.0,))
@@ -982,9 +1001,12 @@ class PreviewSurface:
     def _add_normal(self, entry: dict[str, Any]) -> None:
         """Fill in the normal map.
 
-        An image of 8 bits with the scale and the bias that glTF implies is taken as it
-        is. Others are decoded and written anew. A single normal for all, or one
-        channel, is left out with a note. `entry` is the glTF material.
+        An image of 8 bits is copied if its scale and bias are 2 and -1, as glTF
+        implies. Others are decoded and written anew. A single normal for all of the
+        surface, or an image of one channel, is left out with a note.
+
+        Args:
+            entry: the glTF material.
         """
         if self.shader.find_source("normal") is None:
             self._note_constant_normal()
@@ -1034,8 +1056,11 @@ class PreviewSurface:
     def _add_emission(self, entry: dict[str, Any]) -> None:
         """Fill in the emission, whose factor may be larger than 1.
 
-        An image of sRGB texels times factors is taken as it is; another one is written
-        anew. `entry` is the glTF material.
+        An image whose sRGB texels are only scaled is copied; another one is written
+        anew.
+
+        Args:
+            entry: the glTF material.
         """
         black = (0.0, 0.0, 0.0)
         use, value = self._find_texture_or_value(
@@ -1088,9 +1113,12 @@ def _write_emission_factor(entry: dict[str, Any], factor: Sequence[float]) -> No
 def _pack_planes(planes: Mapping[str, Array], factors: Mapping[str, float]) -> Array:
     """Return an image (H, W, 3) of roughness (green) and metallic (blue).
 
-    Planes (h, w) in [0, 1] and factors are by these two names; where there is no plane,
-    the factor fills the channel. The image has the size of the wider plane, of two
-    equally wide ones of the higher. Red is 1.
+    The image has the size of the wider plane, or of the higher one if both are equally
+    wide. Red is 1.
+
+    Args:
+        planes: values (h, w) in [0, 1], by "roughness" and "metallic".
+        factors: numbers by the same names, used for a channel without a plane.
     """
     width, height = max((plane.shape[1], plane.shape[0]) for plane in planes.values())
     packed = np.ones((height, width, 3), np.float32)
