@@ -158,7 +158,7 @@ class ThingsControl(Control):
         return moved
 
     def _check_things_stand_free(self) -> None:
-        """Check that the things of this control overlap with nothing in the clean scene.
+        """Check that the things of this control stand free in the clean scene.
 
         Raises:
             InputError: one overlaps with something else.
