@@ -168,8 +168,9 @@ class Evaluation:
         )
 
     def _sanitize_gradient(self) -> Evaluation:
-        """Return the evaluation with zeros for gradient elements that are NaN or
-        infinite, which are added to `non_finite`.
+        """Return the evaluation with zeros in place of NaN or infinite gradients.
+
+        The number of elements that were replaced is added to `non_finite`.
         """
         gradient = self.gradient
         if gradient is None:
@@ -222,10 +223,14 @@ class Proposal:
         return self.samples * (1 + gradient_cost)
 
     def limit_cost(self, domain: Domain, renders_left: int) -> Proposal:
-        """Return the proposal as far as `renders_left` renders, at least 1, allow it.
+        """Return the proposal, reduced so that the remaining renders suffice for it.
 
-        It has no more samples than these, and no gradient that would leave no render to
-        use it.
+        It has at most `renders_left` samples. Its gradient is dropped if no render
+        would be left after it: a gradient is only useful for a next step.
+
+        Args:
+            domain: states how many renders a gradient costs.
+            renders_left: number of renders that the budget has left, at least 1.
         """
         proposal = self
         if self.samples > renders_left:
@@ -281,8 +286,12 @@ class Policy(ABC, Generic[State]):
     handles_choices: ClassVar[bool] = False
 
     def __init_subclass__(cls, **more: Any) -> None:
-        """Refuse the old name of a method, and give a user's class copies of what it is
-        passed.
+        """Prepare a subclass: reject a renamed method, and pass copies to its methods.
+
+        A user's policy may write into its arguments, which the search still needs.
+
+        Raises:
+            InputError: the class defines `answer`, the old name of `distribution`.
         """
         super().__init_subclass__(**more)
         if "answer" in vars(cls):
@@ -318,15 +327,15 @@ class Policy(ABC, Generic[State]):
         """Return the next configurations, and the state until `update`.
 
         Args:
-            state: after the latest `update`, or as `start` returned it.
-            n: how many can be evaluated before the next `update`, at least 1.
+            state: state after the latest `update`, or as `start` returned it.
+            n: largest number of proposals, at least 1.
 
         Returns:
-            Up to n that do not wait for each other's evaluations: a sample of a
-            population is one of many, a step along a gradient is alone. None at all if
-            there is nothing more to propose (a grid that is done, a flat objective).
-            Asked with another n, a policy proposes the same configurations in the same
-            order, provided that `update` is told of all of them.
+            At most n proposals that do not depend on each other's evaluations: many
+            samples of a population, but a single step along a gradient. An empty tuple
+            means that there is nothing more to propose, because a grid is complete or
+            the objective is flat. With another n, a policy must propose the same
+            configurations in the same order, if all of them are passed to `update`.
         """
 
     @abstractmethod

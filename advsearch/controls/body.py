@@ -78,7 +78,7 @@ class BodyControl(Control):
             # by default the first animation, if its time is set, or nothing at all
             plays_time = geometry.TIME.name in self.specs or not self._settings
             return clips[0] if clips and plays_time else None
-        index = -1  # of no animation
+        index = -1  # no index of an animation
         # a number may be given as text
         if Parameter.is_number(requested) or str(requested).isdecimal():
             index = int(requested)

@@ -588,7 +588,7 @@ class ContentsControl(Control):
         return proportions
 
     def find_cuts(self, proportions: Mapping[str, float]) -> dict[str, float]:
-        """Return the cuts that give certain proportions, the inverse of `cut_proportions`.
+        """Return the cuts that give certain proportions, to invert `cut_proportions`.
 
         A proportion that is not possible is clipped to the nearest possible one.
 
@@ -607,7 +607,7 @@ class ContentsControl(Control):
         return cuts
 
     def _possible_range(self, name: str, remainder: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the smallest and the largest proportion () that an ingredient may have.
+        """Return the smallest and largest proportion () that an ingredient may have.
 
         They are its bounds, narrowed so that the ingredients after it can still add up
         to what is left.

@@ -320,7 +320,7 @@ class Preconditioner:
     """
 
     def __init__(self, welded_mesh: WeldedMesh) -> None:
-        """Factorise I + lambda L, and compute an orthonormal basis of the rigid motions.
+        """Factorise I + lambda L, and compute an orthonormal basis of rigid motions.
 
         L is the Laplacian of the mesh, and lambda the squared smoothing length.
         """
@@ -513,8 +513,8 @@ class DisplacementLimits:
         they are, large ones reach the tightest bound, and all is differentiable.
         """
         squared_usage = self.compute_squared_usage(field)
-        # The r are divided by the largest one, so that powers do not overflow. `largest`
-        # is a square: 1 + sum r^p = largest^(p/2) * total.
+        # The r are divided by the largest one, so that powers do not overflow.
+        # `largest` is a square: 1 + sum r^p = largest^(p/2) * total.
         largest = squared_usage.detach().max().clamp_min(1.0)
         powers = (squared_usage / largest).pow(NORM_EXPONENT // 2).sum()
         total = powers + largest ** (-NORM_EXPONENT // 2)

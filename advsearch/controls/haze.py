@@ -97,7 +97,10 @@ class HazeControl(Control):
         return 0.0 if _find_haze(self.scene) is None else parameter.default
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        """Add a ball of haze, or take over the scene's own."""
+        """Return the scene with a ball of haze around camera and object.
+
+        If the scene has a haze already, that is used and only renamed.
+        """
         scene_haze = _find_haze(scene)
         if scene_haze is not None:
             renamed = replace(scene_haze, name=self.name)
