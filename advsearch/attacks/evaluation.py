@@ -65,9 +65,9 @@ class Query:
     # "free" only ever comes where the domain has `partial_gradients`
     gradient: WhichGradient = False
     samples: int = 1
-    """Of a search: how many times its own samples per pixel to render with, at least 1.
-    The evaluation costs as many times its renders: samples * (1 + gradient_cost) with a
-    gradient, samples without.
+    """Multiple of the search's samples per pixel to render with, at least 1. The
+    evaluation costs samples * (1 + gradient_cost) renders with a gradient, and samples
+    without.
     """
     spp: int = 1  # samples per pixel of a trial
     # of a trial: whether conditions are drawn; else the scene has those that it comes
@@ -138,7 +138,8 @@ class Evaluation:
     def required_judgement(self) -> Judgement:
         """The judgement of the task.
 
-        Raises RuntimeError if there is none: the query was for an image or for light.
+        Raises:
+            RuntimeError: there is none, as the query was for an image or for light.
         """
         if self.judgement is None:
             raise RuntimeError("this evaluation has no judgement")
@@ -207,9 +208,9 @@ class Proposal:
             domain has `partial_gradients`). A wish: the end of a budget gets none.
         step_size: the step that led here in units of each block's radius, for the log;
             NaN where there is none.
-        samples: render with so many times the search's samples per pixel, at least 1,
-            for as many times the renders. A wish too: the end of a budget gets what is
-            left.
+        samples: multiple of the search's samples per pixel to render with, at least 1.
+            It costs as many times the renders. At the end of a budget it is reduced to
+            the renders that are left.
     """
 
     u: Tensor
@@ -225,8 +226,8 @@ class Proposal:
     def limit_cost(self, domain: Domain, renders_left: int) -> Proposal:
         """Return the proposal, reduced so that the remaining renders suffice for it.
 
-        It has at most `renders_left` samples. Its gradient is dropped if no render
-        would be left after it: a gradient is only useful for a next step.
+        Its `samples` (each costs a render) become `renders_left` at most. Its gradient
+        is dropped if no render would be left after it, to use the gradient for.
 
         Args:
             domain: states how many renders a gradient costs.

@@ -61,7 +61,7 @@ class StepRecord:
     seconds: float  # seconds that the evaluation took
     # renders that all evaluations so far took together, this one included
     renders: int = 0
-    samples: int = 1  # as of `Proposal`
+    samples: int = 1  # multiple of the search's samples per pixel; see `Proposal`
 
 
 IsOutOfTime = Callable[[int], bool]

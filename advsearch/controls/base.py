@@ -426,9 +426,12 @@ class Control:
         return cls.parameters
 
     def check_choices(self) -> None:
-        """Check what the choices' own declarations do not say of `self.chosen`.
+        """Check the values of the choices, `self.chosen`, in ways of a subclass.
 
-        By default nothing. Raises InputError: a choice is out of range.
+        For example, two choices may exclude each other. By default nothing is checked.
+
+        Raises:
+            InputError: a choice is out of range.
         """
 
     def to_settings(self) -> dict[str, object]:
@@ -554,7 +557,10 @@ class Control:
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Return the scene with the parts that this control needs (a light, a medium).
 
-        By default it is unchanged. Raises InputError: the scene cannot take them.
+        By default it is unchanged.
+
+        Raises:
+            InputError: the control does not fit the scene.
         """
         return scene
 
@@ -567,7 +573,8 @@ class Control:
     def bind(self, scene: SceneDescription) -> Self:
         """Return a copy that is bound to a scene, which all controls have prepared.
 
-        Raises InputError: a setting of the control is impossible in this scene.
+        Raises:
+            InputError: a setting of the control is impossible in this scene.
         """
         bound = self.with_scene(scene)
         bound.fit()
@@ -943,30 +950,44 @@ class Control:
     def kept_pictures(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return images worth storing; see `get_artifact_images`."""
+        """Return images to store with a result, by file stem; none by default.
+
+        Each is (h, w, 3), display-referred sRGB in [0, 1].
+        """
         return {}
 
     def get_artifact_images(
         self, u: Tensor, earlier_inputs: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Tensor]:
-        """Return images worth storing, by file stem.
+        """Return images to store with a result, by file stem, such as a texture.
 
-        Each is (h, w, 3), display-referred sRGB in [0, 1]. Arguments as for `describe`.
+        A subclass provides them by `kept_pictures`.
+
+        Args:
+            u: (d,) the control's slice of a configuration, in [0, 1].
+            earlier_inputs: inputs of the controls that are evaluated before this one.
+
+        Returns:
+            Images (h, w, 3), display-referred sRGB in [0, 1].
         """
         return self.kept_pictures(self.values(u.detach()), earlier_inputs)
 
     def kept_files(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, bytes]:
-        """Return other files worth storing; see `get_artifact_files`."""
+        """Return other files to store with a result, by name with suffix."""
         return {}
 
     def get_artifact_files(
         self, u: Tensor, earlier_inputs: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, bytes]:
-        """Return other files worth storing, by name with suffix, such as a mesh as PLY.
+        """Return other files to store with a result, by name with suffix.
 
-        Arguments as for `describe`.
+        A file may be a mesh as PLY. A subclass provides them by `kept_files`.
+
+        Args:
+            u: (d,) the control's slice of a configuration, in [0, 1].
+            earlier_inputs: inputs of the controls that are evaluated before this one.
         """
         return self.kept_files(self.values(u.detach()), earlier_inputs)
 

@@ -387,9 +387,15 @@ class ContentsControl(Control):
     )
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
-        """Find the bounds of each proportion, also of those that are not set.
+        """Read the settings, and find the bounds of each proportion.
 
-        Raises InputError: the proportions cannot add up to 1.
+        Args:
+            name: name of the control; by default its kind.
+            **settings: values of its parameters; proportions that are not set get
+                bounds too.
+
+        Raises:
+            InputError: the proportions can't add up to 1.
         """
         super().__init__(name, **settings)
         self.proportion_bounds = self._read_bounds()

@@ -280,7 +280,16 @@ def _read_choices(
 
 
 def _check_bounds(where: str, parameter: Parameter, low: float, high: float) -> None:
-    """Check the bounds of a range. Raises InputError: they are equal, or reversed."""
+    """Check the bounds of a range.
+
+    Args:
+        where: name of the parameter, for messages.
+        parameter: states whether it is an angle or has a logarithmic scale.
+        low, high: bounds of the range.
+
+    Raises:
+        InputError: they are equal or reversed, or not over 0 on a logarithmic scale.
+    """
     if low == high:
         raise InputError(
             f"{where}: the range [{low:g}, {high:g}] has no size; write "
@@ -328,8 +337,11 @@ def _explain_turn(parameter: Parameter, low: float, high: float) -> str:
 
 
 def _make_choice(where: str, values: Sequence[ParameterValue]) -> OneOf:
-    """Return a choice. Raises InputError: a value is there twice."""
-    # it would be drawn twice as often
+    """Return a choice among values.
+
+    Raises:
+        InputError: a value is there twice; it would be drawn twice as often.
+    """
     repeated = [value for value, count in Counter(values).items() if count > 1]
     if repeated:
         raise InputError(

@@ -377,8 +377,9 @@ def _compute_shifts(origin: Tensor, columns: int) -> Tensor:
 def _make_glass_shift(height: int, width: int, seed: int, severity: int) -> Tensor:
     """Make the shift of each pixel to where it is taken from behind frosted glass.
 
-    One pixel after the other, from the bottom right on, is exchanged with a random
-    neighbor. As neighbors were exchanged before, a pixel may come from farther away.
+    One pixel after the other, from the bottom right on, takes over the content of a
+    random neighbor. The neighbor may have taken it over itself before, so that a pixel
+    may come from farther away than one step.
 
     Args:
         height: height of the image.
@@ -524,7 +525,11 @@ def fog(image: Tensor, severity: Tensor, seed: int) -> Tensor:
 def _make_drift(height: int, width: int, seed: int, decay: float) -> Tensor:
     """Make fog (H, W, 1) in [0, 1].
 
-    `decay` is as for `make_fractal_noise`: the larger it is, the smoother is the fog.
+    Args:
+        height, width: size of the image, pixels.
+        seed: chooses the fog.
+        decay: how fast the noise loses height on finer grids; the larger it is, the
+            smoother is the fog.
     """
     rows, columns = compute_reference_size(height, width)
     noise = make_fractal_noise(max(rows, columns), decay, make_generator(seed, "fog"))

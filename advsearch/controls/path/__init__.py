@@ -331,8 +331,10 @@ class PathControl(Control):
             self._check_not_set("reach")
 
     def _check_not_set(self, setting: str) -> None:
-        """Check that a choice which files state is not set. Raises InputError: it
-        is.
+        """Check that a choice is not set, because the files of the paths state it.
+
+        Raises:
+            InputError: it is set.
         """
         if setting in self._settings:
             raise InputError(
@@ -1094,7 +1096,11 @@ def _is_path(name: str) -> bool:
 
 
 def _read_text(path: Path) -> str:
-    """Read a file of waypoints, without a byte order mark. Raises FileFormatError."""
+    """Read a file of waypoints, without a byte order mark.
+
+    Raises:
+        FileFormatError: the file can't be read.
+    """
     try:
         return stored_files.read_text(
             path, "a table of waypoints", MAX_FILE_BYTES

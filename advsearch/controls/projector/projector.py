@@ -385,8 +385,10 @@ class ProjectorControl(PictureControl):
             self.flashes = max(map(float, self.list_allowed_values("flicker", 0.0)))
 
     def read_picture(self) -> Tensor | None:
-        """Return the image of the `picture` file. Raises InputError: a side has one
-        texel.
+        """Return the image (h, w, 3) sRGB of the `picture` file, or None.
+
+        Raises:
+            InputError: a side has only one texel.
         """
         picture = super().read_picture()
         if picture is not None and min(picture.shape[:2]) < 2:
