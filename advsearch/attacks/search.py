@@ -219,7 +219,15 @@ def _check_limits(
     max_extra_repeats: int,
     seconds: float | None,
 ) -> None:
-    """Raise InputError if a limit of a search is out of range."""
+    """Raise InputError if an argument of `search` is out of range.
+
+    Args:
+        steps: renders of the search, at least 1.
+        candidates: number of configurations that are rendered again, at least 0.
+        repeats: renders of each candidate, at least 1.
+        max_extra_repeats: largest number of further renders, at least 0.
+        seconds: time limit, over 0; None for no limit.
+    """
     if steps < 1:
         raise InputError(f"steps: expected at least 1, got {steps}")
     if candidates < 0 or repeats < 1:

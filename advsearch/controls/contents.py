@@ -544,7 +544,7 @@ class ContentsControl(Control):
         """Return the offsets, the pose and the color of the liquid's surface."""
         vessel = find_interior(self.scene.object)
         assert vessel is not None  # see `prepare`
-        # the mesh as `prepare` has made it
+        # `prepare` has made the mesh at half the height
         base = _liquid_surface(vessel, torch.full_like(values["level"], 0.5))
         surface = _liquid_surface(vessel, values["level"])
         inputs = {f"{self.name}.offsets": surface - base}

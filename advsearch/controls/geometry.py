@@ -491,7 +491,10 @@ class DisplacementLimits:
 
         The field changes by d1 along edge 1 of the face, and by d2 along edge 2. Edge 2
         is `along` times edge 1 plus a height across it. So the field changes by d1 /
-        length per unit along edge 1, and by (d2 - along d1) / height across.
+        length per unit along edge 1, and by (d2 - along d1) / height across it.
+
+        Args:
+            field: (P, 3) vectors at the positions of the mesh.
         """
         inverse_axes = self._inverse_axes.to(field.device)
         # (F, 1) each: 1 / length, along, and 1 / height
@@ -611,7 +614,11 @@ class GeometryControl(Control):
         self.form = self.select_form(FORMS)
 
     def fit(self) -> None:
-        """Compute the modes, or the preconditioner, of the mesh in the scene."""
+        """Compute what turns coordinates into a displacement field of the mesh.
+
+        In the form "modes" a coordinate is the amplitude of a smooth field. Otherwise it
+        is a push on one position along one axis, which a preconditioner spreads.
+        """
         self._offsets_input = f"{self.mesh}.offsets"
         self._mesh = self.get_mesh(self.scene).mesh
         welded_mesh = get_welded_mesh(self._mesh)

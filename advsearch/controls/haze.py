@@ -75,8 +75,12 @@ class HazeControl(Control):
     ) -> Parameter:
         """Return the density with its default and its estimators in this scene.
 
-        Without haze in the scene the default is 0; but if only the color is searched,
-        it is `DEFAULT_DENSITY`, since the color would not show otherwise.
+        Without haze in the scene the default is 0. But if only the color is searched,
+        it is `DEFAULT_DENSITY`, because the color of no haze has no effect.
+
+        Args:
+            parameter: the density.
+            scene_haze: haze of the scene, or None.
         """
         default = parameter.default
         if scene_haze is not None:

@@ -617,8 +617,14 @@ def _outward_direction(
 ) -> assets.Float64Array:
     """Return the unit vector (3,) from the center of an object to a patch on it.
 
-    The patch lies on an ellipsoid with the object's radius and half-height. `height` is
-    its latitude: 0 at the lower pole, 0.5 at the equator, 1 at the upper pole.
+    The patch lies on an ellipsoid around the object.
+
+    Args:
+        azimuth: degrees around the vertical.
+        height: latitude on the ellipsoid: 0 at the lower pole, 0.5 at the equator, 1 at
+            the upper pole.
+        radius: level radius of the ellipsoid, object sizes.
+        half_height: half the height of the ellipsoid, object sizes.
     """
     angle = math.radians(azimuth)
     latitude = (height - 0.5) * math.pi

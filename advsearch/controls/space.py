@@ -93,9 +93,9 @@ class Space:
     def _has_material_form(self) -> bool:
         """Return whether the scene's derivatives can be computed in material form.
 
-        That adjoint follows points of a moving surface. It has no terms for a medium, a
-        backdrop, a lens, the edges of cut-out texels, normal maps, or meshes that emit
-        light.
+        That adjoint follows points of a moving surface. It is not implemented for a
+        medium, a backdrop, a lens, the edges of cut-out texels, normal maps, or meshes
+        that emit light.
         """
         scene = self.scene
         if scene is None:

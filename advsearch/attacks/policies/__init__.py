@@ -96,7 +96,7 @@ def _make_nested_policy(spec: Spec, where: str) -> Policy[Any]:
 
     Args:
         spec: a policy, a name, or a mapping with a `name` and options.
-        where: what it is of, for messages.
+        where: where the policy was stated, for messages, e.g. "policy of restarts".
 
     Raises:
         InputError: it is something else.

@@ -492,7 +492,12 @@ class MapElites(Policy[ArchiveState]):
     def _find_measure_indices(self, domain: policies.Domain) -> Tensor:
         """Return the indices (k,) of the parameters that span the archive.
 
-        They are those named in `over`, by default the first two of the domain.
+        They are those named in the option `over`, such as "pose.yaw, pose.pitch", by
+        default the first two of the domain.
+
+        Raises:
+            UnknownNameError: the domain has no parameter of that name.
+            InputError: a name is there twice, or there are too many.
         """
         names = [name.strip() for name in self.over.split(",") if name.strip()]
         if not names:

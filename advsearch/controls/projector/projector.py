@@ -540,9 +540,9 @@ def make_projector_pose(
 
     Args:
         scene: scene with the object.
-        azimuth: degrees.
-        elevation: degrees.
-        distance: as `ProjectorControl` has it.
+        azimuth: degrees around the object's center.
+        elevation: degrees over the object's center.
+        distance: metres from the object's center; object sizes if it has no size.
     """
     left, up, outwards = torch.from_numpy(
         geometry.compute_camera_axes(azimuth, elevation, 0.0)
