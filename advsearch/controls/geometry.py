@@ -616,8 +616,8 @@ class GeometryControl(Control):
     def fit(self) -> None:
         """Compute what turns coordinates into a displacement field of the mesh.
 
-        In the form "modes" a coordinate is the amplitude of a smooth field. Otherwise it
-        is a push on one position along one axis, which a preconditioner spreads.
+        In the form "modes" a coordinate is the amplitude of a smooth field. Otherwise
+        it is a push on one position along one axis, which a preconditioner spreads.
         """
         self._offsets_input = f"{self.mesh}.offsets"
         self._mesh = self.get_mesh(self.scene).mesh
