@@ -70,13 +70,17 @@ class Candidate:
 def add_candidate(
     pool: tuple[Candidate, ...], new: Candidate, size: int
 ) -> tuple[Candidate, ...]:
-    """Return the pool with `new` in it if it belongs to the best `size` distinct ones,
-    best first.
+    """Return the best `size` distinct candidates of the pool and `new`, best first.
 
-    A success beats a candidate without one, then the larger objective wins; of two that
-    are nearly the same configuration the better stays. If exactly the same
-    configuration is in the pool, `new` counts as a repeated render of it, as unbiased
-    as those of the ranking.
+    A success is better than none; then the larger objective is better. Of two that are
+    nearly the same configuration (`SAME`) only the better is stored. If exactly the
+    same configuration is in the pool, `new` counts as a repeated render of it: it was
+    not selected for its value, so it is unbiased.
+
+    Args:
+        pool: candidates so far, best first.
+        new: candidate to add.
+        size: largest number of candidates.
     """
     for old in pool:
         if torch.equal(old.u, new.u):
@@ -102,8 +106,13 @@ def replace_worst(
 ) -> tuple[Candidate, ...]:
     """Return the pool with the last configuration of a search at its end.
 
-    If the pool has `size` candidates, the worst is dropped for it. Without a last
-    configuration, or if that is in the pool already, the pool stays as it is.
+    Without a last configuration, or if it is in the pool already, the pool is returned
+    unchanged.
+
+    Args:
+        pool: candidates, best first.
+        last: the last configuration that was evaluated, or None.
+        size: largest number of candidates; the worst makes room if there are so many.
     """
     if last is None or any(torch.equal(candidate.u, last.u) for candidate in pool):
         return pool
@@ -115,13 +124,14 @@ def select_contenders(
 ) -> tuple[Candidate, ...]:
     """Return the best candidate so far and those that are not clearly worse, in order.
 
-    (The race of Maron and Moore 1994, with normal intervals of one standard deviation
-    in place of Hoeffding's: a search needs the better of two, not a proof.)
+    This is a race (Maron and Moore 1994, "Hoeffding races"), with one standard error as
+    the margin and not Hoeffding's much wider bound: a search only has to choose the
+    better of two, not to prove it.
 
     Args:
         pool: the candidates.
-        n_shared: so many of the latest renders of each candidate have the same seeds as
-            those of the others, so that they can be compared seed by seed.
+        n_shared: number of the latest renders for which all candidates had the same
+            seeds, so that they can be compared seed by seed.
     """
     # one render says nothing of the noise, and one candidate has no rival
     if n_shared < 2 or len(pool) < 2:
@@ -135,11 +145,17 @@ def select_contenders(
 
 
 def _is_clearly_worse(candidate: Candidate, leader: Candidate, n_shared: int) -> bool:
-    """Return whether a candidate has no higher success rate than the leader, and the
-    leader's objective is greater by more than the standard error of the difference.
+    """Return whether a candidate is clearly worse than the best one, the leader.
 
-    Objectives are compared seed by seed in the last `n_shared` renders, at least 2. If
-    a difference is not finite, the candidate is worse if its mean is not finite.
+    It is if its success rate is not higher, and the leader's objective is larger by
+    more than the standard error of the difference. Objectives are compared seed by
+    seed. If a difference is not finite, no error can be computed: the candidate is
+    worse exactly if its mean is not finite.
+
+    Args:
+        candidate: candidate to compare.
+        leader: the best candidate so far.
+        n_shared: number of the latest renders that share their seeds, at least 2.
     """
     differences = [
         leader_objective - objective
@@ -164,8 +180,12 @@ def _is_clearly_worse(candidate: Candidate, leader: Candidate, n_shared: int) ->
 def select_best(pool: tuple[Candidate, ...]) -> Candidate:
     """Return the best candidate: by success rate, then by mean objective.
 
-    Only new renders count. If a candidate has none, the first of the pool is the best,
-    as the pool is sorted by the raw renders.
+    Only renders after the one that admitted a candidate count, as that one is biased.
+    If a candidate has none, the first of the pool is returned: the pool is sorted by
+    the renders that admitted them.
+
+    Args:
+        pool: at least one candidate.
     """
     if all(candidate.repeat_objectives for candidate in pool):
         return max(
@@ -209,28 +229,30 @@ class FailureRate:
 def estimate_failure_rate(
     weights: Tensor, bounds: Tensor, failed: Tensor, unknown: Tensor
 ) -> FailureRate:
-    """Estimate the failure rate under the uniform density from samples of adaptive
-    ones.
+    """Estimate the failure rate of uniform configurations from adaptive samples.
 
-    Sample t comes from a density q_t that may depend on all samples before it. x_t =
-    w_t [failed], with the weight w_t = 1 / q_t relative to the uniform density, has the
-    rate p as its mean given these. Bets on the difference are fair games if the rate is
-    p: the capital of
+    Sample t comes from a density q_t that may depend on all samples before it. Its
+    weight is w_t = 1 / q_t, relative to the uniform density. Let x_t be w_t if the
+    sample failed, otherwise 0. Given the samples before, the mean of x_t is the rate p.
+
+    The interval is by betting (Waudby-Smith and Ramdas 2024, "Estimating means of
+    bounded random variables by betting"). A gambler bets that the rate is over p, or
+    that it is under p, with the fraction c of the capital. The capital starts at 1 and
+    becomes
 
         prod_t (1 - c + c x_t / p)
-        prod_t (1 + c (p - x_t) / (b_t - p)),  b_t the largest weight that q_t gives,
+        prod_t (1 + c (p - x_t) / (b_t - p)),  b_t the largest weight that q_t gives.
 
-    a mean over bets c, exceeds 2 / 0.05 with a probability of 0.025 at most (Ville
-    1939), so the p at which neither does are a 95 % interval (Waudby-Smith and Ramdas
-    2024, "Estimating means of bounded random variables by betting"). Both are monotone
-    in p.
+    If the rate is p, both bets are fair, and the mean over several c exceeds 2 / 0.05
+    with a probability of at most 0.025 (Ville 1939). So the p at which neither exceeds
+    it are a 95 % interval. Both products are monotone in p.
 
     Args:
         weights: (n,) w_t, over 0; n is at least 1.
         bounds: (n,) b_t, at least 1 and at least w_t, known before sample t.
-        failed: (n,) bool.
-        unknown: (n,) bool, samples that could not be evaluated. The interval holds
-            whether they failed or not.
+        failed: (n,) bool, whether the model was wrong at a sample.
+        unknown: (n,) bool, whether a sample could not be evaluated. The interval holds
+            whether these failed or not.
     """
     weights = weights.double()
     bounds = bounds.double()
@@ -253,12 +275,13 @@ def estimate_failure_rate(
         return float(log_factors.sum(dim=1).logsumexp(dim=0)) >= log_limit
 
     total = float(lower_x.sum())
+    # number of equally weighted failures that are worth as much (Kish 1965)
     effective = total**2 / float(lower_x.square().sum()) if total else 0.0
     estimate = None
     if effective >= MIN_EFFECTIVE_FAILURES and not bool(unknown.any()):
         # the mean of weighted samples may exceed 1 by chance, a rate can't
         estimate = min(1.0, total / len(lower_x))
-    # the interval is from where p is no longer too low to where it begins to be too high
+    # `find_threshold` returns where a condition on p in [0, 1] begins to hold.
     lower = find_threshold(lambda p: not is_too_low(p))
     upper = find_threshold(is_too_high)
     return FailureRate(estimate, (lower, upper), effective, draws=len(lower_x))
@@ -310,18 +333,20 @@ def select_diverse(
     is_discrete: Tensor,
     limit: int = MAX_FAILURES,
 ) -> list[int]:
-    """Return the indices of points that differ most, the worst first.
+    """Return the indices of points that differ most from each other, the worst first.
 
-    After the worst, each is the point whose distance from the nearest one before it is
-    largest; of equally far points the worse goes first. This is the greedy choice of k
-    centers, whose largest distance is at most twice the smallest possible (Gonzalez
-    1985, "Clustering to minimize the maximum intercluster distance").
+    The first is the point with the largest objective. Each next one is the point that
+    is farthest from its nearest selected point; of equally far ones, the one with the
+    larger objective. This is the greedy choice of k centers (Gonzalez 1985, "Clustering
+    to minimize the maximum intercluster distance"): the largest distance of any point
+    from a center is at most twice the smallest possible.
 
     Args:
-        points: (n, k), in fractions of each range.
-        objectives: objectives of the points; the larger the worse.
-        is_periodic: (k,) bool, ranges whose bounds are the same value.
-        is_discrete: (k,) bool, discrete choices: different options lie 1 apart.
+        points: (n, k), each value a fraction of its range.
+        objectives: objectives of the points; the larger, the worse for the model.
+        is_periodic: (k,) bool, whether 0 and 1 are the same value, as for an angle.
+        is_discrete: (k,) bool, whether it is a discrete choice; different options have
+            the distance 1.
         limit: maximum number of indices.
     """
     # the worst first: `argmax` below returns the first of equally far points
@@ -334,11 +359,12 @@ def select_diverse(
         farthest = int(nearest_distance.argmax())
         selected.append(farthest)
         difference = (points - points[farthest]).abs()  # (n, k)
-        wrapped_difference = torch.minimum(difference, 1.0 - difference)  # the shorter
+        # around a circle of length 1, the shorter of both directions
+        wrapped_difference = torch.minimum(difference, 1.0 - difference)
         difference = torch.where(is_periodic, wrapped_difference, difference)
         difference = torch.where(is_discrete, (difference > 0.0).double(), difference)
         nearest_distance = torch.minimum(nearest_distance, difference.norm(dim=1))
-        nearest_distance[selected] = -1.0  # never again
+        nearest_distance[selected] = -1.0  # below every distance: never selected again
     return [order[rank] for rank in selected]
 
 
@@ -403,12 +429,16 @@ class Bracket:
 
 
 def scale_domain(domain: Domain, scale: float) -> Domain:
-    """Return the domain with every budget multiplied by `scale`, in (0, 1].
+    """Return the domain with every budget multiplied by a factor.
+
+    Args:
+        domain: domain whose blocks are all norm balls, with an epsilon.
+        scale: factor of every epsilon, in (0, 1].
 
     Raises:
-        InputError: a block has no budget.
+        InputError: a block has a range and no epsilon.
     """
-    # a block is called by its parameter, "pose.yaw" of the control "pose"
+    # "pose.yaw", the name of a block, belongs to the control "pose"
     controls_without_budget = [
         block.name.partition(".")[0] for block in domain.blocks if block.epsilon is None
     ]
@@ -438,33 +468,37 @@ def find_smallest_change(
 ) -> Bracket:
     """Bracket the smallest change with which a configuration passes its trials.
 
-    The change is measured as a scale of the domain's budgets: 1 is all of them.
+    A configuration passes if the model fails in enough of its trials. The change is
+    measured as a scale of the domain's budgets: 1 means the full budgets.
 
-    1. A search in the whole budget. If what it finds fails the trials, there is nothing
-    to shrink.
-    2. The configuration is moved towards the start, by bisection in the logarithm of
-       its length, to the shortest that passes: a handful of trials, no search.
-    3. A search at half the scale reached, then at the geometric mean of the bracket's
-       ends; each configuration that passes is shortened as in 2, each that fails raises
-       the lower end; until the bracket is closed, or after `MAX_SEARCHES`.
+    1. Search in the full budgets. If the result does not pass, there is nothing to
+       shrink.
+    2. Move the configuration towards the start (the clean configuration), by bisection
+       of the logarithm of its length, to the shortest that passes. This takes a few
+       trials and no search.
+    3. Search again at half the scale reached so far; later at the geometric mean of the
+       bracket's bounds. A configuration that passes is shortened as in 2. One that does
+       not pass raises the lower bound. This ends when the bracket is closed, or after
+       `MAX_SEARCHES`.
 
-    For a linear model and a gradient policy the first search points the right way and 2
-    ends within its own step of the optimum, so that the result is within `RATIO` of the
-    closed form.
+    For a linear model and a gradient policy, the first search finds the right direction
+    and step 2 the right length, so that the result is within `RATIO` of the closed
+    form.
 
     Args:
-        search: finds the best configuration of a domain.
-        passes: runs the trials of a configuration.
+        search: returns the best configuration (d,) that it finds in a domain.
+        passes: runs the trials of a configuration; returns whether it passes.
         domain: domain with the full budgets.
-        likely: guesses where the bisection of 2 begins, which then goes on in growing
-            steps; None to bisect from the full length.
+        likely: predicts cheaply whether a configuration would pass. The bisection of
+            step 2 begins where this says, and goes on in growing steps. None to bisect
+            from the full length.
 
     Returns:
-        The bracket. It is not `is_closed` if the searches did not suffice; if nothing
-        passed in the full budget, its `low` is 1 and its `u` None.
+        The bracket. It is not `is_closed` if the searches did not suffice. If nothing
+        passed in the full budgets, its `low` is 1 and its `u` None.
     """
-    full_u = search(domain, 0)
-    # nothing is known to pass yet: `high` is set by the first configuration that does
+    full_u = search(domain, 0)  # the best configuration in the full budgets
+    # Nothing is known to pass yet, so `high` is infinite.
     bracket = Bracket(low=0.0, high=math.inf, u=None, searches=1, checks=1)
     if not passes(full_u, 0):
         return replace(bracket, low=1.0)
@@ -490,8 +524,9 @@ def find_smallest_change(
 def _choose_next_scale(bracket: Bracket) -> float:
     """Return the scale of the budgets at which to search next, inside the bracket.
 
-    It is the geometric mean of both ends; half the upper end if no search has failed
-    yet. Near the end it is the scale that closes the bracket if nothing is found.
+    It is the geometric mean of both bounds, or half the upper one if no search has
+    failed yet. If the bounds are close, it is larger: so large that the bracket is
+    closed if this search finds nothing.
     """
     if bracket.low == 0.0:
         return bracket.high / 2.0
@@ -504,13 +539,19 @@ def _choose_next_scale(bracket: Bracket) -> float:
 def confirm_bracket(
     bracket: Bracket, passes: Passes, domain: Domain, *, times: int = 2
 ) -> Bracket:
-    """Return the bracket with its upper end moved outwards until the configuration
-    there passes `times` times in a row with new seeds.
+    """Enlarge the change at the bracket's upper bound until it passes reliably.
 
-    What lies exactly on the edge passes its trials by chance. If it fails, its change
-    is lengthened by the square root of `RATIO`, about 2.5 %, and it is tried again. The
-    scale never exceeds 1. After `MAX_CONFIRMATIONS` the bracket is returned
-    unconfirmed, with a configuration that was lengthened once more and not tried.
+    A configuration exactly at the limit passes its trials by chance. So it is tried
+    with new seeds. If it does not pass, its change is made longer by the square root of
+    `RATIO`, about 2.5 %, and it is tried again. After `MAX_CONFIRMATIONS` attempts the
+    bracket is returned unconfirmed, with a configuration that was made longer once more
+    and not tried.
+
+    Args:
+        bracket: result of `find_smallest_change`; without a `u` it is returned as is.
+        passes: runs the trials of a configuration; returns whether it passes.
+        domain: domain with the full budgets; the scale never exceeds 1.
+        times: how many times in a row the configuration has to pass.
     """
     if bracket.u is None:
         return bracket
@@ -518,7 +559,7 @@ def confirm_bracket(
     shortest_scale = bracket.high
     growth = 1.0  # factor of the change since the shortest that passed
     for _ in range(MAX_CONFIRMATIONS):
-        # each check has an index of its own, from which the seeds of its trials follow
+        # The seeds of a check's trials follow from its index, so all indices are new.
         check_indices = range(bracket.checks, bracket.checks + times)
         if all(passes(bracket.u, check_index) for check_index in check_indices):
             return replace(bracket, checks=bracket.checks + times, confirmed=True)
@@ -538,21 +579,23 @@ def _shorten(
     domain: Domain,
     likely: Guess | None,
 ) -> Bracket:
-    """Return the bracket with its upper end at the shortest length of a configuration,
-    moved towards the start, that still passes; found by bisection.
+    """Move a configuration towards the start as far as it still passes its trials.
 
-    Lengths are scales of the budgets, bisected in their logarithm until the bounds are
-    within `LENGTH_RATIO` of each other. With `likely`, the first length that is tried
-    is about the shortest that it expects to pass; from there the steps grow, squared
-    each time, but never beyond the middle of the bounds.
+    Lengths are scales of the budgets. They are bisected in their logarithm until the
+    bounds are within `LENGTH_RATIO` of each other. With `likely`, the first length is
+    about the shortest that it predicts to pass; from there the steps grow, squared each
+    time, but never beyond the geometric mean of the bounds.
 
     Args:
-        bracket: so far; its lower end is the lower bound of the length.
-        u: (d,) the configuration that passes.
-        length: its scale.
-        passes: runs the trials of a configuration.
+        bracket: bracket so far; its lower bound is that of the length.
+        u: (d,) a configuration that passes.
+        length: scale of the budgets that u needs.
+        passes: runs the trials of a configuration; returns whether it passes.
         domain: domain with the full budgets.
-        likely: guesses whether a configuration passes, or None.
+        likely: predicts cheaply whether a configuration passes, or None.
+
+    Returns:
+        The bracket with the shortest configuration that passed at its upper bound.
     """
     low = max(bracket.low, SMALLEST_SCALE * length)
     high = length
@@ -560,11 +603,12 @@ def _shorten(
     checks = bracket.checks
 
     def shrink_to(scale: float) -> Tensor:
+        # u has the scale `length`, so that its change is multiplied by this ratio
         return shrink_towards_start(scale_domain(domain, scale), u, scale / length)
 
-    # The next length is the geometric mean of the bounds, but at most this factor away
-    # from the bound that was set last. With a guess it is small at first, and squared
-    # after each trial.
+    # The next length is the geometric mean of the bounds, but differs from the bound
+    # that was set last by at most the factor `max_step`. With a guess the factor is
+    # small at first, and squared after each trial.
     max_step = math.inf
     trial_length = math.sqrt(high * low)
     if likely is not None:
@@ -587,13 +631,14 @@ def _shorten(
 def _guess_shortest(
     likely: Guess, shrink_to: Callable[[float], Tensor], low: float, high: float
 ) -> float:
-    """Return about the shortest length between two bounds that is likely to pass, by
-    bisection of its logarithm.
+    """Return about the shortest length between two bounds that is likely to pass.
+
+    It is found by bisection of its logarithm, without trials.
 
     Args:
-        likely: guesses whether a configuration would pass.
+        likely: predicts whether a configuration would pass.
         shrink_to: returns the configuration (d,) of a length.
-        low, high: bounds, over 0.
+        low, high: bounds of the length, over 0.
     """
     while high > LENGTH_RATIO * low:
         middle = math.sqrt(high * low)

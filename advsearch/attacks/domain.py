@@ -87,8 +87,13 @@ class Block:
             )
 
     def _check_budget(self, where: str) -> None:
-        """Check what depends on the norm: a ball has an epsilon; only a box may be
-        periodic or have a reach.
+        """Raise InputError if epsilon, periodic or reach do not fit the norm.
+
+        A ball ("linf" or "l2") needs an epsilon; only a box may be periodic or have a
+        reach.
+
+        Args:
+            where: " of 'pose.yaw'", say, for messages; empty without a name.
         """
         is_box = self.norm == "box"
         if is_box and self.epsilon is not None:
@@ -117,8 +122,8 @@ class Block:
     def radius(self) -> float:
         """The length of one unit step, in the block's own norm (Euclidean in a box).
 
-        In a ball it is epsilon, at most the diameter of the bounds in that norm. In a
-        box it is the reach, by default half the diagonal.
+        In a ball it is epsilon, but not more than the diameter of the bounds in that
+        norm. In a box it is the reach, by default half the diagonal.
         """
         width = self.high - self.low
         diagonal = width * math.sqrt(self.size)
@@ -209,8 +214,8 @@ class Domain:
     def _compute_bounds(self) -> None:
         """Compute `lower` and `upper`, the bounds (d,) of every element of u.
 
-        Those of an l-infinity ball around the start are cut into them: both together
-        are a box.
+        An l-infinity ball around the start is a box too, so they are the bounds of its
+        intersection with the block's own bounds.
 
         Raises:
             InputError: the start lies outside the bounds of its block.
@@ -288,12 +293,12 @@ class Domain:
     def project(self, u: Tensor) -> Tensor:
         """Return the configuration (d,) of the domain that is nearest to u (d,).
 
-        Nearest is meant block by block, by the Euclidean distance; periodic blocks wrap
-        instead. Both are float32 and finite. A u inside the domain comes back bit for
-        bit.
+        The distance is Euclidean, in each block by itself; periodic blocks wrap around
+        instead. Both tensors are float32 and finite. If u is inside the domain, the
+        result is equal to it, bit for bit.
 
-        An l-infinity ball cut by bounds is itself a box, so clipping is exact. For an
-        l2 ball see `project_l2_box`.
+        An l-infinity ball cut by bounds is itself a box, so clipping is exact. An l2
+        ball cut by bounds needs more (`project_l2_box`).
         """
         u = u.detach()
         projected = torch.clamp(u, self.lower, self.upper)
@@ -308,7 +313,7 @@ class Domain:
                 )
                 # rounding of the sum may leave the bounds
                 wrapped.clamp_(block.low, block.high)
-                # what clipping leaves alone is inside, and stays as it is
+                # Elements that clipping has not changed are inside and are not wrapped.
                 projected[part] = torch.where(
                     u[part] == projected[part], projected[part], wrapped
                 )
@@ -317,10 +322,10 @@ class Domain:
     def violation(self, u: Tensor) -> float:
         """Return how far u (d,) lies outside of the domain.
 
-        It is 0 inside, and infinity where u has NaN or infinite elements. Otherwise it
-        is the largest of the distances past a bound and of the excesses of l2 norms. An
-        excess is by how much a norm is beyond its radius and what rounding may add,
-        divided by the radius if that is over 1.
+        It is 0 inside, and infinity if u has NaN or infinite elements. Otherwise it is
+        the largest distance of an element past its bound, or the largest excess of an
+        l2 norm. The excess is the norm minus the radius and minus what rounding may add
+        to a norm; it is relative to the radius if that is over 1.
         """
         excess = float(torch.maximum(self.lower - u, u - self.upper).amax())
         for block, part in self.list_block_slices():
@@ -338,17 +343,20 @@ class Domain:
     def sample(
         self, generator: torch.Generator, n: int = 1, *, extreme: bool = False
     ) -> Tensor:
-        """Draw configurations (n, d) float32 at random within the budget; the generator
-        advances.
+        """Draw configurations (n, d) float32 at random within the budget.
 
-        - "linf" and "box": uniform in the box that the bounds (and the ball) leave; of
-          a discrete choice, the centre of a random option.
+        - "linf" and "box": uniform in the box, or its intersection with the ball. A
+          discrete choice gets the center of a random option.
         - "l2": uniform in the ball, then projected onto the bounds; not uniform where
-        the bounds cut the ball.
-        - with `extreme`, a norm ball is sampled where random search is strongest: an
-          l-infinity ball at random corners, an l2 ball at its surface in a direction of
-          random signs. A "box" has no such place (the corners of a range of poses are
-          no worse than its middle) and is sampled as before.
+          the bounds cut the ball.
+
+        Args:
+            generator: source of randomness; it advances.
+            n: number of configurations.
+            extreme: whether to sample norm balls where a model fails most often: an
+                l-infinity ball at random corners, an l2 ball at its surface in a
+                direction of random signs. A "box" is sampled as before: the corners of
+                a range of poses, say, are no worse than its middle.
         """
         samples = []
         for _ in range(n):
@@ -361,9 +369,13 @@ class Domain:
     def _sample_block(
         self, block: Block, part: slice, generator: torch.Generator, *, extreme: bool
     ) -> Tensor:
-        """Return a random value (size,) of a block, a slice of u; see `sample`.
+        """Return a random value (size,) of a block, not yet projected.
 
-        It may lie outside of an l2 ball, or outside of the bounds around one.
+        Args:
+            block: the block.
+            part: slice of u that it has.
+            generator: source of randomness; it advances.
+            extreme: whether a norm ball is sampled at its corners or surface.
         """
         noise = torch.rand(block.size, generator=generator)
         if block.options:
@@ -382,18 +394,21 @@ class Domain:
         )
 
     def steepest(self, u: Tensor, gradient: Tensor) -> Tensor:
-        """Return one unit step (d,) from u uphill, by the gradient (d,), finite.
+        """Return the unit step (d,) from u that increases a linear objective most.
 
-        Of all displacements whose length, in the norm of each block, is the radius of
-        the block, it is the one that increases a linear objective most. Add a multiple
-        of it to u and project. All are float32.
+        In each block, its length is the radius of the block, in the block's norm. To
+        make a step, add a multiple of it to u and project.
 
         - "linf": radius * sign(gradient);
         - "l2": radius * gradient / ||gradient||;
-        - "box": the same, without the elements that point out of a bound at which u
-          already lies (the free part of the gradient, as in projected-gradient methods
-          for bounds), so that they do not use up the step;
-        - a discrete choice, and a block whose gradient is zero: nothing.
+        - "box": the same as "l2", but elements of u at a bound that the gradient would
+          push past it get no step, so that they do not use up its length (as in
+          projected-gradient methods for bounds);
+        - a discrete choice, and a block whose gradient is zero: a step of zero.
+
+        Args:
+            u: (d,) float32, configuration of the domain.
+            gradient: (d,) float32, gradient of the objective at u, finite.
         """
         step = torch.empty_like(gradient)
         for block, part in self.list_block_slices():
@@ -409,8 +424,8 @@ class Domain:
                 points_out_above = (u[part] >= block.high) & (slope > 0)
                 points_out_below = (u[part] <= block.low) & (slope < 0)
                 slope = slope.masked_fill(points_out_above | points_out_below, 0.0)
-            # Divided by the largest element first, so that its square is no overflow;
-            # then the norm is at least 1, unless the slope is zero.
+            # Divide by the largest element first, so that squares do not overflow. Then
+            # the norm is at least 1, unless the slope is zero.
             slope = slope / slope.abs().amax().clamp_min(torch.finfo(slope.dtype).tiny)
             norm = max(float(torch.linalg.vector_norm(slope)), 1.0)
             step[part] = slope * (block.radius / norm)
@@ -422,8 +437,14 @@ def _sample_ball(
 ) -> Tensor:
     """Draw a point (size,), uniform in an l2 ball around 0 (Muller 1959).
 
-    Its distance from 0 is the radius times `uniform` to the power 1 / size, if
-    `uniform` is a uniform random number in [0, 1).
+    The direction is that of a normal vector. The distance from 0 is radius *
+    uniform**(1 / size), because the volume grows with distance**size.
+
+    Args:
+        size: number of dimensions.
+        radius: radius of the ball.
+        uniform: a uniform random number in [0, 1), which decides the distance.
+        generator: source of randomness for the direction; it advances.
     """
     direction = torch.randn(size, generator=generator)
     distance = radius * math.pow(uniform, 1.0 / size)
@@ -449,33 +470,38 @@ _MAX_ITERATIONS = 100
 def project_l2_box(
     u: Tensor, center: Tensor, radius: float, low: float = 0.0, high: float = 1.0
 ) -> Tensor:
-    """Project onto the intersection of an l2 ball and a box.
+    """Project a point onto the intersection of an l2 ball and a box.
 
-    The result is the nearest point, argmin_p ||p - u|| subject to ||p - centre|| <=
-    radius and low <= p <= high. Clipping and then rescaling does not give that point,
-    and for a box that cuts deep it is far from it.
+    The result is the nearest point, argmin_p ||p - u|| subject to ||p - center|| <=
+    radius and low <= p <= high. Clipping and then rescaling does not give this point,
+    and is far from it where the box cuts off much of the ball.
 
-    The optimality conditions give p(t) = clip(centre + t (u - centre), low, high) with
-    one multiplier t in (0, 1], t = 1 if p(1) lies in the ball. Otherwise t solves
-    ||p(t) - centre|| = radius. In s = t^2 the squared norm is
+    The optimality conditions give p(t) = clip(center + t (u - center), low, high) with
+    one multiplier t in (0, 1]. If p(1) lies in the ball, t is 1. Otherwise t solves
+    ||p(t) - center|| = radius. With s = t^2 the squared norm is
 
-        g(s) = sum_i min(s v_i^2, room_i^2),   v = u - centre,
+        g(s) = sum_i min(s v_i^2, room_i^2),   v = u - center,
 
-    room_i being the distance to the bound that v_i points at. It is concave,
-    increasing and piecewise linear, so Newton's method from the left never overshoots
-    and stops at the exact root after finitely many steps (two to six in practice). It
-    is the scheme known from continuous quadratic knapsack problems (Cominetti,
-    Mascarenhas, Silva 2014, "A Newton's method for the continuous quadratic knapsack
-    problem").
+    where room_i is the distance from the center to the bound in the direction of v_i.
+    g is concave, increasing and piecewise linear. So Newton's method from the left
+    never overshoots, and reaches the exact root after finitely many steps, two to six
+    in practice (Cominetti, Mascarenhas, Silva 2014, "A Newton's method for the
+    continuous quadratic knapsack problem").
 
-    u is (d,) float32, finite, and so is the centre, inside the bounds; the radius is
-    over 0. The result is rounded towards the centre, so that rounding errors never put
-    it outside of the ball. Points inside come back bit for bit; projecting again
-    changes at most the last bits.
+    Args:
+        u: (d,) float32, finite, the point to project.
+        center: (d,) float32, center of the ball, inside the bounds.
+        radius: radius of the ball, over 0.
+        low, high: bounds of every element.
+
+    Returns:
+        (d,), rounded towards the center, so that rounding never puts it outside of the
+        ball. A point inside is returned bit for bit; projecting a result again changes
+        at most the last bits.
     """
-    # v_i^2 and room_i^2 in chunks, and their sums. room_i is found by clipping u_i,
-    # which gives |v_i| where u_i is within the bounds. That is less than the room, but
-    # does as well: for s up to 1, min(s v_i^2, v_i^2) = s v_i^2.
+    # v_i^2 and room_i^2 in chunks, and their sums. room_i is computed by clipping u_i,
+    # which gives |v_i| if u_i is within the bounds. That is less than the room, but
+    # makes no difference: for s up to 1, min(s v_i^2, v_i^2) = s v_i^2.
     squares = []
     rooms = []
     squared_distance = 0.0
@@ -490,8 +516,8 @@ def project_l2_box(
     # p(1), u clipped to the box, is the solution if it lies in the ball
     if squared_distance_in_box <= (radius * (1.0 + ROUNDING_SLACK)) ** 2:
         return u.clamp(low, high)
-    # Without the box s would be this; with it, g is smaller there, so that the solution
-    # is at least as large, as Newton's method needs it.
+    # Without the box this would be the solution. The box makes g smaller, so that the
+    # solution is at least as large: Newton's method begins on its left.
     initial_s = radius**2 / squared_distance
     s = _solve_multiplier(squares, rooms, radius, initial_s)
     return _move_towards(center, u, math.sqrt(s), low, high)
@@ -502,8 +528,9 @@ def _solve_multiplier(
 ) -> float:
     """Return s with g(s) = sum_i min(s v_i^2, room_i^2) = radius^2, by Newton's method.
 
-    `project_l2_box` has the derivation. g is piecewise linear, so that the method ends
-    at the exact root once it is on the right piece.
+    v_i^2 is the squared distance of element i from the center of a ball, and room_i^2
+    the largest that its bounds allow (derivation in `project_l2_box`). g is piecewise
+    linear, so that the method ends at the exact root once it is on the right piece.
 
     Args:
         squares: v_i^2 in chunks.
@@ -533,7 +560,13 @@ def _move_towards(
     """Return clip(center + t (u - center), low, high), rounded towards the center.
 
     An element that float32 rounded away from the center is moved back by one unit in
-    the last place, so that no norm exceeds the radius.
+    the last place, so that the distance from the center is never too large.
+
+    Args:
+        center: (d,) center of the ball, inside the bounds.
+        u: (d,) the point outside.
+        t: fraction of the distance from the center to u.
+        low, high: bounds of every element.
     """
     moved = torch.empty_like(u)
     for out, u_chunk, center_chunk in zip(
@@ -572,14 +605,15 @@ class Distribution:
 
 
 def compute_half_widths(domain: Domain) -> Tensor:
-    """Return (d,) float32, over 0: how far each element may go from the start if all
-    others of its block go equally far.
+    """Return how far each element of u may change if all of its block change equally.
 
-    - "box": half of the bounds' distance, or the block's reach over the square root of
-    its size if that is given;
-    - "linf": half of what bounds and ball leave;
-    - "l2": epsilon over the square root of the block's size, at most half of the
-    bounds' distance.
+    - "box": half the width of the bounds; if the block has a reach, at most reach /
+      sqrt(size);
+    - "linf": half the width of the intersection of bounds and ball;
+    - "l2": epsilon / sqrt(size), at most half the width of the bounds.
+
+    Returns:
+        (d,) float32, over 0.
     """
     half_widths = (domain.upper - domain.lower) / 2.0
     for block, part in domain.list_block_slices():
@@ -678,8 +712,14 @@ class SampleSequence:
         self._n_sampled = 0
 
     def points(self, first: int, count: int) -> Float64Array:
-        """Return the draws with the numbers from `first` on: (count, dimensions)
-        float64 in [0, 1).
+        """Return the points with the numbers from `first` on.
+
+        Args:
+            first: number of the first point, at least 0.
+            count: number of points.
+
+        Returns:
+            (count, dimensions) float64 in [0, 1).
         """
         if not self.dimensions or count < 1:
             return np.empty((max(0, count), self.dimensions))
@@ -708,10 +748,11 @@ class SampleSequence:
     def _sample_sobol(self, block_index: int) -> Float64Array:
         """Return a block of points of a scrambled Sobol net, (rows, dimensions).
 
-        The engine goes on from where it is if that is in the same net, before this
-        block; otherwise it begins again. Points before the block are skipped.
+        SciPy's engine generates the points of a net in order. It continues if it has
+        not reached this block yet; otherwise a new one begins. Points before the block
+        are skipped.
         """
-        # takes a quarter of a second, and few runs draw from nets
+        # imported here, as it takes a quarter of a second and few runs need it
         from scipy.stats import qmc
 
         net_index, first_row = divmod(block_index * self._rows, NET)
@@ -793,10 +834,10 @@ class ProductIndex:
 
 
 def split_into_batches(first: int, count: int, size: int) -> Iterator[range]:
-    """Yield the numbers from `first` up to `count`, exclusive, in batches of `size`.
+    """Yield the numbers from `first` up to `count`, exclusive, in batches.
 
-    Batches begin at multiples of `size`, as if the first number were 0; so the first
-    batch may be the rest of one, and the last may be shorter.
+    Batches begin at multiples of `size`, so that a resumed run has the same batches as
+    one that began at 0. The first batch and the last may be shorter.
     """
     while first < count:
         last = min(count, (first // size + 1) * size)

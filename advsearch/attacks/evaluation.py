@@ -65,9 +65,9 @@ class Query:
     # "free" only ever comes where the domain has `partial_gradients`
     gradient: WhichGradient = False
     samples: int = 1
-    """Of a search: how many times its own samples per pixel to render with, at least 1.
-    The evaluation costs as many times its renders: samples * (1 + gradient_cost) with a
-    gradient, samples without.
+    """Multiple of the search's samples per pixel to render with, at least 1. The
+    evaluation costs samples * (1 + gradient_cost) renders with a gradient, and samples
+    without.
     """
     spp: int = 1  # samples per pixel of a trial
     # of a trial: whether conditions are drawn; else the scene has those that it comes
@@ -138,7 +138,8 @@ class Evaluation:
     def required_judgement(self) -> Judgement:
         """The judgement of the task.
 
-        Raises RuntimeError if there is none: the query was for an image or for light.
+        Raises:
+            RuntimeError: there is none, as the query was for an image or for light.
         """
         if self.judgement is None:
             raise RuntimeError("this evaluation has no judgement")
@@ -168,8 +169,9 @@ class Evaluation:
         )
 
     def _sanitize_gradient(self) -> Evaluation:
-        """Return the evaluation with zeros for gradient elements that are NaN or
-        infinite, which are added to `non_finite`.
+        """Return the evaluation with zeros in place of NaN or infinite gradients.
+
+        The number of elements that were replaced is added to `non_finite`.
         """
         gradient = self.gradient
         if gradient is None:
@@ -206,9 +208,9 @@ class Proposal:
             domain has `partial_gradients`). A wish: the end of a budget gets none.
         step_size: the step that led here in units of each block's radius, for the log;
             NaN where there is none.
-        samples: render with so many times the search's samples per pixel, at least 1,
-            for as many times the renders. A wish too: the end of a budget gets what is
-            left.
+        samples: multiple of the search's samples per pixel to render with, at least 1.
+            It costs as many times the renders. At the end of a budget it is reduced to
+            the renders that are left.
     """
 
     u: Tensor
@@ -222,10 +224,14 @@ class Proposal:
         return self.samples * (1 + gradient_cost)
 
     def limit_cost(self, domain: Domain, renders_left: int) -> Proposal:
-        """Return the proposal as far as `renders_left` renders, at least 1, allow it.
+        """Return the proposal, reduced so that the remaining renders suffice for it.
 
-        It has no more samples than these, and no gradient that would leave no render to
-        use it.
+        Its `samples` (each costs a render) become `renders_left` at most. Its gradient
+        is dropped if no render would be left after it, to use the gradient for.
+
+        Args:
+            domain: states how many renders a gradient costs.
+            renders_left: number of renders that the budget has left, at least 1.
         """
         proposal = self
         if self.samples > renders_left:
@@ -281,8 +287,12 @@ class Policy(ABC, Generic[State]):
     handles_choices: ClassVar[bool] = False
 
     def __init_subclass__(cls, **more: Any) -> None:
-        """Refuse the old name of a method, and give a user's class copies of what it is
-        passed.
+        """Prepare a subclass: reject a renamed method, and pass copies to its methods.
+
+        A user's policy may write into its arguments, which the search still needs.
+
+        Raises:
+            InputError: the class defines `answer`, the old name of `distribution`.
         """
         super().__init_subclass__(**more)
         if "answer" in vars(cls):
@@ -318,15 +328,15 @@ class Policy(ABC, Generic[State]):
         """Return the next configurations, and the state until `update`.
 
         Args:
-            state: after the latest `update`, or as `start` returned it.
-            n: how many can be evaluated before the next `update`, at least 1.
+            state: state after the latest `update`, or as `start` returned it.
+            n: largest number of proposals, at least 1.
 
         Returns:
-            Up to n that do not wait for each other's evaluations: a sample of a
-            population is one of many, a step along a gradient is alone. None at all if
-            there is nothing more to propose (a grid that is done, a flat objective).
-            Asked with another n, a policy proposes the same configurations in the same
-            order, provided that `update` is told of all of them.
+            At most n proposals that do not depend on each other's evaluations: many
+            samples of a population, but a single step along a gradient. An empty tuple
+            means that there is nothing more to propose, because a grid is complete or
+            the objective is flat. With another n, a policy must propose the same
+            configurations in the same order, if all of them are passed to `update`.
         """
 
     @abstractmethod

@@ -63,13 +63,13 @@ def targeted_margin(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
 
 
 def log_odds(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
-    """Return the log-odds of a wrong prediction, (N,): like cross-entropy all classes
-    count, and the gradient never fades.
+    """Return the log-odds of a wrong prediction, (N,).
 
-    log((1 - p) / p) with p the total probability of Y, as logsumexp over j not in Y
-    minus logsumexp over Y. A growing function of `cross_entropy`, so the two rank
-    configurations alike; between it and `margin` lies at most the logarithm of the
-    number of classes.
+    It is log((1 - p) / p), with p the total probability of the right labels Y, computed
+    as logsumexp over j not in Y minus logsumexp over Y. All classes count, as in
+    cross-entropy, but the gradient does not vanish where the model is sure. It
+    increases with `cross_entropy`, so the two rank configurations alike. It differs
+    from `margin` by at most the logarithm of the number of classes.
     """
     return _compute_log_odds(logits, ~make_class_mask(logits, labels))
 
@@ -82,12 +82,12 @@ def targeted_log_odds(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
 def cross_entropy(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
     """Return minus the logarithm of the probability of the right labels, (N,) in nats.
 
-    -log p = softplus(l) with l the `log_odds`: that form neither overflows for logits
-    of thousands nor cancels where p is near 1. Its slope in l is 1 - p and would be
-    lost where the model is sure. So below l = `MAX_LOG_ODDS`, where the value is 3e-7,
-    it is continued by its tangent: the slope stays 3e-7, and values get slightly under
-    0. That is enough for policies that normalise their steps; `log_odds` has slope 1
-    everywhere.
+    It is computed as -log p = softplus(l), with l the `log_odds`. This form does not
+    overflow for logits of thousands and keeps its digits where p is near 1. Its slope
+    in l is 1 - p, which rounds to 0 where the model is sure. So below l =
+    `MAX_LOG_ODDS`, where the value is 3e-7, it is continued by its tangent: the slope
+    stays 3e-7, and values get slightly under 0. That is enough for policies that
+    normalise their steps; `log_odds` has slope 1 everywhere.
     """
     return _softplus(log_odds(logits, images, labels))
 
@@ -100,30 +100,29 @@ def targeted_cross_entropy(logits: Tensor, images: Tensor, target: Labels) -> Te
 
 
 def dlr(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
-    """Return the difference of logits ratio, (N,): `margin` over a distance between
-    logits, so that scale and offset of the logits cancel.
+    """Return the difference of logits ratio, (N,), of Croce and Hein 2020.
 
-    Let s be the largest right logit, w the largest wrong one, and p_1 >= p_2 >= ... the
-    sorted list of s and all wrong logits. The value is
+    It is `margin` divided by a distance between logits, so that scale and offset of the
+    logits cancel. Let s be the largest right logit, w the largest wrong one, and p_1 >=
+    p_2 >= ... the sorted list of s and all wrong logits. The value is
 
         (w - s) / (p_1 - p_3)                 where the model is right (w <= s): from -1 to 0;
         (w - s) / (p_1 - (p_3 + p_4) / 2)     where it is wrong: over 0.
 
-    The first line is the ratio of Croce and Hein 2020 (Auto-PGD), section 4, and the
-    denominator of the second is that of their targeted form: with the first one the
-    value would be 1, without a gradient, wherever s comes third, and a search goes on
-    after its first success. We depart from them in three more things:
+    The first line is the ratio of Croce and Hein 2020 (Auto-PGD), section 4. The second
+    has the denominator of their targeted form, because a search goes on after its first
+    success: with the first denominator the value would be 1, without a gradient,
+    wherever s comes third. Three more things differ from theirs:
 
-    - Of several right labels only the largest takes part, or three of them at the top
-      would divide by zero.
-    - Where there is no fourth logit, p_2 stands in for it.
+    - Of several right labels only the one with the largest logit is in the list:
+      otherwise three of them at the top would give a denominator of zero.
+    - If there is no fourth logit, p_2 replaces p_4.
     - `RELIEF` times the distance from the largest to the smallest logit is added to a
-      denominator, so that ties leave it finite and the value within 1 / `RELIEF`; where
-      all logits are the same, it is 1.
+      denominator, so that it is never zero and the value never exceeds 1 / `RELIEF`. If
+      all logits are the same, the denominator is 1.
 
-    Without scale there is no way to say *how far* beyond the others a logit lies. So
-    the value is no measure of confidence: with p_2 = p_3 behind a right prediction it
-    is -1, however sure the model is.
+    The value does not measure confidence, as the scale cancels: if p_2 = p_3 behind a
+    right prediction, it is -1, however sure the model is.
 
     Raises:
         InputError: fewer than two wrong classes. Of two numbers only the order is left
@@ -168,12 +167,13 @@ def _softplus(x: Tensor) -> Tensor:
 
 
 def _sort_logits(logits: Tensor, group: Tensor, setting: str) -> tuple[Tensor, Tensor]:
-    """Return the largest logits, if the classes of a group count as a single one.
+    """Return the largest logits, where a group of classes counts as a single class.
 
     Args:
         logits: (N, C).
-        group: (C,) bool; the logit of the group is the largest of its classes.
-        setting: the group's, for messages.
+        group: (C,) bool, classes of the group; its logit is the largest of theirs.
+        setting: name of the setting that gave the group, "label" or "target", for
+            messages.
 
     Returns:
         The 4 largest logits in descending order, (N, 4), or (N, 3) if there are only 3;
@@ -221,35 +221,33 @@ ReadFeatures = Callable[[Tensor], Tensor]
 def feature_distance(
     features: ReadFeatures, clean: Tensor
 ) -> Callable[[Tensor, Tensor, tuple[int, ...]], Tensor]:
-    """Return the objective of the distance of an image's features from those of the
-    clean image, as a multiple of the length of the latter.
+    """Make the objective of how far an image's features are from the clean image's.
 
-    With f0 the features of the clean picture, e = (f - f0) / |f0|, r a fixed unit
-    vector and h = `NEARBY`,
+    The distance is a multiple of the length of the clean features. With f0 the clean
+    features, e = (f - f0) / |f0|, r a fixed unit vector and h = `NEARBY`, the value is
 
-        sqrt(|e + h r|^2 + h^2) - sqrt(2) h,
+        sqrt(|e + h r|^2 + h^2) - sqrt(2) h.
 
-    which is |e| to within 3 h, exactly 0 at e = 0, and has a finite gradient
-    everywhere. The plain |e| has none at the clean picture, where every search starts,
-    and |e|^2 and a smoothed |e| have their minimum there: a gradient of zero, which a
-    search without noise would never leave. Hence r: at the clean picture the gradient
-    is r / (sqrt(2) |f0|), at the full strength of a distance, and beyond a few h it is
-    that of |e|. The direction of r (drawn once, from a fixed seed) does not matter:
-    every direction leads away, and after the first step the distance itself shows which
-    leads away fastest. With a noisy renderer the noise does the same.
+    This differs from |e| by at most 3 h, is exactly 0 at e = 0, and has a finite
+    gradient everywhere. Every search starts at the clean image, where |e| has no
+    gradient, and |e|^2 or a smoothed |e| has a gradient of zero, so that a search
+    without noise would never move. With r the gradient there is r / (sqrt(2) |f0|), as
+    strong as that of a distance; beyond a few h it is that of |e|. The direction of r
+    (from a fixed seed) does not matter: every direction leads away, and after the first
+    step the distance itself shows which leads away fastest.
 
-    The idea is that of Sabour et al. 2016, who lead a picture's features to those of
-    another one; here they lead away.
+    The idea is that of Sabour et al. 2016, who move the features of an image towards
+    those of another one; here they move away.
 
-    It looks at no label: it needs no right label, leads to no class in particular, and
-    what counts as success is checked by the prediction as ever. Where f0 is zero its
-    length counts as 1.
+    No label is used: the objective leads to no class in particular, and success is
+    decided by the prediction, as with all objectives. If f0 is zero, its length counts
+    as 1.
 
     Args:
-        features: differentiable; called once here, and once more per evaluation.
+        features: differentiable function from images to features (N, F).
         clean: (H, W, 3) or (N, H, W, 3): the clean image, or several renders of it,
-            whose features are averaged. Take as little noise as you can afford: noise
-            of the search's own renders is a distance as well.
+            whose features are averaged. It should have little noise, as the noise of
+            the renders adds to the distance.
 
     Returns:
         An objective (logits, images, labels) -> (N,), at least 0 but for h, that looks
@@ -276,20 +274,23 @@ def feature_distance(
 def cosine_distance(
     features: ReadFeatures, clean: Tensor
 ) -> Callable[[Tensor, Tensor, tuple[int, ...]], Tensor]:
-    """Return the objective of one minus the cosine of an image's features and those of
-    the clean image: from 0 where they are the same to 2.
+    """Make the objective of one minus the cosine with the clean image's features.
 
-    That is |e|^2 / 2 for e the difference of both at length 1. Its gradient is zero at
-    the clean picture, where every search starts, so `h` e . r is added, with r and `h`
-    as in `feature_distance`: at the clean picture the gradient leads along r, and
-    beyond a few `h` it is that of the distance.
+    It is 0 for equal directions and 2 for opposite ones. With both features scaled to
+    length 1 and e their difference, it is |e|^2 / 2. Its gradient is zero at the clean
+    image, where every search starts. So h e . r is added, with a fixed unit vector r
+    and h = `NEARBY`: at the clean image the gradient points along r, and beyond a few h
+    it is that of the distance.
 
     Args:
-        features: features of the clean picture; called once, here.
-        clean: as for `feature_distance`.
+        features: function from images to features (N, F); called once, for the clean
+            image.
+        clean: (H, W, 3) or (N, H, W, 3): the clean image, or several renders of it,
+            whose features are averaged.
 
-    Returns: An objective (features (N, F), images, labels) -> (N,), at least 0 but for
-        `h`^2, that looks at the features only.
+    Returns:
+        An objective (features (N, F), images, labels) -> (N,) that uses the features
+        only; at least -h^2 / 2.
     """
     reference = functional.normalize(_compute_reference(features, clean), dim=0)
     start_direction = _make_start_direction(reference)

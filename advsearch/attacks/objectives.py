@@ -94,21 +94,24 @@ class ObjectiveSignature:
 
 
 def read_signature(function: Callable[..., Any]) -> ObjectiveSignature:
-    """Return which arguments an objective takes: (output, images, truth) or (output,
-    labels), and by name any of `REQUESTABLE_INPUTS`.
+    """Return which arguments an objective takes, by the names of its parameters.
 
-    The first two parameters request nothing, whatever their names are.
+    It is called with (output, images, truth) or (output, labels). Further parameters
+    named like one of `REQUESTABLE_INPUTS`, e.g. "texture", request that input. The
+    first two parameters request nothing, whatever their names are.
+
+    Args:
+        function: a user's function, or a torch module, whose `forward` is read.
 
     Raises:
-        InputError: a class, a function that takes images first, or one that does not
-            take these arguments.
+        InputError: it is a class, takes images first, or takes other arguments.
     """
     if isinstance(function, type):
         raise InputError(
             "objective: expected a name or a function (output, images, "
             f"truth), got {describe_value(function)}"
         )
-    # a module is called through its `forward`
+    # The `__call__` of a module takes (*args, **kwargs), which says nothing.
     callee = function.forward if isinstance(function, nn.Module) else function
     try:
         signature = inspect.signature(callee)
@@ -157,19 +160,27 @@ def _list_positional(signature: inspect.Signature) -> list[str]:
 def _check_arguments(
     signature: inspect.Signature, takes_images: bool, requested_inputs: Iterable[str]
 ) -> None:
-    """Raise TypeError if a function can't be called with (output, images, truth), or
-    (output, labels), and the inputs that it requests by name.
+    """Raise TypeError if a function can't be called as an objective is.
+
+    Args:
+        signature: signature of the function.
+        takes_images: whether it is called with (output, images, truth), otherwise with
+            (output, labels).
+        requested_inputs: names of the inputs that are passed by keyword as well.
     """
     n_positional = 3 if takes_images else 2
     signature.bind(*([None] * n_positional), **dict.fromkeys(requested_inputs))
 
 
 def _has_image_parameter(names: Sequence[str]) -> bool:
-    """Return whether the positional parameters of a function are meant as (output,
-    images, truth), by their names; otherwise they are (output, truth).
+    """Return whether a function takes (output, images, truth), not (output, truth).
 
-    A third parameter means the former, unless the second is called like the truth, as
-    in a loss whose third parameter is an option.
+    This is decided by its positional parameters. With three or more it takes images,
+    unless the second is named like the truth, e.g. "target": then it is a loss whose
+    third parameter is an option.
+
+    Args:
+        names: names of its positional parameters, in order.
     """
     if len(names) < 2:  # neither; the caller rejects it whatever is returned
         return True
@@ -184,15 +195,19 @@ def _has_image_parameter(names: Sequence[str]) -> bool:
 def wrap_objective(function: Callable[..., Tensor]) -> Objective:
     """Wrap a user's function as an objective whose mistakes are explained.
 
-    The function returns (N,), or a scalar; if it returns a scalar for several images,
-    it is called with one image at a time. A label set of a single class is passed as
-    (N,) int64, as torch's losses take it. All arguments are copies, which it may write
-    into. What it raises itself passes through, but for torch losses that are passed
-    several labels. NaN values pass too: a search has a rule for them.
+    The function gets copies of its arguments, which it may write into. A label set of a
+    single class is passed as (N,) int64, as torch's losses take it. Errors that the
+    function raises are not caught, except the one of a torch loss that gets several
+    labels. NaN values are allowed, as a search counts them.
+
+    Args:
+        function: takes (output, images, truth) or (output, labels), and by name any of
+            `REQUESTABLE_INPUTS`. It returns values (N,), or a scalar; if it returns a
+            scalar for several images, it is called again with one image at a time.
 
     Raises:
-        InputError: (when the objective is called) a wrong type or shape, or a lost
-            gradient.
+        InputError: (when the objective is called) the result has a wrong type or shape,
+            or does not depend on the arguments differentiably.
     """
     name = get_name(function)
     signature = read_signature(function)
@@ -223,7 +238,8 @@ def wrap_objective(function: Callable[..., Tensor]) -> Objective:
             result = _evaluate_each_image(objective, output, images, truth, inputs)
         values = _check_values(name, result, count)
         if values.requires_grad and _are_written_into((argument_copies, input_copies)):
-            # the derivative may be lost that way: it is computed now, to see
+            # Writing in place may make torch's backward pass fail. It is tried here, so
+            # that the error names the function.
             sources = _list_differentiable((output, inputs))
             _check_differentiable(name, values, sources or [images])
         _check_keeps_gradient(name, values, (images, output, *inputs.values()))
@@ -255,12 +271,11 @@ def _evaluate_each_image(
     """Return the values (N,) of an objective that is called with one image at a time.
 
     Args:
-        objective: objective of a function that returns a scalar.
+        objective: wraps a function that returns a scalar for any number of images.
         output: output of the model for N images.
         images: (N, H, W, 3).
         truth: what is right, equal for all images.
-        inputs: what the function requests, by the names of its parameters, for N
-            images.
+        inputs: inputs that the function requests, by name, for all N images.
     """
     values = []
     for index in range(images.shape[0]):
@@ -273,8 +288,14 @@ def _evaluate_each_image(
 
 
 def _check_keeps_gradient(name: str, values: Tensor, sources: tuple[Any, ...]) -> None:
-    """Raise InputError if a function's values do not depend differentiably on any of
-    its sources (its arguments), though a gradient is wanted.
+    """Raise InputError if a function's values have lost the gradient.
+
+    Nothing is checked if torch records no gradients, or no argument needs one.
+
+    Args:
+        name: name of the function.
+        values: (N,) values that it returned.
+        sources: arguments that it was called with, tensors or not.
     """
     if values.requires_grad or not torch.is_grad_enabled():
         return
@@ -304,8 +325,12 @@ def _list_differentiable(value: Any) -> list[Tensor]:
 
 
 def _check_differentiable(name: str, values: Tensor, sources: Sequence[Tensor]) -> None:
-    """Raise InputError if a function wrote into its arguments in place, so that torch
-    cannot differentiate its values (N,) by their sources.
+    """Raise InputError if torch can't differentiate a function that wrote in place.
+
+    Args:
+        name: name of the function.
+        values: (N,) values that it returned, with a graph.
+        sources: tensors that need a gradient.
     """
     try:
         torch.autograd.grad(values.sum(), sources, retain_graph=True, allow_unused=True)
@@ -326,7 +351,12 @@ def get_name(function: Callable[..., Any]) -> str:
 
 
 def _check_values(name: str, values: Any, count: int) -> Tensor:
-    """Return what a function returned as one value per image, (count,).
+    """Check what a user's function returned; return one value per image, (count,).
+
+    Args:
+        name: name of the function.
+        values: what it returned; a scalar is allowed for a single image.
+        count: number of images.
 
     Raises:
         InputError: it is no floating-point tensor of that shape.
@@ -356,8 +386,15 @@ def _check_values(name: str, values: Any, count: int) -> Tensor:
 
 
 def truth_to_labels(truth: Any, output: Any, count: int) -> Any:
-    """Return the truth as a user's function gets it: a label set of one class as (N,)
-    int64, anything else as it is.
+    """Return the truth as a user's function gets it.
+
+    A label set of one class, e.g. (3,), becomes a tensor (count,) int64, as torch's
+    losses take it. Anything else, e.g. boxes or several labels, is returned unchanged.
+
+    Args:
+        truth: what is right for all images.
+        output: output of the model; the tensor is on its device.
+        count: number of images, N.
     """
     if (
         isinstance(truth, tuple)
@@ -443,8 +480,9 @@ def _ignore_inputs(function: Callable[[Any, Tensor, Any], Tensor]) -> Objective:
 
 
 def _pass_copies(objective: Objective) -> Objective:
-    """Return an objective of another package as one that is called with copies, so that
-    it cannot change what a run computes with.
+    """Wrap another package's objective so that it is called with copies.
+
+    It may write into its arguments, and the run still needs them unchanged.
     """
 
     def with_copies(
@@ -593,23 +631,25 @@ def get_objective(
     features: ReadFeatures | None = None,
     clean: Tensor | None = None,
 ) -> Objective:
-    """Return the objective of that name, or the user's own function wrapped so that its
-    mistakes are explained.
+    """Return an objective by its name, or a user's function wrapped as one.
 
-    What comes back is called with the truth, whatever the search is after. With a
-    target, a named objective takes its targeted form, and the user's function gets the
-    target in place of the truth. To minimise, either is negated.
+    The result is always called with the truth, and is to be maximised. If the task has
+    a target, a named objective uses its targeted form, and a user's function gets the
+    target in place of the truth. If the task minimises, the values are negated. The
+    mistakes of a user's function are explained.
 
     Args:
         objective: a name, or a function of (output, images, truth) or of (output,
-            labels), which may ask for more.
-        task: judges the model; classification of any wrong prediction if None.
-        features: features for an objective that `needs_features`:
-            `advsearch.models.features.features_of(model)`.
-        clean: likewise: the clean picture (H, W, 3), or renders of it (N, H, W, 3).
+            labels), which may request further inputs by name.
+        task: judges the model; by default classification without a target.
+        features: computes the model's features, for an objective that
+            `needs_features`: `advsearch.models.features.features_of(model)`.
+        clean: for such an objective the clean image (H, W, 3), or renders of it (N, H,
+            W, 3).
 
     Raises:
-        UnknownNameError, InputError: as for `check_objective`; no features.
+        UnknownNameError: there is no objective of that name.
+        InputError: the objective does not fit the task, or needs features and got none.
     """
     task = task or Classification()
     targeted = task.target is not None
@@ -623,7 +663,7 @@ def get_objective(
     # functions of other packages are called with copies, and their mistakes explained
     is_built_in = _BUILT_IN_KINDS.get(kind.name) is kind
     if kind.of_task is not None:
-        # It knows target and direction itself.
+        # The task has target and direction already, so it is not oriented below.
         task_objective = kind.of_task(task)
         return task_objective if is_built_in else _pass_copies(task_objective)
     if kind.of_features is not None:
@@ -666,7 +706,8 @@ def _has_other_outputs(task: Task) -> bool:
     """Return whether the model's outputs are not logits of the labels as they are, so
     that an objective of logits gets what `Task.as_logits` makes of them.
 
-    They are features that are compared, or have classes that stand for "nothing".
+    The outputs may be features that are compared with those of each label, or may have
+    classes that stand for "nothing here".
     """
     compares_features = isinstance(task, Classification) and not task.reads_logits
     has_nothing_classes = isinstance(task, ClassTask) and bool(task.nothing_classes)
@@ -680,16 +721,17 @@ def _orient_objective(
     takes_logits_of_task: bool,
     user_function: str | Callable[..., Tensor] | None,
 ) -> Objective:
-    """Return an objective that is called with the truth and is to be maximised,
-    whatever the search is after.
+    """Return an objective that is called with the truth and is to be maximised.
+
+    So a search needs no case for targets or for minimising.
 
     Args:
-        function: gets the target in place of the truth if the task has one; its values
+        function: gets the target in place of the truth if the task has one. Its values
             are negated if the task minimises.
-        task: judges the model.
+        task: judges the model; has the target and the direction.
         takes_logits_of_task: whether the function gets `Task.as_logits` of the output.
-        user_function: which the function wraps; None for a named objective. With a
-            target its direction is checked once, at its first gradient.
+        user_function: the user's function that `function` wraps; None for a named
+            objective. With a target, its sign is checked once, at its first gradient.
     """
     targeted = task.target is not None
     # set to False by the first call that has checked it
@@ -705,6 +747,7 @@ def _orient_objective(
         if takes_logits_of_task:
             function_output = task.as_logits(output, labels)
         value = function(function_output, images, labels, more)
+        # (N, classes); the check needs the slope in each class
         has_logits = isinstance(output, Tensor) and output.ndim == 2
         can_check = value.requires_grad and has_logits and output.requires_grad
         if must_check_direction and can_check:
@@ -717,16 +760,17 @@ def _orient_objective(
 
 
 def _warn_of_direction(name: str, values: Tensor, output: Tensor, target: Any) -> None:
-    """Warn of a user's function that falls for every image as the target's logit rises:
-    to maximise it leads away from the target.
+    """Warn if a user's function falls, for every image, as the target's logit rises.
+
+    It probably has the wrong sign: maximising it leads away from the target.
 
     Args:
         name: name of the function.
-        values: (N,) of it, with a graph.
+        values: (N,) values that it returned, with a graph.
         output: (N, classes) logits.
         target: indices of classes; anything else is not checked.
     """
-    # the graph is differentiated again by the search
+    # the graph is retained, as the search differentiates it again
     (slope,) = torch.autograd.grad(
         values.sum(), output, retain_graph=True, allow_unused=True
     )
@@ -751,19 +795,19 @@ def check_objective(
     targeted: bool = False,
     minimise: bool = False,
 ) -> None:
-    """Check an objective before anything is loaded.
+    """Check that an objective fits a task, before a model or scene is loaded.
 
     Args:
         objective: a name, or a function.
         task: name of the task.
-        targeted: whether a target is sought.
+        targeted: whether a prediction of a certain target is sought.
         minimise: whether a right prediction is sought.
 
     Raises:
         UnknownNameError: there is no objective of that name.
-        InputError: it is neither a name nor a function of such arguments, or is one of
-            another task; a target is to be minimised; or an objective of features has a
-            target or is minimised.
+        InputError: it is neither a name nor a function with the arguments of an
+            objective; it belongs to another task; `targeted` and `minimise` are both
+            set; or an objective of features has a target or is minimised.
     """
     if targeted and minimise:
         raise InputError(
@@ -791,13 +835,12 @@ def check_objective(
 def _check_kind(
     kind: ObjectiveKind, task: str, *, targeted: bool, minimise: bool
 ) -> None:
-    """Raise InputError unless a named objective is one for the task, and for what is
-    sought.
+    """Raise InputError if a named objective does not fit the task or the goal.
 
     Args:
         kind: kind of the objective.
         task: name of the task.
-        targeted: whether a target is sought.
+        targeted: whether a prediction of a certain target is sought.
         minimise: whether a right prediction is sought.
     """
     if not kind.fits(task):
@@ -807,7 +850,7 @@ def _check_kind(
             f"got {kind.name}, which takes outputs of {kind.task}"
         )
     if kind.needs_features and (targeted or minimise):
-        # a distance from the clean picture has no other use than to be maximised
+        # A distance from the clean image can only be maximised.
         setting = "minimise"
         reason = "it is least at the start already"
         if targeted:

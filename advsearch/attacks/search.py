@@ -61,7 +61,7 @@ class StepRecord:
     seconds: float  # seconds that the evaluation took
     # renders that all evaluations so far took together, this one included
     renders: int = 0
-    samples: int = 1  # as of `Proposal`
+    samples: int = 1  # multiple of the search's samples per pixel; see `Proposal`
 
 
 IsOutOfTime = Callable[[int], bool]
@@ -138,45 +138,48 @@ def search(
 ) -> SearchResult:
     """Run one policy on one domain and return the worst configuration it found.
 
-    1. Until `steps` renders are spent: the policy proposes as many configurations as do
-       not wait for each other; they are checked against the domain and evaluated, each
-       with a new seed (docs/design.md, "The search"); then the policy is updated. An
-       evaluation costs `Proposal.max_cost` renders at most. What the budget cannot pay
-       is not requested.
-    2. The `candidates` best distinct configurations are each evaluated `repeats` times
-       more, with new seeds that are the same for all, without gradient. The best by
-       these renders is what the search found (see `candidates`). With `candidates=0`,
-       for an objective without noise, the raw best is what it found. If evaluations
-       draw conditions (`Domain.draws_conditions`), the raw best had easy ones; so the
-       last configuration, to which all of them led, replaces the worst candidate.
-       Those that are not clearly worse than the best by then are rendered again, up to
-       `max_extra_repeats` times more (see `candidates.select_contenders`).
+    1. Until `steps` renders are spent, the policy proposes a batch of configurations
+       that do not depend on each other's results. Each is checked against the domain
+       and evaluated with a new seed (docs/design.md, "The search"); then the policy is
+       updated. An evaluation costs `Proposal.max_cost` renders at most. What the budget
+       cannot pay is not requested.
+    2. The `candidates` best distinct configurations are rendered `repeats` times again,
+       without gradient, all with the same new seeds. The best by these renders is what
+       the search found: the best of step 1 is partly a lucky one. With `candidates=0`,
+       for an objective without noise, the best of step 1 is returned.
+       If every evaluation draws conditions (`Domain.draws_conditions`), the best of
+       step 1 had conditions that made it easy to fail. So the last configuration of the
+       policy replaces the worst candidate.
+       Candidates that are not clearly worse than the best one are then rendered again,
+       up to `max_extra_repeats` times (`candidates.select_contenders`).
 
     A policy that does not handle discrete choices is wrapped in `Choices` where the
     domain has some.
 
-    A non-finite objective is counted, is never best, and reaches the policy as -inf;
-    `NON_FINITE_LIMIT` in a row end the search. KeyboardInterrupt, wherever it strikes,
-    ends it with what there is.
+    A non-finite objective is counted, is never best, and reaches the policy as -inf.
+    `NON_FINITE_LIMIT` of them in a row end the search. KeyboardInterrupt ends it at any
+    time, and the result is made of the evaluations until then.
 
     Args:
-        evaluate: renders and judges configurations.
+        evaluate: renders queries and yields their evaluations, one by one.
         domain: where to search.
         policy: proposes the configurations.
-        steps: renders of the search, at least 1; as many evaluations where no gradient
-            costs any. All are spent: the worst case is wanted, not the first failure.
+        steps: number of renders in step 1, at least 1. It is the number of evaluations
+            too if gradients cost no renders. All are spent, also after a failure: the
+            worst case is searched, not the first failure.
         seed: root seed of the policy's randomness, at least 0.
-        candidates: number of configurations that are rendered again, see above.
-        repeats: renders of each of them.
-        max_extra_repeats: further renders of each. All these cost at most `candidates *
-            (repeats + max_extra_repeats)` renders more.
+        candidates: number of configurations that step 2 renders again.
+        repeats: renders of each candidate in step 2.
+        max_extra_repeats: largest number of further renders of each. Step 2 costs at
+            most `candidates * (repeats + max_extra_repeats)` renders.
         on_step: called after every evaluation.
-        seconds: end step 1 after the first evaluation that is done later than this,
-            over 0; None for no limit. There is always one evaluation, and step 2 comes
-            on top. Policies still plan for `steps`.
-        is_out_of_time: returns whether the time is over; in place of `seconds`, for a
-            run that is resumed.
-        kind: kind of the queries.
+        seconds: time limit of step 1, over 0; None for no limit. It is checked after
+            each evaluation, so there is always one, and step 2 comes on top. Policies
+            still plan for `steps`.
+        is_out_of_time: returns whether the time is over, by the number of evaluations.
+            It replaces `seconds` in a run that is resumed, which must stop where it
+            stopped before.
+        kind: kind of the queries; it also names the stream of their seeds.
         render_seed: root seed of the noise of the renders, at least 0.
 
     Raises:
@@ -187,6 +190,7 @@ def search(
     """
     _check_limits(steps, candidates, repeats, max_extra_repeats, seconds)
     started = time.perf_counter()
+    # one candidate is stored even if none is rendered again: it is the result
     log = _Log(evaluate, domain, on_step, max(1, candidates), kind, render_seed)
     try:
         with interruptible():
@@ -201,6 +205,7 @@ def search(
             if domain.draws_conditions:
                 log.pool = replace_worst(log.pool, log.last, log.size)
             if candidates:
+                # Step 1 used seed indices below `steps` at most.
                 _rank(log, steps, repeats, max_extra_repeats)
     except KeyboardInterrupt:
         stopped = Ending.INTERRUPTED
@@ -214,7 +219,15 @@ def _check_limits(
     max_extra_repeats: int,
     seconds: float | None,
 ) -> None:
-    """Raise InputError if a limit of a search is out of range."""
+    """Raise InputError if an argument of `search` is out of range.
+
+    Args:
+        steps: renders of the search, at least 1.
+        candidates: number of configurations that are rendered again, at least 0.
+        repeats: renders of each candidate, at least 1.
+        max_extra_repeats: largest number of further renders, at least 0.
+        seconds: time limit, over 0; None for no limit.
+    """
     if steps < 1:
         raise InputError(f"steps: expected at least 1, got {steps}")
     if candidates < 0 or repeats < 1:
@@ -231,14 +244,15 @@ def _check_limits(
 
 
 def _make_result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
-    """Return what a search found, by its log.
+    """Return the result of a search from its log.
 
-    An interrupted search claims nothing, whatever it found.
+    A failure is claimed (FOUND) if the model was wrong in at least half of the best
+    candidate's renders. An interrupted search claims nothing, whatever it found.
 
     Args:
         log: log of the search.
-        stopped: why it stopped.
-        seconds: seconds that it took.
+        stopped: why the search stopped.
+        seconds: seconds that the search took.
     """
     best = Candidate(log.domain.start, math.nan, False)
     if log.pool:  # else nothing could be evaluated
@@ -332,15 +346,16 @@ class _Log:
     def evaluate_and_record(
         self, proposals: Sequence[Proposal], indices: Sequence[int], phase: Phase
     ) -> Iterator[Evaluation]:
-        """Yield the evaluations of proposals, each recorded before it is yielded.
+        """Evaluate proposals; yield each evaluation once it is counted and recorded.
 
-        Evaluations come one by one, and the time of each is that since the one before.
+        The time of an evaluation is measured from the one before. The caller's work
+        between two of them is left out.
 
         Args:
             proposals: proposals to evaluate.
-            indices: indices of the seed of each in the stream of the search; candidates
-                that are ranked share them.
-            phase: phase of the search.
+            indices: seed index of each proposal in the search's stream of seeds.
+                Candidates that are ranked share seeds, so that they meet equal noise.
+            phase: "search" or "ranking".
         """
         started = time.perf_counter()
         queries = self._make_queries(proposals, indices, phase)
@@ -354,6 +369,7 @@ class _Log:
             self.records.append(self._make_record(proposal, query, evaluation, seconds))
             self._measure_agreement(evaluation.gradient)
             if self.on_step is not None:
+                # copies, as the callback may write into the tensors
                 self.on_step(self.records[-1], *copy_value((proposal.u, evaluation)))
             yield evaluation
             started = time.perf_counter()
@@ -361,7 +377,13 @@ class _Log:
     def _make_queries(
         self, proposals: Sequence[Proposal], seed_indices: Sequence[int], phase: Phase
     ) -> list[Query]:
-        """Return the queries of proposals, numbered from the next record on."""
+        """Return the queries of proposals, numbered from the next record on.
+
+        Args:
+            proposals: proposals to evaluate.
+            seed_indices: index of the seed of each proposal in the search's stream.
+            phase: "search" or "ranking".
+        """
         queries = list[Query]()
         for record_index, (proposal, seed_index) in enumerate(
             zip(proposals, seed_indices, strict=True), start=len(self.records)
@@ -379,12 +401,13 @@ class _Log:
         return queries
 
     def _count(self, proposal: Proposal, evaluation: Evaluation, phase: Phase) -> None:
-        """Count the costs of an evaluation; one of the search may become a candidate.
+        """Count the costs of an evaluation, and update the best and the candidates.
 
         Args:
             proposal: proposal of the policy.
-            evaluation: sanitized.
-            phase: "search" or "ranking".
+            evaluation: its evaluation, sanitized.
+            phase: "search" or "ranking". A ranking renders the candidates again, so it
+                adds no candidate.
         """
         if proposal.gradient:
             self.gradients += 1
@@ -402,13 +425,16 @@ class _Log:
     def _make_record(
         self, proposal: Proposal, query: Query, evaluation: Evaluation, seconds: float
     ) -> StepRecord:
-        """Return the record of an evaluation, which `_count` has counted already.
+        """Return the record of an evaluation, after `_count` has counted it.
+
+        The objective is NaN if it was not finite; so is the norm of a gradient that was
+        not requested.
 
         Args:
             proposal: proposal of the policy.
-            query: query that was made of it.
-            evaluation: sanitized.
-            seconds: seconds that it took.
+            query: query that was made of the proposal.
+            evaluation: its evaluation, sanitized.
+            seconds: seconds that the evaluation took.
         """
         objective = math.nan
         if evaluation.is_finite:
@@ -433,12 +459,14 @@ class _Log:
         )
 
     def _measure_agreement(self, gradient: Tensor | None) -> None:
-        """Add the cosine similarity of a gradient (d,) and the one before to
-        `agreement`; a gradient of zero, which has no direction, is left out.
+        """Append the cosine similarity of a gradient (d,) and the one before it.
+
+        A gradient of zero has no direction and is left out.
         """
         if gradient is None or not bool(gradient.any()):
             return
         if self.previous_gradient is not None:
+            # a small `eps`, as the default of 1e-8 distorts small gradients
             cosine = torch.cosine_similarity(
                 gradient, self.previous_gradient, dim=0, eps=1e-30
             )
@@ -453,19 +481,21 @@ def _explore(
     seed: int,
     is_out_of_time: IsOutOfTime,
 ) -> Ending:
-    """Let the policy propose until there is a reason to stop; return that.
+    """Evaluate what the policy proposes until there is a reason to stop; return it.
 
-    Reasons are that the budget is spent, the time is over (which counts as the same),
-    the policy has nothing more to propose, or objectives are not finite. At any time,
-    the log has the policy's latest state and the evaluations since then: an interrupted
-    search ends with these.
+    - BUDGET_SPENT: all renders are spent, or the time is over.
+    - STALLED: the policy has nothing more to propose.
+    - NON_FINITE: `NON_FINITE_LIMIT` objectives in a row were not finite.
+
+    The log always has the policy's latest state and the evaluations that the policy has
+    not received yet. An interrupted search makes its result from these.
 
     Args:
         log: log of the search; it is changed.
         policy: policy that proposes.
-        steps: renders of the search.
+        steps: number of renders to spend.
         seed: root seed of the policy's randomness.
-        is_out_of_time: returns whether the time is over.
+        is_out_of_time: returns whether the time is over, by the number of evaluations.
     """
     generator = torch.Generator().manual_seed(stream(seed, "search"))
     name = policy.name  # for messages: that of the policy that a user chose
@@ -502,12 +532,15 @@ def _explore(
 def _limit_batch(
     proposals: Sequence[Proposal], domain: Domain, renders_left: int
 ) -> list[Proposal]:
-    """Return copies of the first proposals, as many and as costly as the renders allow.
+    """Return copies of the first proposals, as many as the remaining renders pay.
+
+    The last one may be changed to a cheaper one (`Proposal.limit_cost`), e.g. without
+    its gradient.
 
     Args:
         proposals: proposals of the policy.
-        domain: states what gradients cost.
-        renders_left: renders left of the budget.
+        domain: states how many renders a gradient costs.
+        renders_left: number of renders that the budget has left.
     """
     batch = list[Proposal]()
     for proposal in proposals:
@@ -523,15 +556,15 @@ def _limit_batch(
 def _rank(log: _Log, first_seed: int, repeats: int, max_extra_repeats: int) -> None:
     """Render every candidate again, all with the same new seeds.
 
-    Then those that are not clearly worse than the best are rendered once more each,
-    until a single one is left, or `max_extra_repeats` times. The others are dropped
-    from the pool.
+    Then candidates that are clearly worse than the best are dropped from the pool, and
+    the others are rendered once more each. This is repeated `max_extra_repeats` times,
+    or until a single candidate is left.
 
     Args:
         log: log of the search, whose pool changes.
-        first_seed: number of the first new seed.
-        repeats: renders of every candidate.
-        max_extra_repeats: renders of those that remain.
+        first_seed: index of the first seed that the search has not used.
+        repeats: renders of every candidate at first.
+        max_extra_repeats: largest number of further renders of a candidate.
     """
     first_extra_seed = first_seed + repeats
     _repeat_candidates(log, range(first_seed, first_extra_seed))
@@ -544,9 +577,13 @@ def _rank(log: _Log, first_seed: int, repeats: int, max_extra_repeats: int) -> N
 
 
 def _repeat_candidates(log: _Log, indices: range) -> None:
-    """Render all candidates of the pool with the seeds of these indices.
+    """Render all candidates of the log's pool with the seeds of these indices.
 
-    The pool is updated after every render, so that an interrupted search has all.
+    The pool is updated after every render, so that an interrupted search loses none.
+
+    Args:
+        log: log of the search, whose pool changes.
+        indices: seed indices, one render of each candidate for each.
     """
     pool = log.pool
     proposals = [Proposal(candidate.u) for candidate in pool for _ in indices]
@@ -562,14 +599,15 @@ def _repeat_candidates(log: _Log, indices: range) -> None:
 def _check_proposals(
     proposals: Sequence[Proposal], max_count: int, domain: Domain, name: str
 ) -> None:
-    """Raise RuntimeError if a policy proposed too many configurations, or something
-    else than configurations of the domain, which is a bug.
+    """Raise RuntimeError if a policy's proposals break its contract, which is a bug.
+
+    They may be too many, or no configurations of the domain.
 
     Args:
         proposals: proposals of the policy.
-        max_count: how many it may propose.
+        max_count: largest number of proposals allowed.
         domain: domain of the search.
-        name: name of the policy.
+        name: name of the policy, for the message.
     """
     if len(proposals) > max_count:
         raise RuntimeError(
@@ -581,8 +619,15 @@ def _check_proposals(
 
 
 def _check_inside(proposal: Proposal, domain: Domain, name: str) -> None:
-    """Raise RuntimeError if a policy proposed something that is no configuration of the
-    domain, which is a bug.
+    """Raise RuntimeError if a proposal is no configuration of the domain.
+
+    This is a bug of the policy. Its u has to be float32, have the domain's shape (d,)
+    and lie within the budget, but for rounding.
+
+    Args:
+        proposal: proposal of the policy.
+        domain: domain of the search.
+        name: name of the policy, for the message.
     """
     u = proposal.u
     if proposal.samples < 1:
@@ -605,8 +650,15 @@ def _check_inside(proposal: Proposal, domain: Domain, name: str) -> None:
 def _check_evaluation(
     evaluation: Evaluation, proposal: Proposal, domain: Domain
 ) -> None:
-    """Raise RuntimeError unless an evaluation has the gradient that was requested, and
-    took as many renders as the domain states.
+    """Raise RuntimeError if an evaluation does not fit its proposal, which is a bug.
+
+    It must have the gradient that was requested, like u in shape and dtype, and have
+    taken as many renders as the domain states.
+
+    Args:
+        evaluation: what `evaluate` returned.
+        proposal: proposal that was evaluated.
+        domain: states how many renders a gradient costs.
     """
     gradient = evaluation.gradient
     u = proposal.u

@@ -78,23 +78,25 @@ def make_margin_function(
 ) -> MarginsOf:
     """Return a function that renders a configuration and returns its margins.
 
-    A margin is the negative of the task's score, so it is over 0 if the model is right.
+    The function takes samples per pixel and seeds, and returns one margin per seed. A
+    margin is the negative of the task's score, so it is over 0 if the model is right.
 
     Args:
-        evaluate: answers queries.
+        evaluate: renders queries and yields their evaluations.
         kind: kind of the queries, which are numbered across all sample counts.
         u: (d,) the configuration.
-        n_images: how many images of each sample count are requested, the first ones.
-        draws_conditions: whether conditions are sampled by the seeds; else they are
-            those that the scene comes with.
+        n_images: number of renders at each sample count, the first ones, whose images
+            are requested.
+        draws_conditions: whether each seed also samples conditions (e.g. the weather);
+            otherwise the scene's own conditions hold.
     """
     n_rendered = Counter[int]()
 
     def margins(spp: int, seeds: Sequence[int]) -> list[float]:
-        """Return the margin of a render for each seed.
+        """Return the margin of one render for each seed.
 
-        The first `n_images` renders of each sample count are those whose images are
-        requested.
+        Calls are counted in `n_rendered`: a later call with the same `spp` continues
+        the numbering, so that only the first `n_images` renders request an image.
         """
         first_render = n_rendered[spp]  # at this sample count
         first_query = n_rendered.total()  # at all sample counts
@@ -168,43 +170,42 @@ def choose_spp(
 ) -> SampleCount:
     """Choose a sample count at which more samples would not change the verdict.
 
-    A ladder of sample counts is climbed with each configuration until that holds; the
-    highest rung that one of them needed is returned.
+    Each configuration is rendered at rising sample counts, the rungs of a ladder, until
+    it has settled. The highest rung that one of them needed is returned.
 
-    A verdict asks on which side of zero the margin is. A configuration has settled at a
-    rung, with the mean margin m there and m' at the rung below, when on that side, with
-    all of their uncertainty, are
+    The verdict depends on the sign of the margin. Let m be the mean margin at a rung
+    and m' the one at the rung below. The configuration has settled if all of these have
+    the same sign, with 95 % confidence:
 
     - m,
-    - m + (m - m'), where the margin would be if noise took once more as much as it took
-      from the rung below to here: the error that is left falls with the sample count,
-      so it is smaller than the change that led here,
-    - every single render of the rung; and, if these are not as many as the trials, m
-      even with the standard deviation of a single render.
+    - m + (m - m'), the margin if more samples changed it as much again as the step from
+      the rung below did. The remaining error falls with the sample count, so it is
+      smaller than that,
+    - every single render at the rung. Unless these are as many as the trials to come,
+      m must even exceed the uncertainty of a single render.
 
     A margin at zero never settles: its verdict depends on the noise. About 5 % settle
-    on the wrong side at most: 5.1 % of those that are hardest to tell
-    (`benchmarks/verdicts.py`). A rung is looked at after some of the renders, and again
-    after more, and each look has its share of the 5 % (Bonferroni). A look that cannot
-    settle anything, as far as the noise so far tells (`_may_settle`), is left out;
-    where none is left that could, or one configuration has not settled, the last rung,
-    which has three quarters of all samples, is taken as it is and not `converged`.
+    with the wrong sign at most: 5.1 % of the hardest cases (`benchmarks/verdicts.py`).
+    A rung is checked after some renders and again after more; the 5 % are divided
+    equally among these looks (Bonferroni). A look that cannot settle anything, judging
+    by the noise so far (`_may_settle`), is skipped. If one configuration does not
+    settle, the last rung is returned, with `converged` False.
 
-    A rung is chosen because its renders agree, so they are no trials: those have seeds
-    of their own (`run_trials`). Counted among them, they would make what holds in 75 %
-    `found` in 5.9 % of all cases in place of 2.2 %.
+    These renders must not be used as trials, because a rung is chosen where they
+    agree: trials have other seeds (`run_trials`). If they were, a claim that holds in
+    75 % of renders would be `found` in 5.9 % of all cases and not in 2.2 %.
 
     Args:
-        margins: the configurations, e.g. {"adversarial": ..., "clean": ...}; each
-            renders what it is asked for. The first should be the one that is least
-            likely to settle.
+        margins: for each configuration, e.g. "adversarial" and "clean", a function
+            that renders it (`make_margin_function`). The first should be the one that
+            is least likely to settle, as the others are then not rendered.
         seed: root seed.
         ladder: sample counts, rising, at least one, or InputError. A single one is
             returned unmeasured.
-        trials: number of trials that will follow under the same conditions; 0 where
-            other trials follow. After as many renders there is one more look, the
-            last one, at which only the mean and every single render have to be on
-            one side.
+        trials: number of trials that will follow under the same conditions; 0 if the
+            trials are of another kind. There is one more look after so many renders,
+            the last one, which takes the standard error of m, not the deviation of a
+            single render.
     """
     if not ladder or ladder[0] < 1 or any(b <= a for a, b in pairwise(ladder)):
         raise InputError(
@@ -273,10 +274,11 @@ def _climb_ladder(
     """Return the margins of one configuration at each rung that was rendered.
 
     It ends at the rung at which the configuration settles, or when no later look can
-    settle it. Each look renders what is missing at its rung and at the rung below.
+    settle it. A look renders what is still missing at its rung and at the rung below,
+    with the same seeds at both.
 
     Args:
-        margins: renders the configuration.
+        margins: renders the configuration; (spp, seeds) to margins.
         seed: root seed.
         ladder: samples per pixel of the rungs, ascending.
         look_sizes: renders of a rung after which one looks, ascending.
@@ -323,11 +325,13 @@ def _is_settled(
         trials: trials that will follow; 0 if other trials follow.
     """
     mean = fmean(at_rung)
+    # An earlier look may have rendered more at the rung below.
     count = min(len(at_rung), len(below))
     deviation = _compute_deviation(at_rung)
     # m + (m - m'), with the mean m at the rung and m' below: the mean if the rest of the
     # noise changed it as much as the step from below did
     extrapolated = 2.0 * mean - fmean(below)
+    # standard error of 2 m - m'
     extrapolated_error = math.hypot(
         2.0 * deviation, _compute_deviation(below)
     ) / math.sqrt(count)
@@ -352,16 +356,17 @@ def _may_settle(
 ) -> bool:
     """Return whether `count` renders at a rung may show that the margin has settled.
 
-    This is a forecast from the renders so far. The mean may be off by its standard
-    error, and may move on by as much as it has moved before. Standard deviations stay;
-    at rungs that were not rendered they fall with the root of the samples. Margins on
-    both sides of zero at the rung rule it out.
+    This is an optimistic forecast from the renders so far: the mean may be farther from
+    zero by its standard error, and by as much again as it changed over the last rung.
+    Standard deviations are assumed to stay as they are, and at rungs that were not
+    rendered to fall with the square root of the samples. If margins at the rung have
+    both signs, it cannot settle.
 
     Args:
-        values: margins of each rung; empty of one that was not rendered.
+        values: margins of each rung; an empty list if it was not rendered.
         ladder: samples per pixel of the rungs.
-        level: index of the rung.
-        count: renders there.
+        level: index of the rung in `ladder`.
+        count: number of renders at the rung that the look would use.
         looks: number of looks, which share the 5 %.
     """
     rendered_rungs = [rung for rung in range(level + 1) if values[rung]]
@@ -376,8 +381,8 @@ def _may_settle(
     drift = abs(mean - fmean(values[rendered_rungs[-2]]))
     standard_error = _compute_deviation(last_values) / math.sqrt(len(last_values))
     max_mean = abs(mean) + drift + standard_error
-    # The mean m of the rung and m' of the one below have to show that 2 m - m' is not
-    # zero (`_is_settled`): this is the deviation of a difference of single renders.
+    # 2 m - m' has to differ from zero (`_is_settled`), with the mean m at the rung and
+    # m' below. Its deviation, for a single render of each:
     deviation = math.hypot(
         2.0 * _estimate_deviation(values, ladder, last_rung, level),
         _estimate_deviation(values, ladder, last_rung, level - 1),
@@ -480,23 +485,24 @@ def limit_ladder(
 def choose_rate_spp(
     margins: Mapping[str, MarginsOf], *, seed: int, ladder: Sequence[int] = OVER_LADDER
 ) -> SampleCount:
-    """Choose a sample count at which more samples would not change how often a model is
-    wrong over conditions: the fraction with a margin below zero.
+    """Choose a sample count at which more samples would not change a failure rate.
 
-    A ladder of sample counts is climbed with each configuration until that holds; the
-    highest rung that one of them needed is returned.
+    The rate is the fraction of conditions (e.g. weather) with a margin below zero,
+    where the model is wrong. Each configuration is rendered at rising sample counts,
+    the rungs of a ladder, until it has settled. The highest rung that one of them
+    needed is returned.
 
-    Each is rendered under the same `N_CONDITIONS` at a rung and at the one below. It
-    has settled if the mean change of the margin, taken once more and at either end
-    of its 95 % interval (Student's t), would carry at most `MAX_MOVED_FRACTION` of the
-    conditions over zero (`estimate_moved_fraction`). The error that is left falls with
-    the sample count, so it is smaller than the change that led here
-    (`benchmarks/verdicts.py` has how far the rate is off then). No render of it is a
-    trial.
+    A configuration is rendered under the same `N_CONDITIONS` conditions at each rung.
+    Suppose that more samples changed all margins by the mean change from the rung
+    below, at either bound of its 95 % interval (Student's t). The configuration has
+    settled if this would move at most `MAX_MOVED_FRACTION` of the conditions across
+    zero (`estimate_moved_fraction`). The remaining error falls with the sample count,
+    so it is smaller than that change. `benchmarks/verdicts.py` measures the error of
+    the rate. These renders are not used as trials.
 
     Args:
-        margins: the configurations by name, as of `choose_spp`; conditions are sampled
-            by the seeds.
+        margins: for each configuration, by name, a function that renders it
+            (`make_margin_function`); its seeds also sample the conditions.
         seed: root seed.
         ladder: sample counts, ascending. A single one is returned unmeasured.
     """
@@ -522,8 +528,16 @@ def choose_rate_spp(
 def _climb_until_settled(
     name: str, render: MarginsOf, seeds: Sequence[int], ladder: Sequence[int]
 ) -> list[Rung]:
-    """Return the rungs of a configuration under many conditions, up to the first at
-    which it has settled, or the last of the ladder.
+    """Render a configuration at rising sample counts until it has settled.
+
+    Args:
+        name: name of the configuration.
+        render: renders it; (spp, seeds) to margins.
+        seeds: one for each condition, the same at all sample counts.
+        ladder: sample counts, ascending.
+
+    Returns:
+        The rungs that were rendered; the last one may have not settled.
     """
     rungs = list[Rung]()
     below: FloatArray | None = None
@@ -561,24 +575,24 @@ def _summarize_conditions(
 def estimate_moved_fraction(at_rung: FloatArray, below: FloatArray) -> float:
     """Return the fraction of conditions whose margin more samples may carry over zero.
 
-    It is supposed that all margins change once more by the mean change from the rung
-    below, at either end of its 95 % interval; the end counts that carries more over
-    zero. The distribution of margins is smoothed by normal kernels. NaN if a margin is
-    no number.
+    It is supposed that more samples change all margins by the mean change from the rung
+    below, at either bound of its 95 % interval. The bound that moves more conditions
+    across zero counts. The distribution of margins is smoothed by normal kernels. NaN
+    if a margin is not finite.
 
     Args:
         at_rung: (n,) margins at one sample count, by condition.
         below: (n,) margins at the sample count before.
     """
     change = at_rung - below
-    # of the kernels, by Silverman's rule of thumb
+    # standard deviation of the kernels, by Silverman's rule of thumb
     width = 0.9 * at_rung.std(ddof=1) * len(at_rung) ** -0.2
     if not np.isfinite(change).all():
         return math.nan
     quantile = stdtrit(len(at_rung) - 1, 0.5 + CONFIDENCE / 2.0)
     half_width = quantile * change.std(ddof=1) / math.sqrt(len(at_rung))
     mean_change = change.mean()
-    # none, for comparison; and both ends of the interval of the mean change
+    # no shift, for comparison, and both bounds of the mean change
     shifts = np.array([0.0, mean_change - half_width, mean_change + half_width])
     # smoothed fraction of conditions with a margin over zero, by shift (3,); the width
     # is 0 if all margins are equal

@@ -120,9 +120,13 @@ class Rule:
     def count_needed(self, trials: int, *, early: bool = False) -> int:
         """Return how many of `trials` must succeed.
 
-        It is the percentage, rounded up, and at least `min_trials`. At an `early` look
-        over conditions, after which more trials could follow, it is that of
-        `OVER_EARLY`.
+        It is the rule's percentage of them, rounded up, and at least `min_trials`.
+
+        Args:
+            trials: number of trials that count.
+            early: whether more trials could follow. A rule over conditions then needs
+                the larger number in `OVER_EARLY`, because several looks raise the
+                chance of a lucky one.
         """
         n_required = self.count_percent(trials)
         if early and self.is_conditional:
@@ -176,8 +180,8 @@ class Rule:
         """Return whether a configuration is a success by its trials.
 
         None if that depends on the noise: it succeeds too often to be called a failure
-        and fails too often to be called a success. Of trials that nearly all agree, the
-        others may be as many as the failures that the rule allows.
+        and fails too often to be called a success. Trials agree if the rarer outcome,
+        whichever it is, occurs at most as often as the rule allows failures.
         """
         failures = trials - successes
         n_exceptions = min(successes, failures)
@@ -188,12 +192,17 @@ class Rule:
     def decide_ending(
         self, search: Ending, clean: Trials, adversarial: Trials
     ) -> Ending:
-        """Return the run's ending from the search's ending and the trials of both
-        groups.
+        """Return the ending of a run, by its search and by the trials of both groups.
 
-        It is FOUND if both reach what the rule needs, also if the search claimed
-        nothing. An interrupted search stays interrupted. Over conditions, or without a
-        control group, the clean trials need not reach the percentage.
+        It is FOUND if both groups have as many successes as the rule needs, even if the
+        search claimed nothing. Over conditions, or without a control group, only the
+        adversarial trials need as many.
+
+        Args:
+            search: how the search ended. INTERRUPTED is never changed.
+            clean: counts of the clean configuration, whose successes are right
+                predictions.
+            adversarial: counts of the configuration that the search found.
         """
         if search is Ending.INTERRUPTED:
             return search
@@ -274,19 +283,20 @@ def run_trials(
 ) -> tuple[Judgement, ...]:
     """Render and judge one configuration in several trials; return the new ones.
 
-    Trial k has the seed k of the stream "verification" of the root seed: two groups of
-    one root get the same seeds, which is what a control group needs.
+    Trial k has the seed k of the stream "verification" of the root seed. So two groups
+    with the same root seed are rendered with the same noise, which makes one of them
+    the control group of the other.
 
     Args:
-        evaluate: answers the queries; see `Query`.
+        evaluate: renders the queries and yields their evaluations, one by one.
         u: (d,) the configuration.
         spp: samples per pixel.
         seed: root seed.
         trials: number of trials, those that are done included.
         n_done: number of trials that are done already; they are not repeated.
         first_index: index k of the first trial.
-        kind: kind of the queries.
-        n_images: how many images are requested, those of the first trials.
+        kind: kind of the queries, such as "verification" or "control".
+        n_images: number of trials, the first ones, whose images are requested.
         is_decided: called with the new trials after each of them; if it returns True,
             no more follow.
 
@@ -311,6 +321,7 @@ def run_trials(
     ]
     for evaluation in evaluate(queries):
         done.append(evaluation.required_judgement)
+        # Leaving the loop means that the remaining queries are not evaluated.
         if is_decided is not None and is_decided(done):
             return tuple(done)
     if len(done) != len(queries):
@@ -340,46 +351,47 @@ def verify(
     curtailed: bool = False,
     first_index: int = 0,
 ) -> Verification:
-    """Check what a search found in fresh trials against the clean configuration as
-    control group.
+    """Check a search's configuration in new trials, with the clean one as control.
 
-    Several numbers of trials, such as `TRIAL_LOOKS`, are looks: the trials end at the
-    first look at which the claim is found to hold. Over conditions, a look is at that
-    many trials that count (`OVER_LOOKS`), and the last look at that many in all.
+    `trials` may be several ascending numbers, such as `TRIAL_LOOKS`. They are looks:
+    after that many trials the successes are counted, and if they suffice, no more
+    trials follow. Over conditions only trials with a right clean prediction count: a
+    look is then at so many of these (`OVER_LOOKS`), but the last number is the limit of
+    all trials.
 
-    Curtailed trials end as soon as more have failed than the rule allows of all of
-    them: whatever the rest would say, the verdict would be the same. The
-    Clopper-Pearson interval of those that were made still covers the rate as often as
-    it says, as it contains the exact interval of that stopping rule, by which an
-    outcome is the better the later the trials end (Jennison and Turnbull 1983).
+    Curtailed trials end as soon as more have failed than the rule allows: the remaining
+    trials could not change the verdict. Their Clopper-Pearson interval still covers the
+    rate in 95 % of all cases, because it contains the exact interval of this stopping
+    rule (Jennison and Turnbull 1983).
 
-    Trials with several looks are always curtailed, but there are at least
-    `Rule.min_trials`, so that they say something of the rate. That their intervals
-    cover it is shown by the probability of every outcome (`benchmarks/verdicts.py`).
+    Trials with several looks are always curtailed, but at least `Rule.min_trials` are
+    made, as fewer say nothing of the rate. `benchmarks/verdicts.py` computes from the
+    probability of every outcome that their intervals cover the rate.
 
     Args:
-        evaluate: answers the queries.
+        evaluate: renders the queries and yields their evaluations.
         domain: the budget; the clean configuration is its start.
         u: (d,) the adversarial configuration; projected into the domain again.
-        claim: the search's ending.
+        claim: how the search ended; FOUND if it claims a failure.
         spp: samples per pixel.
         seed: root seed. Must not be one that the search rendered with through the same
             stream.
-        trials: number of trials of each group; or ascending numbers, see above.
+        trials: number of trials of each group; or ascending numbers, the looks.
         clean: the first trials of the clean configuration, where `run_trials` has run
             them with the same spp and seed (one control group serves the attack and its
             baseline); what is missing is run here.
         rule: what counts as a success, and which ending it is.
         kind: kind of the queries of the adversarial configuration.
         control_kind: kind of the queries of the clean configuration.
-        n_images: how many images of the adversarial trials are requested.
-        curtailed: see above; for a claim of which only the verdict matters.
-        first_index: index of the first trial; if the configuration was chosen by
-            trials, fresh ones begin after these.
+        n_images: number of adversarial trials, the first ones, with an image.
+        curtailed: whether trials end early once too many have failed; for a claim of
+            which only the verdict matters, not the rate.
+        first_index: index of the first trial, which decides its seed. If trials chose
+            the configuration, the new ones must begin after these.
     """
     looks = (trials,) if isinstance(trials, int) else tuple(trials)
     has_several_looks = len(looks) > 1
-    # so many are made even if the verdict stands sooner
+    # so many adversarial trials are made even if the verdict stands sooner
     min_trials = rule.min_trials if has_several_looks and not curtailed else 0
     u = domain.project(u)
     clean_trials = list(clean)
@@ -388,7 +400,7 @@ def verify(
     def has_failed(new_trials: Sequence[Judgement]) -> bool:
         """Return whether too many trials fail for the claim to hold at any look."""
         all_trials = [*done, *new_trials]
-        # all that there may be
+        # largest number of trials that may count in the end
         n_total = looks[-1] if has_several_looks else rule.count_valid(clean_trials)
         has_too_many = _fails_too_often(rule, all_trials, clean_trials, n_total)
         return len(all_trials) >= min_trials and has_too_many
@@ -397,7 +409,8 @@ def verify(
     run_clean = partial(run, domain.start, kind=control_kind)
     is_decided = has_failed if curtailed or has_several_looks else None
     for look in looks:
-        # trials of each group at this look, so that `look` of them count
+        # Clean trials come first: they say which adversarial trials will count.
+        # `count` is the number of trials of each group at this look.
         count = _extend_clean_trials(clean_trials, run_clean, rule, look, looks[-1])
         done += run(
             u,
@@ -411,7 +424,7 @@ def verify(
         is_success = _is_found(
             rule, done, clean_trials, count, spp=spp, is_early=is_early
         )
-        # there are fewer than `count` if too many of them failed before
+        # `run` stops before `count` trials if too many of them failed.
         if len(done) < count or has_failed(()) or is_success or not is_early:
             break
     # as many as were asked for, and no look before
@@ -437,7 +450,14 @@ def _fails_too_often(
     clean_trials: Sequence[Judgement],
     n_total: int,
 ) -> bool:
-    """Return whether more trials fail than the rule allows of `n_total` trials."""
+    """Return whether more trials have failed than the rule allows of `n_total` trials.
+
+    Args:
+        rule: says what a failure is, and how many are allowed.
+        trials: trials of the adversarial configuration so far.
+        clean_trials: clean trials of the same seeds, or more.
+        n_total: number of trials that there may be in the end.
+    """
     n_failures = _list_outcomes(rule, trials, clean_trials).count(False)
     return n_failures > rule.count_allowed_failures(n_total)
 
@@ -458,19 +478,23 @@ def _extend_clean_trials(
     look: int,
     max_trials: int,
 ) -> int:
-    """Run clean trials until `look` of them count, or there are `max_trials`; return
-    how many there are then.
+    """Run clean trials until `look` of them count, or there are `max_trials`.
 
-    Over conditions, clean trials that are wrong do not count, so that more are run.
+    Over conditions (weather, viewpoints, ...) a clean trial that is wrong does not
+    count, so another is run for it.
+
+    Returns:
+        How many trials are needed for this look, those that do not count included.
 
     Args:
-        clean_trials: so far; new ones are appended.
-        run_clean: runs trials, see `run_trials`.
+        clean_trials: clean trials so far; new ones are appended.
+        run_clean: runs trials of the clean configuration (`run_trials`).
         rule: says which trials count.
         look: number of trials that have to count.
         max_trials: maximum number of trials.
     """
     count = look
+    # There may be more than `count` already, from an earlier call: then none is run.
     clean_trials += run_clean(trials=count, n_done=len(clean_trials))
     n_missing = look - rule.count_valid(clean_trials[:count])
     while n_missing > 0 and count < max_trials:
@@ -489,8 +513,10 @@ def _is_found(
     spp: int,
     is_early: bool,
 ) -> bool:
-    """Return whether a claim is found to hold: enough trials succeed, and the model is
-    not wrong about the clean configuration already.
+    """Return whether a claim holds at a look.
+
+    Enough trials have to succeed, and the model must not be wrong about the clean
+    configuration already.
 
     Args:
         rule: says how many have to succeed.
@@ -540,24 +566,26 @@ def _summarize_trials(
     is_early: bool,
     begin: int,
 ) -> Verification:
-    """Return the verification of a configuration by the trials of both groups: counts,
-    ending and the reason in a sentence.
+    """Return the verification of a configuration by the trials of both groups.
+
+    It has their counts, the ending, and a sentence with the reason for it.
 
     Args:
         rule: says what a success is, and how many are needed.
-        claim: the search's ending.
-        u: (d,) the configuration.
+        claim: how the search ended.
+        u: (d,) the configuration that was verified.
         clean_trials, trials: clean trials and trials of both groups, in the order of
             their seeds.
         spp: samples per pixel.
         confidence: confidence of the interval of the success rate.
-        renders: renders that were spent.
-        stopped: why there are no more trials.
+        renders: number of renders that the trials took.
+        stopped: why there are no more trials: "asked for" or "decided".
         is_early: whether the needed successes are those of an early look.
         begin: index of the first trial.
     """
     outcomes = _list_outcomes(rule, trials, clean_trials)
-    n_counted = max(1, len(outcomes) - outcomes.count(None))  # a rate needs one
+    # None marks a trial that does not count; a rate of no trials would be 0 / 0.
+    n_counted = max(1, len(outcomes) - outcomes.count(None))
     clean_counts = count_right(clean_trials, spp)
     counts = Trials(outcomes.count(True), n_counted, spp, confidence)
     ending = rule.decide_ending(claim, clean_counts, counts)

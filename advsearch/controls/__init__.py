@@ -48,14 +48,19 @@ def make_control(
     """Return a control from its name and settings.
 
     Args:
-        control_name: "kind"; "kind:mesh" for what is about one mesh, and that another
-            than the object (pose:chair); else "kind:name" for an instance with a name
-            of its own (light:key); or "kind.parameter" to search one parameter only,
-            over its default range. With "kind" among the settings, this is the
-            instance's name. A kind is a word, or "package.module:Class" where the class
-            has a capital and the module is no control.
-        settings: values for its parameters and choices; None or missing keeps the
-            default.
+        control_name: one of these forms:
+
+            - "pose", a kind of control;
+            - "pose:chair", the kind and the mesh that it acts on, if not the object;
+            - "light:key", the kind and a name for this instance, for kinds that do not
+              act on a mesh;
+            - "pose.yaw", the kind and the only parameter to search, over its default
+              range.
+
+            If the settings have a "kind", this is the name of the instance. A kind may
+            also be a class, "package.module:Class".
+        settings: values of its parameters and choices. None, or a missing one, means
+            the default.
 
     Raises:
         UnknownNameError: no such control, or no such setting.
@@ -87,8 +92,11 @@ def make_unknown_control_error(
 ) -> UnknownNameError:
     """Return the error for a control that does not exist.
 
-    If `kind` is a parameter of other controls, the message says so in place of `hint`.
-    Names of `instances` are suggested as well as those of controls.
+    Args:
+        kind: the unknown name. If it is a parameter of controls, e.g. "yaw", the
+            message says so: "write pose.yaw".
+        hint: otherwise the end of the message.
+        instances: further names that may be suggested, besides those of controls.
     """
     owners = [
         name
@@ -111,12 +119,16 @@ def parse_control_name(
 def _parse_name(
     control_name: str, settings: dict[str, object]
 ) -> tuple[str, str, str | None]:
-    """Return the kind, the instance's name, and the parameter of a control's full name.
+    """Split the full name of a control into kind, instance name and parameter.
 
-    The parameter is None unless the full name has one. If the settings have a "kind",
-    that is removed from them, and the full name is the instance's. Otherwise the full
-    name is that of a class of controls, or KIND, KIND:NAME, KIND.PARAMETER or
-    KIND.PARAMETER:NAME.
+    Args:
+        control_name: "pose", "pose:chair", "pose.yaw", "pose.yaw:chair" or a class of
+            controls, "package.module:Class". If the settings have a "kind", it is the
+            name of the instance.
+        settings: settings of the control; a "kind" is removed from them.
+
+    Returns:
+        Kind, instance name, and parameter; None if the full name has no parameter.
     """
     kind_setting = settings.pop("kind", None)
     if kind_setting is not None:
@@ -155,11 +167,15 @@ def check_instance_name(label: str, name: str, colon: str = ":") -> None:
 
 
 def _get_default_range(control: type[Control], parameter: str) -> object:
-    """Return the range, or the choices, of a parameter for which only its name was
-    given.
+    """Return the range, or the choices, of a parameter that was named without values.
 
-    Raises UnknownNameError or InputError: the control has no such parameter, or no
-    ranges.
+    Args:
+        control: class of the control.
+        parameter: name of the parameter, e.g. "yaw" of "pose.yaw".
+
+    Raises:
+        UnknownNameError: the control has no such parameter.
+        InputError: the control has no ranges of its own, as mitsuba.
     """
     if not control.parameters:
         raise InputError(
@@ -183,9 +199,13 @@ def _get_default_range(control: type[Control], parameter: str) -> object:
 def check_control_settings(
     settings: Mapping[str, object],
 ) -> dict[str, Mapping[str, object]]:
-    """Return the settings of each control, with ranges of Mitsuba's names under one.
+    """Check that the settings of each control are a mapping, and return them.
 
-    Raises InputError: one has something else than settings.
+    Names such as "mitsuba:mug.bsdf.reflectance" are grouped into one control first. A
+    control without settings (None) gets empty ones.
+
+    Raises:
+        InputError: the settings of a control are something else than a mapping.
     """
     by_name: dict[str, Mapping[str, object]] = {}
     for name, control_settings in group_mitsuba_keys(settings).items():
@@ -201,11 +221,11 @@ def check_control_settings(
 def merge_control_settings(
     settings: Mapping[str, object],
 ) -> dict[str, dict[str, object]]:
-    """Merge settings that are given by name into the settings of each control.
+    """Merge settings of single parameters into the settings of each control.
 
     `camera.azimuth` and `camera.elevation` become one control that searches both. A
-    parameter that only a name states has its default range; what settings state of it
-    wins.
+    parameter that is only named is searched over its default range, unless the settings
+    state another one.
 
     Args:
         settings: settings by name; a name may be "kind", "kind:name", "kind.parameter"
@@ -234,8 +254,9 @@ def merge_control_settings(
 def make_space(controls: Sequence[Control], scene: SceneDescription) -> Space:
     """Compose controls and a scene into a space that can be searched.
 
-    Raises InputError: no control, two of one name, one that the scene cannot take, or
-    nothing that varies.
+    Raises:
+        InputError: there is no control, two have the same name, one does not fit the
+            scene, or every parameter is fixed.
     """
     if not controls:
         raise InputError(f"controls: expected at least one of {', '.join(CONTROLS)}")
@@ -265,9 +286,14 @@ def _make_example_range(control: Control) -> str:
 
 
 def _check_names_no_mesh(controls: Sequence[Control], scene: SceneDescription) -> None:
-    """Check that no control's own name is that of a mesh beside the object.
+    """Check that no control is named after a mesh that it does not act on.
 
-    A name as in light:chair would seem to say that the control acts on that mesh.
+    In "pose:chair" the chair is the mesh that is moved. "light:chair" is only a light
+    with that name, and would be misunderstood.
+
+    Args:
+        controls: controls to check.
+        scene: scene with the meshes around the object.
 
     Raises:
         InputError: a control has such a name.
@@ -287,16 +313,17 @@ def _check_names_no_mesh(controls: Sequence[Control], scene: SceneDescription) -
 
 
 def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
-    """Let controls prepare a scene, bind them to it and compose them.
+    """Let controls prepare a scene, bind them to it and compose them into a space.
 
-    There may be none, or only fixed ones. All controls prepare the scene before any is
-    bound to it. Values of the clean scene that controls replace become adjusted
-    defaults of the space, in the order of the controls; an environment among them, or
-    one that a control has put into the scene, becomes that of the space.
+    There may be no controls, or only fixed ones. All prepare the scene, e.g. add a
+    mesh, before any is bound to it, so that each is bound to the final scene. If
+    controls replace default values of the clean scene, the space lists these as
+    adjusted defaults, in the order of the controls. If one of them replaces the
+    environment, the space has its name.
 
     Raises:
-        InputError: two controls of one name, one that the scene cannot take, or one
-            that leaves out what was requested of the scene.
+        InputError: two controls have the same name, one does not fit the scene, or one
+            replaces a value that the user set.
     """
     _check_controls(controls, scene)
     described_scene = scene
@@ -323,9 +350,11 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
 
 
 def _check_controls(controls: Sequence[Control], scene: SceneDescription) -> None:
-    """Check that controls go together, and with a scene that none has prepared.
+    """Check that controls fit each other, and a scene that none has prepared yet.
 
-    Raises InputError: they do not, or two have one name.
+    Raises:
+        InputError: two controls have the same name, one is named after a mesh that it
+            does not act on, or one does not fit the scene's photographs.
     """
     names = [control.name for control in controls]
     if len(set(names)) != len(names):

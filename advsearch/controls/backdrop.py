@@ -66,13 +66,17 @@ class BackdropControl(Control):
         return (replace(which, options=options, default=options[0], high=high),)
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        """Check the photographs, and begin with the first one that is allowed.
+        """Return the scene in the first allowed photograph, after checking all of them.
 
-        The scene gets a camera model if one of the cameras has one.
+        If one of the photographs has a camera model, the scene gets one: all are then
+        seen through the same kind of lens.
+
+        Args:
+            scene: scene that is rendered into a folder of photographs.
 
         Raises:
-            InputError: the scene is rendered into no folder, a name is none of its
-                photographs, or one of them can not be shown beside the others.
+            InputError: there is no folder, a name is none of its photographs, or the
+                photographs differ in what a scene can't change, e.g. the kind of lens.
         """
         folder = scene.photographs
         if folder is None:
@@ -106,10 +110,10 @@ class BackdropControl(Control):
         )
 
     def _check_views(self, views: Mapping[str, SceneDescription]) -> None:
-        """Raise InputError if two photographs can not be shown in one scene.
+        """Raise InputError if the photographs can't all be shown in one scene.
 
-        `views` are the scenes in the photographs, by name. All are compared with the
-        first.
+        Args:
+            views: scene in each photograph, by name; all are compared with the first.
         """
         first_name, first = next(iter(views.items()))
         first_lens = _get_lens(first)
@@ -132,7 +136,7 @@ class BackdropControl(Control):
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
         """Return the parameter with the photographs as options, the first as default.
 
-        They are searched unless the user chose among them.
+        Without a setting of the user all of them are searched.
         """
         options = tuple(map(str, self._list_names(self.scene)))
         high = max(len(options) - 1.0, 0.0)
@@ -158,11 +162,14 @@ class BackdropControl(Control):
 
 @cache_per_scene
 def _compute_view_inputs(scene: SceneDescription, index: int) -> dict[str, Tensor]:
-    """Return the inputs by which a scene is seen as in one of its photographs.
+    """Return the scene inputs that replace the first photograph by another one.
+
+    They set the photograph, the camera's pose, lens and exposure, the ground plane, and
+    the environment, turned with the camera.
 
     Args:
         scene: scene in the first photograph.
-        index: index of the photograph.
+        index: index of the photograph to show.
     """
     assert scene.photographs is not None
     view = list(scene.photographs.scenes.values())[index]
@@ -172,6 +179,7 @@ def _compute_view_inputs(scene: SceneDescription, index: int) -> dict[str, Tenso
     inputs = {
         PHOTOGRAPH_INPUT: torch.tensor(float(index)),
         "camera.to_world": torch.from_numpy(pose).float(),
+        # in stops, relative to the first photograph
         "camera.exposure": torch.tensor(math.log2(view.gain / scene.gain)),
     }
     if scene.camera_model is not None:
@@ -216,20 +224,23 @@ def _get_lens(view: SceneDescription) -> CameraModel:
 def _check_compatible(
     name: str, view: SceneDescription, first: SceneDescription
 ) -> None:
-    """Raise InputError if a photograph can not be shown in the scene of the first one.
+    """Raise InputError if a photograph can't be shown in the scene of the first one.
+
+    Both need the same environment, the same direction up and the same ground plane.
 
     Args:
-        name: name of the photograph.
-        view: the scene in it.
-        first: the scene in the first one.
+        name: name of the photograph, for messages.
+        view: scene in this photograph.
+        first: scene in the first photograph.
     """
     if view.environment_spec != first.environment_spec:
         raise InputError(
             f"`controls` backdrop: {name} has a light of its own beside it; state one "
             "`environment` for all photographs, or sweep over them"
         )
+    # (4, 4) from the world of this photograph to that of the first
     carry = _compute_carry(view, first)
-    # Row 2 of the map gives z in the first scene: it has to be z, but for a shift.
+    # Row 2 gives z in the first world: it has to be z here as well, but for a shift.
     up_change = carry[2, :3] - [0.0, 0.0, 1.0]
     is_upright = np.abs(up_change).max() <= PLANE_TOLERANCE and carry[2, 2] > 0.0
     same_surface = all(

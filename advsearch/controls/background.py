@@ -82,9 +82,17 @@ class BackgroundControl(Control):
     )
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
-        """Check that something can be searched. Raises InputError."""
+        """Read the settings, and check that something can be searched.
+
+        Args:
+            name: name of the control; by default its kind.
+            **settings: values of its parameters.
+
+        Raises:
+            InputError: `what` is fixed at the environment, which shows no color.
+        """
         super().__init__(name, **settings)
-        # a list for `what` alone leaves the colour to be searched
+        # If only `what` has a list, the color is searched too, unless it is fixed.
         color_specs = [
             self.specs[parameter_name]
             for parameter_name in COLOR_PARAMETERS
@@ -148,8 +156,8 @@ def hsv_to_rgb(hue: Tensor, saturation: Tensor, value: Tensor) -> Tensor:
     All are display-referred. Piecewise linear in each argument, so differentiable
     almost everywhere; a grey has the derivative 0 by hue.
     """
-    # (3,) where the hue is on the color circle of six sectors, as red, green and blue
-    # see it
+    # (3,) position of the hue on the color circle, which has six sectors; each channel
+    # has an offset of its own
     sector = torch.remainder(torch.tensor([5.0, 3.0, 1.0]).to(hue) + hue / 60.0, 6.0)
     # how much of the saturation is taken from each channel
     ramp = torch.minimum(sector, 4.0 - sector).clamp(0.0, 1.0)

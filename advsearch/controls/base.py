@@ -122,13 +122,18 @@ def _describe_adjustment(value: AdjustedDefault) -> str:
 def list_replaced_settings(
     control: str, before: SceneDescription, after: SceneDescription
 ) -> Iterator[AdjustedDefault]:
-    """Yield the values of a scene that a control replaced although they were defaults.
+    """Yield the default values of a scene that a control has replaced.
 
-    They are the environment, and the settings that have another value after the control
-    has prepared the scene than before.
+    They are the environment, and settings such as "ground.size" that differ between
+    both scenes.
+
+    Args:
+        control: name of the control, for messages.
+        before: scene before the control has prepared it.
+        after: scene that the control returned.
 
     Raises:
-        InputError: the user set a value that was replaced.
+        InputError: a replaced value was set by the user, so it is no default.
     """
     environment = _find_replaced_environment(control, before, after)
     if environment is not None:
@@ -150,10 +155,15 @@ def list_replaced_settings(
 def _find_replaced_environment(
     control: str, before: SceneDescription, after: SceneDescription
 ) -> AdjustedDefault | None:
-    """Return the environment that a control replaced in a scene; None if it did not.
+    """Return the environment that a control has replaced in a scene, or None.
 
-    None, too, if the scene after it states the new environment in its
-    `environment_spec`: then it is no default that was adjusted.
+    It is also None if the new scene names the new environment in its
+    `environment_spec`: then the environment is not an adjusted default.
+
+    Args:
+        control: name of the control, for messages.
+        before: scene before the control has prepared it.
+        after: scene that the control returned.
 
     Raises:
         InputError: the user set the environment that was replaced.
@@ -210,10 +220,14 @@ class Choice:
     signed: bool = False
 
     def check(self, control: str, value: object) -> None:
-        """Check what was chosen; raises InputError if it cannot be chosen.
+        """Check a value of this choice.
 
-        `control` is the name of the instance, for messages. None is fine where it is
-        the default.
+        Args:
+            control: name of the control, for messages.
+            value: what the user set; None is allowed if it is the default.
+
+        Raises:
+            InputError: the value is not allowed.
         """
         if value is None and self.default is None:
             return
@@ -345,7 +359,17 @@ class Control:
             cls.summary = " ".join(cls.__doc__.partition("\n\n")[0].split())
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
-        """Read the settings; see the class."""
+        """Read and check the settings of a control, without a scene.
+
+        Args:
+            name: name of this instance; by default its kind, e.g. "pose".
+            **settings: value, range or list of values of each parameter, and values of
+                choices. None counts as left out.
+
+        Raises:
+            InputError: a setting is out of range or of a wrong form.
+            UnknownNameError: there is no such setting.
+        """
         self.name = name or self.kind
         settings = {
             setting: distribution_to_setting(value)
@@ -402,9 +426,12 @@ class Control:
         return cls.parameters
 
     def check_choices(self) -> None:
-        """Check what the choices' own declarations do not say of `self.chosen`.
+        """Check the values of the choices, `self.chosen`, in ways of a subclass.
 
-        By default nothing. Raises InputError: a choice is out of range.
+        For example, two choices may exclude each other. By default nothing is checked.
+
+        Raises:
+            InputError: a choice is out of range.
         """
 
     def to_settings(self) -> dict[str, object]:
@@ -429,10 +456,12 @@ class Control:
         return to_file_name(self.name)
 
     def get_mesh(self, scene: SceneDescription) -> MeshPart:
-        """Return the mesh that the control is about, in a scene.
+        """Return the mesh of a scene that the control acts on, e.g. "chair".
 
-        Raises UnknownNameError or InputError: there is none of that name, or it is one
-        of a Mitsuba scene that stays as it is.
+        Raises:
+            UnknownNameError: the scene has no such mesh.
+            InputError: it belongs to the surroundings of a Mitsuba scene, which can't
+                be changed by this control.
         """
         mesh = self.mesh
         if mesh in scene.meshes:
@@ -461,14 +490,14 @@ class Control:
         return f"{self.kind if self.mesh == OBJECT else self.name}.{parameter.name}"
 
     def select_form(self, forms: Sequence[str]) -> str:
-        """Return the form in which a control acts, such as "palette" of `texture`.
+        """Return the form in which a control acts, such as "palette" for `texture`.
 
-        The user requests a form by the setting `form`, or by naming the parameter that
-        stands for it.
+        Each form has one parameter. The user requests a form by the setting `form`, or
+        by setting its parameter to its full range.
 
         Args:
-            forms: the forms, one for each parameter in their order; the first is the
-                default.
+            forms: names of the forms, in the order of their parameters; the first is
+                the default.
 
         Raises:
             InputError: two forms are requested, or a parameter is set to a narrower
@@ -502,11 +531,11 @@ class Control:
     def list_allowed_values(
         self, parameter: str, *defaults: ParameterValue
     ) -> tuple[ParameterValue, ...]:
-        """Return the values that a parameter was set to, one by one.
+        """Return the values that a parameter may have, if they can be listed.
 
         Args:
-            parameter: its name.
-            *defaults: what is returned where it was not set, or has a range.
+            parameter: name of the parameter.
+            *defaults: returned if it was not set, or was set to a range.
         """
         spec = self.specs.get(parameter)
         if isinstance(spec, OneOf):
@@ -528,7 +557,10 @@ class Control:
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Return the scene with the parts that this control needs (a light, a medium).
 
-        By default it is unchanged. Raises InputError: the scene cannot take them.
+        By default it is unchanged.
+
+        Raises:
+            InputError: the control does not fit the scene.
         """
         return scene
 
@@ -541,7 +573,8 @@ class Control:
     def bind(self, scene: SceneDescription) -> Self:
         """Return a copy that is bound to a scene, which all controls have prepared.
 
-        Raises InputError: a setting of the control is impossible in this scene.
+        Raises:
+            InputError: a setting of the control is impossible in this scene.
         """
         bound = self.with_scene(scene)
         bound.fit()
@@ -549,6 +582,9 @@ class Control:
 
     def fit(self) -> None:
         """Set `slots`, `start`, `groups` and `adjusted_defaults` for `self.scene`.
+
+        A slot is the place of one parameter in the control's slice of u; a fixed one
+        has no coordinates. A group has the coordinates of one searched parameter.
 
         Raises:
             InputError: a setting of the control is impossible in this scene.
@@ -605,11 +641,14 @@ class Control:
         return parameter.default
 
     def get_spec(self, parameter: Parameter) -> Spec:
-        """Return what a parameter, as `resolve_parameter` returned it, is set to.
+        """Return what a parameter is set to: a value, a range or a list of values.
 
         A parameter that the user did not set is searched over its default range. But it
-        is fixed at its default if it has no such range, or if another parameter was
-        given a range.
+        is fixed at its default if it has no such range, or if the user gave another
+        parameter a range.
+
+        Args:
+            parameter: parameter with its range in the scene (`resolve_parameter`).
         """
         if parameter.name in self.specs:
             return self.specs[parameter.name]
@@ -641,7 +680,13 @@ class Control:
         scene_value: ParameterValue,
         used_value: ParameterValue,
     ) -> None:
-        """Note that the start has another value of a parameter than the clean scene."""
+        """Record that the search starts at another value than the clean scene has.
+
+        Args:
+            parameter: the parameter.
+            scene_value: its value in the clean scene.
+            used_value: its value at the start of the search.
+        """
         self.adjusted_defaults = (
             *self.adjusted_defaults,
             AdjustedDefault(
@@ -654,14 +699,14 @@ class Control:
         )
 
     def _list_adjusted_defaults(self) -> Iterator[AdjustedDefault]:
-        """Yield the values of the clean scene that the start does not have.
+        """Yield the parameters whose start differs from the value in the clean scene.
 
-        Values that the user fixed are left out. A control with an `amount` yields
-        nothing but that one: at the amount of the clean scene its other parameters have
-        no effect.
+        Parameters that the user fixed are left out. If the control has an `amount`,
+        such as the density of a haze, only that is compared: at the amount of the clean
+        scene, its other parameters have no effect.
 
         Raises:
-            InputError: the user set one of them for the scene.
+            InputError: the user set the scene's value, and the range excludes it.
         """
         for slot in self.slots:
             parameter = slot.parameter
@@ -672,7 +717,7 @@ class Control:
             hides_others = self.amount not in (None, parameter.name)
             if hides_others or is_same_value(used, scene_value, is_angle=slot.is_angle):
                 continue
-            # as the user sets the same value of the scene
+            # the scene's setting that has the same meaning
             setting = self.setting_name(parameter)
             label = f"{self.name}.{parameter.name}"
             if setting in self.scene.requested:
@@ -703,8 +748,13 @@ class Control:
     def _group(self, slot: Slot) -> Group:
         """Return the group of coordinates of a searched parameter.
 
-        A choice has no estimators, since it has no derivative. Raises InputError: a
-        distribution together with a ball.
+        A list of values gets no gradient estimators, since it has no derivative.
+
+        Args:
+            slot: the parameter's place in u.
+
+        Raises:
+            InputError: a parameter with a norm budget was given a distribution.
         """
         parameter = slot.parameter
         name = parameter.name
@@ -761,17 +811,20 @@ class Control:
     # ---- at a configuration
 
     def values(self, u: Tensor) -> dict[str, Tensor]:
-        """Return every parameter's value at a slice of u, fixed ones too.
+        """Return the value of every parameter, fixed ones too.
+
+        Args:
+            u: (d,) the control's slice of a configuration, in [0, 1].
 
         Returns:
-            By name, float32 of the parameter's shape; of a choice the index of its
-            option.
+            By name, float32 of the parameter's shape and in its unit. For a parameter
+            with named options it is the index of the option.
         """
         values: dict[str, Tensor] = {}
         if not self.slots:
             return values
-        # of all coordinates at once; those with a logarithmic scale or a distribution
-        # are interpolated one by one below
+        # All coordinates are interpolated linearly at once, which is fast. Those with a
+        # logarithmic scale or a distribution are interpolated again below.
         linear = self._low.to(u) + self._span.to(u) * u
         for slot in self.slots:
             parameter = slot.parameter
@@ -842,9 +895,13 @@ class Control:
     ) -> dict[str, Value]:
         """Describe a configuration by a few named values with units.
 
-        They are the values of the parameters that are not fixed, without images, and
-        those of `measured`. Names are `<control>.<parameter>`, with an index for an
-        element of a vector. Arguments are those of `inputs`.
+        They are the parameters that are not fixed, except images, and the values of
+        `measured`. Names are `<control>.<parameter>`, such as "pose.yaw", with an index
+        for an element of a vector.
+
+        Args:
+            u: (d,) the control's slice of a configuration, in [0, 1].
+            earlier_inputs: inputs of the controls that are evaluated before this one.
         """
         values = self.values(u.detach())
         described: dict[str, Value] = {}
@@ -868,9 +925,10 @@ class Control:
         return described
 
     def get_numeric_values(self, u: Tensor) -> Mapping[str, Tensor]:
-        """Return the numbers of a configuration by parameter; names are left out.
+        """Return the numeric parameters of a configuration, by name.
 
-        Each is (k,) or (), in the parameter's unit, and differentiable in u.
+        Parameters with named options, and images, are left out. Each value is (k,) or
+        (), in the parameter's unit, and differentiable in u (d,).
         """
         values = self.values(u)
         numbers = {}
@@ -892,30 +950,44 @@ class Control:
     def kept_pictures(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return images worth storing; see `get_artifact_images`."""
+        """Return images to store with a result, by file stem; none by default.
+
+        Each is (h, w, 3), display-referred sRGB in [0, 1].
+        """
         return {}
 
     def get_artifact_images(
         self, u: Tensor, earlier_inputs: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Tensor]:
-        """Return images worth storing, by file stem.
+        """Return images to store with a result, by file stem, such as a texture.
 
-        Each is (h, w, 3), display-referred sRGB in [0, 1]. Arguments as for `describe`.
+        A subclass provides them by `kept_pictures`.
+
+        Args:
+            u: (d,) the control's slice of a configuration, in [0, 1].
+            earlier_inputs: inputs of the controls that are evaluated before this one.
+
+        Returns:
+            Images (h, w, 3), display-referred sRGB in [0, 1].
         """
         return self.kept_pictures(self.values(u.detach()), earlier_inputs)
 
     def kept_files(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, bytes]:
-        """Return other files worth storing; see `get_artifact_files`."""
+        """Return other files to store with a result, by name with suffix."""
         return {}
 
     def get_artifact_files(
         self, u: Tensor, earlier_inputs: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, bytes]:
-        """Return other files worth storing, by name with suffix, such as a mesh as PLY.
+        """Return other files to store with a result, by name with suffix.
 
-        Arguments as for `describe`.
+        A file may be a mesh as PLY. A subclass provides them by `kept_files`.
+
+        Args:
+            u: (d,) the control's slice of a configuration, in [0, 1].
+            earlier_inputs: inputs of the controls that are evaluated before this one.
         """
         return self.kept_files(self.values(u.detach()), earlier_inputs)
 
@@ -964,11 +1036,11 @@ def make_value(value: Tensor | float, unit: str) -> Value:
 
 
 def describe_color_change(name: str, change: Tensor) -> dict[str, Value]:
-    """Describe a change of searched colors: the largest, and the root mean square.
+    """Describe a change of searched colors by its maximum and its root mean square.
 
     Args:
         name: name of the control.
-        change: any shape, display-referred.
+        change: tensor of any shape, in display-referred sRGB.
     """
     root_mean_square = change.square().mean().sqrt()
     return {

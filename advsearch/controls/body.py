@@ -55,7 +55,11 @@ class BodyControl(Control):
 
     @property
     def rig(self) -> assets.MeshRig:
-        """What moves the mesh. Raises InputError if it has no joints."""
+        """The rig of the mesh: its joints and animations.
+
+        Raises:
+            InputError: the mesh has no joints.
+        """
         mesh = self.get_mesh(self.scene)
         if mesh.mesh.rig is None:
             raise InputError(
@@ -67,18 +71,21 @@ class BodyControl(Control):
 
     @property
     def clip(self) -> str | None:
-        """The name of the animation that is played; None for none.
+        """The name of the animation that is played, or None.
 
-        Raises UnknownNameError if the mesh has no animation of the chosen name or
-        number.
+        The choice `clip` is a name, or the number of an animation from 0 on.
+
+        Raises:
+            UnknownNameError: the mesh has no animation of that name or number.
         """
         clips = self.rig.clips
         requested = self.chosen["clip"]
         if requested is None:
-            # by default the first animation, if its time is set, or nothing at all
+            # By default the first animation is played, if the control has no settings
+            # or its time is set.
             plays_time = geometry.TIME.name in self.specs or not self._settings
             return clips[0] if clips and plays_time else None
-        index = -1  # of no animation
+        index = -1  # no index of an animation
         # a number may be given as text
         if Parameter.is_number(requested) or str(requested).isdecimal():
             index = int(requested)

@@ -135,15 +135,16 @@ class CameraControl(Control):
     )
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        """Check the settings against the scene, and add the lens that they need.
+        """Return the scene with the lens that the settings need, after checking them.
 
-        Distortion coefficients need a camera model: without one, a pinhole's is added.
-        An aperture or a focus needs a thin lens, in a scene without a camera model. If
-        the camera would always drive against the traffic, a remark is added.
+        Distortion coefficients need a camera model; if there is none, that of a pinhole
+        is added. An aperture or a focus needs a thin lens, which is possible only
+        without a camera model. If the camera would always drive against the traffic, a
+        remark is added.
 
         Raises:
-            InputError: the scene has another camera, two settings are the same thing,
-                or its lens does not support one.
+            InputError: the scene's camera does not orbit, two settings determine the
+                same number, or the lens does not support a setting.
         """
         self._check_can_orbit(scene)
         needs_thin_lens = "aperture" in self.specs or "focus" in self.specs
@@ -166,11 +167,11 @@ class CameraControl(Control):
         return scene
 
     def _check_can_orbit(self, scene: SceneDescription) -> None:
-        """Check that the scene's camera orbits, and that no two settings are one.
+        """Check that the scene's camera orbits, and that no number is set twice.
 
         Raises:
-            InputError: the camera is fixed by the scene, or two settings that stand for
-                the same thing (such as `distance` and `sizes`) are both set.
+            InputError: the scene fixes the camera; or two settings that determine the
+                same number, such as `distance` and `sizes`, are both set.
         """
         if scene.camera != ORBIT_CAMERA:
             raise InputError(
@@ -187,14 +188,15 @@ class CameraControl(Control):
                 )
 
     def _check_lens(self, model: CameraModel, distortion_names: Sequence[str]) -> None:
-        """Check that a camera model has what the settings change.
+        """Check that a lens has all the numbers that the settings change.
 
         Args:
-            model: the lens, from a camera file or a pinhole with distortion.
-            distortion_names: the distortion coefficients that were set.
+            model: lens from a camera file, or a pinhole with distortion, which has no
+                name.
+            distortion_names: distortion coefficients that were set, such as "k1".
 
         Raises:
-            InputError: a setting is none of this kind of lens.
+            InputError: this kind of lens does not have a number that was set.
         """
         supported_names = COEFFICIENTS_OF_KIND[model.kind]
         for name in distortion_names:
@@ -222,7 +224,8 @@ class CameraControl(Control):
     def _drives_against_traffic(self, scene: SceneDescription) -> bool:
         """Return whether the camera always drives against the traffic.
 
-        That is at the lower end, the center and the upper end of all its ranges.
+        Three configurations are checked: all parameters at the lower bound, the center
+        and the upper bound of their ranges.
         """
         control = self.bind(scene)
         configurations = (
@@ -250,12 +253,17 @@ class CameraControl(Control):
         return replace(parameter, default=default, search=search)
 
     def _find_default(self, parameter: Parameter) -> ParameterValue:
-        """Return the value of a parameter that the scene's lens and pose have."""
+        """Return the value of a parameter in the scene, by its lens and its pose.
+
+        Args:
+            parameter: the parameter; if the scene does not determine its value, its
+                own default is returned.
+        """
         scene = self.scene
         name = parameter.name
         if name in COEFFICIENTS and scene.camera_model is not None:
             return scene.camera_model.values[name]
-        # all three are how far the camera is away: it is focused on the object
+        # All three are the distance of the object, as the camera is focused on it.
         if name in ("distance", "focus", "sizes"):
             fixed_lens_scene = self._with_fixed_lens()
             camera_position = camera_to_world(fixed_lens_scene)[:3, 3]
@@ -277,9 +285,16 @@ class CameraControl(Control):
     ) -> tuple[float, float] | None:
         """Return the range that a parameter is searched over if the user sets none.
 
-        It is the preset's, if the scene has one. Around a road vehicle the height is
-        searched (the heights of road users' eyes) and the elevation is not. A distance
-        is searched over multiples of its default.
+        If the scene has a preset, it is that of the preset. Around a road vehicle, the
+        camera's height is searched over the eye heights of road users, and the
+        elevation is not searched. A distance is searched over multiples of its default.
+
+        Args:
+            parameter: the parameter.
+            default: its value in the scene.
+
+        Returns:
+            Lower and upper bound; None if the parameter is not searched by default.
         """
         scene = self.scene
         name = parameter.name
@@ -310,7 +325,11 @@ class CameraControl(Control):
     ) -> dict[str, Tensor]:
         """Return the camera's pose, lens, focus, shift and exposure.
 
-        A camera model has its own numbers in place of the field of view and the shift.
+        With a camera model, "camera.lens" replaces the field of view and the shift.
+
+        Args:
+            values: values of the control by parameter.
+            earlier_inputs: inputs of earlier controls, which are not used.
         """
         scene = self.scene
         fov = values["fov"]
@@ -341,11 +360,15 @@ class CameraControl(Control):
     def _compute_model_numbers(
         self, model: CameraModel, values: Values, fov: Tensor
     ) -> Tensor:
-        """Return the numbers (17,) of the camera's model, in the order of
-        `NUMBER_NAMES`.
+        """Return the numbers (17,) of the camera model, in the order of `NUMBER_NAMES`.
 
-        A model without a name is a pinhole whose focal lengths are those of the field
-        of view; coefficients that were set replace the model's.
+        Distortion coefficients that were set replace those of the model.
+
+        Args:
+            model: lens from a camera file; or one without a name, which is a pinhole
+                whose focal lengths follow from the field of view.
+            values: values of the control by parameter.
+            fov: () field of view along the larger side, degrees.
         """
         model_values = {
             name: torch.tensor(value) for name, value in model.values.items()
@@ -369,11 +392,10 @@ class CameraControl(Control):
         return torch.stack([model_values[name].to(fov) for name in NUMBER_NAMES])
 
     def _with_fixed_lens(self) -> SceneDescription:
-        """Return the scene with the field of view to which the control fixes it, if it
-        does.
+        """Return the scene with the field of view of this control, if it is fixed.
 
-        The camera's distance depends on the field of view, so that it is computed for
-        this one.
+        The default distance of the camera depends on the field of view, because the
+        object fills the image. So it has to be computed with this one.
         """
         fov = self.specs.get("fov")
         focal_length = self.specs.get("focal_length")
@@ -388,9 +410,13 @@ class CameraControl(Control):
     def _compute_distance(self, values: Values, fov: Tensor) -> Tensor:
         """Return the camera's distance () from the object's center, in object sizes.
 
-        It is that of `sizes` or `distance`, if the user or the scene sets one of them,
-        or if all parameters are searched. Otherwise only others are: then it is the
-        distance at which a field of view of `fov` degrees frames the object.
+        It is the value of `sizes` or `distance` if the user or the scene sets one of
+        them, or if all parameters are searched. Otherwise only other parameters are
+        searched: then it is the distance at which the object fills the image.
+
+        Args:
+            values: values of the control by parameter.
+            fov: () field of view, degrees.
         """
         scene = self.scene
         if "sizes" in self.specs:
@@ -404,8 +430,13 @@ class CameraControl(Control):
     def _compute_elevation(self, values: Values, distance: Tensor) -> Tensor:
         """Return the elevation () of the camera over the object's center, radians.
 
-        It follows from the height in two cases: the user set the height; or set neither
-        of the two, and the scene states a height or the height is searched.
+        It follows from the height in two cases: the user set the height; or the user
+        set neither height nor elevation, and the scene states a height or the height is
+        searched.
+
+        Args:
+            values: values of the control by parameter.
+            distance: () distance from the object's center, object sizes.
         """
         has_height = "height" in self.specs
         if not {"elevation", "height"} & self.specs.keys():

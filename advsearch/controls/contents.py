@@ -91,7 +91,8 @@ class Vessel:
 def find_interior(asset: assets.ObjectAsset) -> Vessel | None:
     """Find the inside of an object in its default pose; None if it is no vessel.
 
-    The wall is found by level rays from the axis of the largest basin, at even heights.
+    The largest basin is found on a height map: where most water would stand. Its wall
+    is found by level rays from the axis of the basin, at evenly spaced heights.
     """
     mesh = asset.mesh
     basin = _find_basin(mesh)
@@ -100,7 +101,7 @@ def find_interior(asset: assets.ObjectAsset) -> Vessel | None:
     axis, floor, rim = basin
     depth = rim - floor
     heights = np.linspace(floor, floor + FILL_LIMIT * depth, WALL_ROWS)
-    # just above the floor, since a ray along a flat floor might hit anything
+    # Rays start a little above the floor: along a flat floor they would graze it.
     min_height = floor + 0.004 * depth
     distances = []
     faces = []
@@ -113,7 +114,8 @@ def find_interior(asset: assets.ObjectAsset) -> Vessel | None:
     radii = _fill_missed_radii(np.stack(distances))
     if radii is None:
         return None
-    # what is seen through the liquid; -1 is a ray that hit no face
+    # The color of the lower half is what is seen through the liquid. A ray that hit no
+    # face has the index -1.
     lower_faces = np.concatenate(faces[: WALL_ROWS // 2])
     wall_color = _mean_face_color(asset, lower_faces[lower_faces >= 0])
     return Vessel(axis, heights, radii, wall_color)
@@ -156,10 +158,11 @@ def _find_basin(mesh: assets.Mesh) -> tuple[assets.Float64Array, float, float] |
     """Find the largest basin of a mesh: where most water would stand.
 
     Returns:
-        Its axis (2,), the center of the water seen from above, weighted by depth; and
-        the heights of its floor and its rim. None if it is too shallow or its opening
-        too small.
+        Its axis (2,), which is the center of the water from above, weighted by depth;
+        the height of its floor; and the height of its rim. None if it is too shallow or
+        its opening too small.
     """
+    # ground: height of the mesh in each cell; water: level at which water would stand
     corner, cell, ground = _compute_height_map(mesh)
     water = _fill_with_water(ground)
     water_depth = water - ground
@@ -193,7 +196,7 @@ def _compute_height_map(
     lower = vertices[:, :2].min(axis=0)
     upper = vertices[:, :2].max(axis=0)
     cell = float((upper - lower).max()) / GRID_CELLS
-    # a margin of at least one cell on each side
+    # at least one empty cell on each side, over which water runs off
     lower = lower - 1.5 * cell
     width, height = (np.ceil((upper - lower) / cell).astype(np.int64) + 2).tolist()
     below_mesh = vertices[:, 2].min() - 1.0
@@ -215,11 +218,11 @@ def _draw_edges(
     """Raise a height map (h, w) to the edges of triangles, in place.
 
     Args:
-        ground: the map.
-        positions: (F, 3, 2) of the corners, in cells.
-        heights: (F, 3) of the corners.
+        ground: (h, w) height map; it is changed.
+        positions: (F, 3, 2) column and row of the corners of triangles, in cells.
+        heights: (F, 3) heights of the corners.
     """
-    # 9 points of each edge
+    # 9 points on each edge
     for fraction in np.linspace(0.0, 1.0, 9):
         for begin, end in ((0, 1), (1, 2), (2, 0)):
             edge = positions[:, end] - positions[:, begin]
@@ -230,11 +233,14 @@ def _draw_edges(
 
 
 def _fill_with_water(ground: assets.Float64Array) -> assets.Float64Array:
-    """Return the level of water on a height map (h, w) from whose edges it runs off.
+    """Return the level (h, w) at which water stands on a height map after heavy rain.
 
-    At first there is water without end inside, and none at the edges. Then each cell's
-    water falls to its lowest neighbour's, but not below the ground, until nothing
-    changes.
+    Water runs off over the edges of the map. At first the level is infinite inside, and
+    that of the ground at the edges. Then the level of each cell falls to that of its
+    lowest neighbor, but not below the ground, until nothing changes.
+
+    Args:
+        ground: (h, w) height map.
     """
     water = np.full_like(ground, np.inf)
     water[[0, -1]] = ground[[0, -1]]
@@ -273,8 +279,13 @@ def _find_wall(
 ) -> tuple[assets.Float64Array, assets.IntArray]:
     """Cast level rays from the axis at a height, in K = `WALL_DIRECTIONS` directions.
 
-    A face is cut at the height into a segment; a ray hits a segment if its ends lie on
-    different sides of the ray's line, in front of the axis.
+    The level plane cuts a face in a segment. A ray hits the segment if its two ends lie
+    on different sides of the ray's line, and the crossing is in front of the axis.
+
+    Args:
+        mesh: mesh of the object.
+        axis: (2,) x and y of the axis.
+        height: z of the rays.
 
     Returns:
         Distance (K,) of the first surface in each direction, infinite if there is none;
@@ -287,7 +298,7 @@ def _find_wall(
     second_end = second_end - axis
     angle = np.arange(WALL_DIRECTIONS) * 2.0 * np.pi / WALL_DIRECTIONS
     ray = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    # (K, S) cross products, whose signs are the sides of each ray that the ends are on
+    # (K, S) cross products; their signs tell on which side of a ray an end lies
     first_side = ray[:, :1] * first_end[:, 1] - ray[:, 1:] * first_end[:, 0]
     second_side = ray[:, :1] * second_end[:, 1] - ray[:, 1:] * second_end[:, 0]
     is_crossed = (first_side > 0.0) != (second_side > 0.0)
@@ -315,7 +326,7 @@ def _cut_faces(
     corners = corners[face]
     is_above = is_above[face]
     index = np.arange(len(face))
-    # (S,) the corner (0 to 2) that is on its side of the plane by itself
+    # (S,) index, 0 to 2, of the corner that is alone on its side of the plane
     apex_corner = np.where(
         is_above.sum(axis=1) == 1, is_above.argmax(axis=1), (~is_above).argmax(axis=1)
     )
@@ -376,9 +387,15 @@ class ContentsControl(Control):
     )
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
-        """Find the bounds of each proportion, also of those that are not set.
+        """Read the settings, and find the bounds of each proportion.
 
-        Raises InputError: the proportions cannot add up to 1.
+        Args:
+            name: name of the control; by default its kind.
+            **settings: values of its parameters; proportions that are not set get
+                bounds too.
+
+        Raises:
+            InputError: the proportions can't add up to 1.
         """
         super().__init__(name, **settings)
         self.proportion_bounds = self._read_bounds()
@@ -389,8 +406,11 @@ class ContentsControl(Control):
     def _add_default_bounds(self, rest: float) -> None:
         """Add the bounds of the proportions that are not set.
 
-        If proportions are searched, they go from 0 to the rest that those set leave.
-        Otherwise the first of coffee, water and milk that is not set has all of it.
+        If proportions are searched, the bounds are 0 and the rest. Otherwise the first
+        of coffee, water and milk that is not set gets all of the rest.
+
+        Args:
+            rest: what the proportions that are set leave of 1.
         """
         # all parameters are searched unless a range is set for some
         are_searched = not self.has_requested_search or any(
@@ -406,7 +426,7 @@ class ContentsControl(Control):
                 rest = 0.0
 
     def _read_bounds(self) -> dict[str, tuple[float, float]]:
-        """Return the least and the largest proportion of each ingredient that is set.
+        """Return the smallest and largest proportion of each ingredient that is set.
 
         Raises:
             InputError: one has a list of values or a distribution.
@@ -432,9 +452,13 @@ class ContentsControl(Control):
         return bounds
 
     def _check_total(self, min_total: float) -> None:
-        """Check that the proportions can add up to 1. Raises InputError: they cannot.
+        """Check that the proportions can add up to 1.
 
-        `min_total` is the sum of the lower bounds of those that are set.
+        Args:
+            min_total: sum of the lower bounds of the proportions that are set.
+
+        Raises:
+            InputError: they can't.
         """
         max_total = sum(upper for _, upper in self.proportion_bounds.values())
         all_set = len(self.proportion_bounds) == len(INGREDIENTS)
@@ -458,7 +482,13 @@ class ContentsControl(Control):
         )
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        """Add the surface of the liquid. Raises InputError: the object is no vessel."""
+        """Return the scene with a mesh for the surface of the liquid.
+
+        The mesh is a disk at half the height; `scene_inputs` moves its vertices.
+
+        Raises:
+            InputError: the object is no vessel.
+        """
         vessel = find_interior(scene.object)
         if vessel is None:
             raise InputError(
@@ -514,7 +544,7 @@ class ContentsControl(Control):
         """Return the offsets, the pose and the color of the liquid's surface."""
         vessel = find_interior(self.scene.object)
         assert vessel is not None  # see `prepare`
-        # the mesh as `prepare` has made it
+        # `prepare` has made the mesh at half the height
         base = _liquid_surface(vessel, torch.full_like(values["level"], 0.5))
         surface = _liquid_surface(vessel, values["level"])
         inputs = {f"{self.name}.offsets": surface - base}
@@ -530,11 +560,11 @@ class ContentsControl(Control):
     # ---- proportions
 
     def get_spec(self, parameter: Parameter) -> Fixed | Range | OneOf:
-        """Return the range of a parameter; for an ingredient, that of its cut (see
-        `find_cuts`).
+        """Return the range of a parameter; for an ingredient, that of its cut.
 
-        A cut goes from 0 to 1. The last of the ingredients whose proportion has a range
-        has none: it gets what the others leave.
+        A cut is a coordinate from 0 to 1 that decides the proportion of an ingredient
+        (`cut_proportions`). The last ingredient whose proportion has a range has no
+        cut: it gets what the others leave.
         """
         if parameter.name not in INGREDIENTS:
             return super().get_spec(parameter)
@@ -548,9 +578,9 @@ class ContentsControl(Control):
     def cut_proportions(self, cuts: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the proportion of each ingredient for its cut; they add up to 1.
 
-        Ingredients are cut off one after the other: a cut from 0 to 1 goes from the
-        least to the largest proportion that is still possible. Differentiable in the
-        cuts.
+        Ingredients are cut off a stick of length 1, one after the other. A cut of 0 is
+        the smallest proportion that is still possible, a cut of 1 the largest. The
+        result is differentiable in the cuts.
 
         Args:
             cuts: coordinates in [0, 1] by ingredient.
@@ -564,10 +594,12 @@ class ContentsControl(Control):
         return proportions
 
     def find_cuts(self, proportions: Mapping[str, float]) -> dict[str, float]:
-        """Return the cuts, by ingredient, for proportions or the nearest that are
-        possible.
+        """Return the cuts that give certain proportions, to invert `cut_proportions`.
 
-        It is the inverse of `cut_proportions`.
+        A proportion that is not possible is clipped to the nearest possible one.
+
+        Args:
+            proportions: proportion by ingredient.
         """
         remainder = torch.ones(())
         cuts = dict[str, float]()
@@ -581,10 +613,10 @@ class ContentsControl(Control):
         return cuts
 
     def _possible_range(self, name: str, remainder: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the least and the largest proportion () that an ingredient may have.
+        """Return the smallest and largest proportion () that an ingredient may have.
 
-        They are its own bounds, narrowed so that the ingredients after it can make up
-        the rest.
+        They are its bounds, narrowed so that the ingredients after it can still add up
+        to what is left.
 
         Args:
             name: name of the ingredient.
@@ -608,7 +640,8 @@ class ContentsControl(Control):
 def mix_liquid_color(proportions: Tensor, vessel_color: Tensor) -> Tensor:
     """Return the linear reflectance (3,) of a cup of water, milk and coffee.
 
-    After Kubelka and Munk (1931).
+    By Kubelka and Munk (1931): a layer absorbs and scatters light, and the coefficients
+    of a mixture are sums over its ingredients.
 
     Args:
         proportions: proportions (3,) in the order of `INGREDIENTS`.
@@ -638,11 +671,13 @@ def mix_liquid_color(proportions: Tensor, vessel_color: Tensor) -> Tensor:
 def _liquid_surface(vessel: Vessel, level: Tensor) -> Tensor:
     """Return the vertices (1 + K, 3) of the liquid's surface, the center first.
 
-    They are in mesh coordinates; K is `WALL_DIRECTIONS`. `level` is () from 0 at the
-    floor to 1 at the highest level. The wall's distance is interpolated between the
-    heights at which it is known, so that vertices are differentiable in the level, with
-    kinks at those heights. Below `SINKING_LEVEL` the surface shrinks and sinks into the
-    floor.
+    They are in mesh coordinates, and differentiable in the level, with kinks at the
+    heights at which the wall is known. Below `SINKING_LEVEL` the surface shrinks and
+    sinks into the floor, as an empty vessel has no liquid to show.
+
+    Args:
+        vessel: inside of the vessel; its wall is known in K directions at some heights.
+        level: () from 0 at the floor to 1 at the highest level.
     """
     heights = torch.from_numpy(vessel.heights).to(level)
     radii = torch.from_numpy(vessel.radii).to(level)  # (len(heights), K)

@@ -131,10 +131,11 @@ class EnvironmentControl(Control):
             )
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        """Give the scene the first allowed environment, or let it keep its own.
+        """Return the scene with the first allowed environment, or with its own.
 
-        It keeps its own, which it must have, if that is allowed, or if several bundled
-        ones are searched. Notes on files become remarks.
+        Its own environment stays if it is among the allowed ones, or if several bundled
+        ones are searched; the scene must have one then. Notes on environment files
+        become remarks.
         """
         allowed = self.list_allowed_values("which", SCENE_ENVIRONMENT)
         assets_by_file = {
@@ -215,10 +216,10 @@ class EnvironmentControl(Control):
     def scene_inputs(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return the map (H, W, 3) of linear radiance.
+        """Return the map (H, W, 3) of linear radiance, "environment.data".
 
-        The scene's rotation and exposure are in its own map already, so that only the
-        differences from them are applied.
+        The map of the scene includes the scene's rotation and exposure already, so that
+        only the differences from these are applied.
         """
         name = self.instance_parameters[0].options[int(values["which"])]
         device = values["rotation"].device
@@ -280,7 +281,7 @@ def _is_scene_environment(name: ParameterValue, scene: SceneDescription) -> bool
 def _load_environment(name: str) -> EnvironmentAsset:
     """Return an environment by its name or from a file.
 
-    A file is read again when it has changed.
+    Files are cached by their path, time and size, so that a changed file is read again.
     """
     if not _is_file(name):
         return library.load_environment(name)
@@ -303,8 +304,12 @@ def _read_environment(real_path: str, name: str, *version: int) -> EnvironmentAs
 def _load_map(scene: SceneDescription, asset: EnvironmentAsset | None) -> Tensor:
     """Return the map (H, W, 3) of an environment, linear radiance.
 
-    None as the asset stands for the scene's own environment. If the scene is metered,
-    another map is scaled so that the metered gain of the image stays that of the scene.
+    If the scene is metered, i.e. exposed by the brightness of its environment, another
+    map is scaled so that it would be exposed in the same way.
+
+    Args:
+        scene: the scene.
+        asset: the environment; None for the scene's own.
     """
     scene_environment = scene.require_environment("the environment")
     if asset is None:

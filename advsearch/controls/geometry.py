@@ -89,7 +89,9 @@ class WeldedMesh:
     def __init__(self, mesh: Mesh) -> None:
         """Weld the seams of a mesh, and find its walls.
 
-        Vertices at the same position become one. Faces without area are left out.
+        Vertices at the same position become one position. Faces without area are left
+        out. The normal of a position is the mean of its faces' normals, weighted by
+        their areas.
         """
         self.position_of_vertex, count = weld_vertices(mesh)
         self.positions = np.zeros((count, 3))
@@ -107,10 +109,10 @@ class WeldedMesh:
     def _find_walls(self) -> IntArray:
         """Return pairs (W, 2) of positions on opposite sides of a wall or of a gap.
 
-        The partner of a position x with the normal n is the nearest y with an opposite
-        normal m, by |x - y|^2 + b^2 |n + m|^2, b a tenth of the extent: a search in six
-        dimensions. A pair is a wall if the normals are opposite enough and the distance
-        is not too large, nor 0.
+        For a position x with the normal n, the partner is the position y, with the
+        normal m, that minimises |x - y|^2 + b^2 |n + m|^2. Here b is a tenth of the
+        mesh's extent; a k-d tree in six dimensions finds it. A pair is a wall if both
+        normals are nearly opposite and the distance is not too large, and not 0.
         """
         scaled_normals = 0.1 * self.extent * self.normals  # b n
         tree = cKDTree(np.hstack([self.positions, scaled_normals]))
@@ -139,10 +141,11 @@ def _compute_landmark_weights(
 
     Args:
         positions: positions of a mesh.
-        points: the landmarks.
-        width: width of the kernel.
-        density: (N,) of the landmarks, which the kernel is divided by.
+        points: positions of the landmarks.
+        width: standard deviation of the Gaussian kernel.
+        density: (N,) density of the landmarks, by which the kernel is divided.
     """
+    # The largest exponent is subtracted, so that far positions do not underflow to 0.
     exponent = -cdist(positions, points, "sqeuclidean") / (2.0 * width**2)
     weights = np.exp(exponent - exponent.max(axis=1, keepdims=True)) / density
     return np.asarray(weights / weights.sum(axis=1, keepdims=True))
@@ -152,8 +155,9 @@ def _compute_landmark_weights(
 def compute_shape_modes(mesh: Mesh, count: int) -> Float64Array:
     """Return the smoothest displacement fields of a mesh that are no rigid motion.
 
-    They are combinations of the slowest functions of a diffusion map of landmarks,
-    extended to all positions (Nystrom). The result is cached.
+    Some points of the surface, the landmarks, get a diffusion map: functions that vary
+    slowly over the surface. The fields are combinations of these, extended from the
+    landmarks to all positions of the mesh (Nystrom). The result is cached.
 
     Args:
         mesh: mesh in object sizes.
@@ -190,18 +194,18 @@ def _diffusion_map(
     """Compute the diffusion map of points (Coifman and Lafon 2006, alpha = 1).
 
     Args:
-        points: (N, 3).
-        width: standard deviation of the kernel.
+        points: (N, 3) landmarks.
+        width: standard deviation of the Gaussian kernel.
         n_scalars: number of functions, without the constant one.
 
     Returns:
-        The kernel density (N,) at the points, the slowest functions (N, n_scalars),
-        orthonormal under the mass (N,) of the points, and their eigenvalues
-        (n_scalars,), falling.
+        The kernel density (N,) at the points; the most slowly varying functions (N,
+        n_scalars), orthonormal under the mass; the mass (N,) of the points; and the
+        eigenvalues (n_scalars,) of the functions, descending.
     """
     kernel = np.exp(-cdist(points, points, "sqeuclidean") / (2.0 * width**2))
     density = kernel.sum(axis=1)
-    # alpha = 1: where landmarks are dense makes no difference
+    # alpha = 1 makes the result independent of the density of landmarks
     kernel /= density[:, None] * density[None, :]
     mass = kernel.sum(axis=1)
     symmetric = kernel / np.sqrt(mass[:, None] * mass[None, :])
@@ -230,11 +234,11 @@ def _fix_signs(vectors: Float64Array) -> Float64Array:
 
 
 def _sample_landmarks(welded_mesh: WeldedMesh) -> tuple[Float64Array, float]:
-    """Return points (N, 3) spread evenly over the surface, and the side of their cells.
+    """Return points (N, 3) spread evenly over a surface, and the size of their cells.
 
-    The surface is sampled evenly by area, and its vertices are added. Each landmark is
-    the mean of all that lies in one cubic cell. Cells are enlarged until there are at
-    most `MAX_LANDMARKS`.
+    The surface is sampled evenly by area, and its vertices are added. All points in one
+    cubic cell are averaged to one landmark. Cells are enlarged until there are at most
+    `MAX_LANDMARKS`.
     """
     corners = welded_mesh.positions[welded_mesh.faces]
     areas = np.linalg.norm(compute_area_vectors(corners), axis=1)
@@ -269,20 +273,20 @@ def _without_rotation(
 ) -> Float64Array:
     """Combine scalar functions to vector fields without rotation, smoothest first.
 
-    All fields whose components are sums of the functions are considered. Those
-    orthogonal to the three rotations about the center are kept, and sorted by their
-    energy. (A shift is none of them, as the constant function is not among the
-    functions.)
+    A field has three components, each a weighted sum of the functions. Only fields
+    orthogonal to the three rotations about the center are used, sorted by how fast they
+    vary (their energy). Shifts need not be removed, because the constant function is
+    not among the functions.
 
     Args:
-        points: (N, 3).
-        functions: (N, S), orthonormal under `mass`.
+        points: (N, 3) landmarks.
+        functions: (N, S) scalar functions, orthonormal under `mass`.
         mass: (N,) weight of each point.
-        energy: (S,), how fast each function varies.
+        energy: (S,) how fast each function varies.
         count: number of fields.
 
     Returns:
-        (S, 3, count), the weight of each function along each axis.
+        (S, 3, count), the weight of each function in each component of a field.
     """
     n_scalars = functions.shape[1]
     center = (points * mass[:, None]).sum(axis=0) / mass.sum()
@@ -316,14 +320,13 @@ class Preconditioner:
     """
 
     def __init__(self, welded_mesh: WeldedMesh) -> None:
-        """Factorise the system, and compute an orthonormal basis of the rigid motions.
+        """Factorise I + lambda L, and compute an orthonormal basis of rigid motions.
 
-        The system is the identity plus the Laplacian times the squared smoothing
-        length.
+        L is the Laplacian of the mesh, and lambda the squared smoothing length.
         """
         positions = welded_mesh.positions
         laplacian, mean_edge_length = _compute_wall_laplacian(welded_mesh)
-        # in mean edges, which have length 1 for the Laplacian
+        # The Laplacian has the mean edge length as its unit.
         smoothing_edges = SMOOTHING_LENGTH * welded_mesh.extent / mean_edge_length
         system = sparse.identity(len(positions)) + smoothing_edges**2 * laplacian
         self._factor = sparse_linalg.splu(system.tocsc())
@@ -344,11 +347,13 @@ class Preconditioner:
 
 
 def _compute_wall_laplacian(welded_mesh: WeldedMesh) -> tuple[Any, float]:
-    """Return the Laplacian (P, P) of a mesh with links through its walls, sparse, and
-    the mean length of an edge.
+    """Return the Laplacian of a mesh with links through its walls.
 
-    Edges are weighted by the inverse square of their length, links through walls by
-    `WALL_WEIGHT`.
+    An edge has the weight (mean length / length)^2, a link between both sides of a wall
+    the weight `WALL_WEIGHT`, so that both sides move together.
+
+    Returns:
+        The sparse Laplacian (P, P), and the mean length of an edge.
     """
     count = len(welded_mesh.positions)
     edges = np.concatenate(
@@ -364,7 +369,7 @@ def _compute_wall_laplacian(welded_mesh: WeldedMesh) -> tuple[Any, float]:
     )
     lengths = np.linalg.norm(edge_vectors, axis=1)
     mean_length = float(lengths.mean())
-    # 1 for an edge of mean length; limited for very short ones
+    # 1 for an edge of mean length, at most 100 for very short ones
     edge_weights = (mean_length / lengths.clip(0.1 * mean_length)) ** 2
     wall_weights = np.full(len(welded_mesh.walls), WALL_WEIGHT)
     links = np.concatenate([edges, welded_mesh.walls])
@@ -420,7 +425,12 @@ class DisplacementLimits:
     """
 
     def __init__(self, welded_mesh: WeldedMesh, epsilon: float) -> None:
-        """Compute what each bound needs of the mesh."""
+        """Compute from the mesh what each bound needs: edges, heights and wall widths.
+
+        Args:
+            welded_mesh: the mesh.
+            epsilon: largest length of a displacement, in object sizes.
+        """
         self.epsilon = epsilon
         corners = welded_mesh.positions[welded_mesh.faces]
         edge_1 = corners[:, 1] - corners[:, 0]
@@ -428,7 +438,7 @@ class DisplacementLimits:
         edges = np.stack([edge_1, edge_2, edge_1 - edge_2])
         longest = np.linalg.norm(edges, axis=-1).max(axis=0)
         double_area = np.linalg.norm(np.cross(edge_1, edge_2), axis=1)
-        # a face that is almost a line has no strain to speak of
+        # The strain of a face that is almost a line would be huge, and is not bounded.
         is_sound = double_area > MIN_FACE_HEIGHT * longest**2
         edge_1 = edge_1[is_sound]
         edge_2 = edge_2[is_sound]
@@ -450,14 +460,14 @@ class DisplacementLimits:
         self._positions = torch.from_numpy(welded_mesh.positions)
 
     def compute_squared_usage(self, field: Tensor) -> Tensor:
-        """Return how much of each bound the displacement `epsilon d` uses up, squared.
+        """Return the squared fraction of each bound that a displacement uses up.
 
-        The bounds are: a length of epsilon at each position, a strain of
-        `MAX_FACE_STRAIN` of each face, and of `MAX_WALL_STRAIN` across each wall. 1 is
-        a bound that is just reached.
+        The displacement is epsilon d. It is bounded by the length epsilon at each
+        position, the strain `MAX_FACE_STRAIN` of each face, and the strain
+        `MAX_WALL_STRAIN` across each wall. 1 means that a bound is just reached.
 
         Args:
-            field: d, (P, 3).
+            field: (P, 3) the field d, without units.
 
         Returns:
             (N,): positions first, then faces, then walls.
@@ -466,7 +476,7 @@ class DisplacementLimits:
         wall_widths = self._wall_widths.to(field.device)
         squared_gradient = self._compute_squared_gradients(field)
         face_usage = squared_gradient * (self.epsilon / MAX_FACE_STRAIN) ** 2
-        # index_select, for its derivative is ten times faster than that of an index
+        # The derivative of `index_select` is ten times faster than that of indexing.
         difference = field.index_select(0, walls[:, 0]) - field.index_select(
             0, walls[:, 1]
         )
@@ -481,7 +491,10 @@ class DisplacementLimits:
 
         The field changes by d1 along edge 1 of the face, and by d2 along edge 2. Edge 2
         is `along` times edge 1 plus a height across it. So the field changes by d1 /
-        length per unit along edge 1, and by (d2 - along d1) / height across.
+        length per unit along edge 1, and by (d2 - along d1) / height across it.
+
+        Args:
+            field: (P, 3) vectors at the positions of the mesh.
         """
         inverse_axes = self._inverse_axes.to(field.device)
         # (F, 1) each: 1 / length, along, and 1 / height
@@ -503,8 +516,8 @@ class DisplacementLimits:
         they are, large ones reach the tightest bound, and all is differentiable.
         """
         squared_usage = self.compute_squared_usage(field)
-        # Divided by the largest (a square, too), powers stay within the range of
-        # floats: 1 + sum r^p = largest^(p/2) * total.
+        # The r are divided by the largest one, so that powers do not overflow.
+        # `largest` is a square: 1 + sum r^p = largest^(p/2) * total.
         largest = squared_usage.detach().max().clamp_min(1.0)
         powers = (squared_usage / largest).pow(NORM_EXPONENT // 2).sum()
         total = powers + largest ** (-NORM_EXPONENT // 2)
@@ -601,7 +614,11 @@ class GeometryControl(Control):
         self.form = self.select_form(FORMS)
 
     def fit(self) -> None:
-        """Compute the modes, or the preconditioner, of the mesh in the scene."""
+        """Compute what turns coordinates into a displacement field of the mesh.
+
+        In the form "modes" a coordinate is the amplitude of a smooth field. Otherwise
+        it is a push on one position along one axis, which a preconditioner spreads.
+        """
         self._offsets_input = f"{self.mesh}.offsets"
         self._mesh = self.get_mesh(self.scene).mesh
         welded_mesh = get_welded_mesh(self._mesh)

@@ -75,8 +75,12 @@ class HazeControl(Control):
     ) -> Parameter:
         """Return the density with its default and its estimators in this scene.
 
-        Without haze in the scene the default is 0; but if only the color is searched,
-        it is `DEFAULT_DENSITY`, since the color would not show otherwise.
+        Without haze in the scene the default is 0. But if only the color is searched,
+        it is `DEFAULT_DENSITY`, because the color of no haze has no effect.
+
+        Args:
+            parameter: the density.
+            scene_haze: haze of the scene, or None.
         """
         default = parameter.default
         if scene_haze is not None:
@@ -97,7 +101,10 @@ class HazeControl(Control):
         return 0.0 if _find_haze(self.scene) is None else parameter.default
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        """Add a ball of haze, or take over the scene's own."""
+        """Return the scene with a ball of haze around camera and object.
+
+        If the scene has a haze already, that is used and only renamed.
+        """
         scene_haze = _find_haze(scene)
         if scene_haze is not None:
             renamed = replace(scene_haze, name=self.name)

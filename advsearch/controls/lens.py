@@ -39,7 +39,17 @@ def _per_dot(
     *,
     log: bool = False,
 ) -> Parameter:
-    """Return a parameter with one number for each dot."""
+    """Return a parameter with one number for each dot.
+
+    Args:
+        name: name of the parameter.
+        unit: unit of the numbers.
+        default: value of each number.
+        text: description for the user.
+        search: range that is searched by default.
+        low: lower bound; the upper one is 1.
+        log: whether it is searched on a logarithmic scale.
+    """
     return Parameter(
         name,
         (None,),
@@ -138,10 +148,11 @@ class LensControl(Control):
         return {self.name: draw_dots(checkerboard, self._spread_dots(values))}
 
     def _spread_dots(self, values: Values) -> dict[str, Tensor]:
-        """Return the values, with the dots spread along an axis that stays fixed.
+        """Return the values with the dots spread over the image along fixed axes.
 
-        An axis that was not set is fixed if other parameters are searched, and then all
-        dots have the same default there. A searched axis starts spread already.
+        If only some parameters are searched, x or y may be fixed at its default, which
+        is the same for all dots: they would cover each other. A searched axis starts
+        with different positions already.
         """
         if not self.has_requested_search:
             return dict(values)
@@ -193,9 +204,13 @@ def draw_dots(image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
 def _compute_covers(height: int, width: int, values: Mapping[str, Tensor]) -> Tensor:
     """Return the opacity (dots, H, W) of each dot in each pixel.
 
-    It is opacity * exp(-(r^2)^falloff), where r is the distance from the dot's center
-    in its radii. x and y are fractions of the image's width and height, radii of its
-    shorter side; `values` are as for `draw_dots`.
+    It is opacity * exp(-(r^2)^falloff), where r is the distance from the dot's center,
+    divided by the dot's radius.
+
+    Args:
+        height, width: size of the image, pixels.
+        values: `x`, `y`, `radius` and `opacity` (dots,), and `falloff` (). x and y are
+            fractions of width and height, the radius of the shorter side.
     """
     shorter_side = min(height, width)
     device = values["x"].device
@@ -206,8 +221,8 @@ def _compute_covers(height: int, width: int, values: Mapping[str, Tensor]) -> Te
     squared_distance = y_offset[:, :, None] ** 2 + x_offset[:, None, :] ** 2
     in_radii = squared_distance / values["radius"][:, None, None] ** 2
     falloff = values["falloff"]
-    # beyond it the exponential is 0, and its derivative would not be finite
+    # Beyond this the exponential is 0 and its derivative would not be finite.
     max_in_radii = float(_MAX_EXPONENT ** (1.0 / falloff.detach()))
-    # not 0, where a power has no derivative
+    # at least 1e-12, as a power has no derivative at 0
     fading = torch.exp(-(in_radii.clamp(1e-12, max_in_radii) ** falloff))
     return values["opacity"][:, None, None] * fading

@@ -119,10 +119,10 @@ class LightControl(Control):
             )
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
-        """Return a parameter as this lamp has it.
+        """Return a parameter for this lamp.
 
-        A lamp of which other parameters are searched has a power by default, or they
-        would not show. A point has no size to search.
+        If only other parameters are searched, the default power is not 0, because a
+        dark lamp has no effect. The size of a point is not searched.
         """
         needs_power = self.has_requested_search and not self.is_searched("power")
         if parameter.name == "power" and needs_power:
@@ -144,10 +144,10 @@ class LightControl(Control):
     def scene_inputs(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return where the lamp is, and how bright.
+        """Return the lamp's position and its brightness.
 
-        At a distance of 1, a power of 1 is the scene's metered irradiance: that which
-        shows a white surface just below white.
+        A power of 1 gives, at a distance of 1, the scene's metered irradiance, at which
+        a white surface is just below white in the image.
         """
         position = torch.stack([values[axis] for axis in ("x", "y", "z")])
         intensity = (
@@ -161,8 +161,8 @@ class LightControl(Control):
                 f"{self.name}.intensity": intensity,
             }
         radius = values["size"] / 2.0
-        # A ball with the intensity of a point: its radiance times the disk that it
-        # covers from afar.
+        # A ball looks like a disk of area pi r^2 from far away, so that its intensity
+        # is its radiance times that area.
         return {
             f"{self.name}.ball": make_ball_pose(position, radius),
             f"{self.name}.radiance": intensity / (math.pi * radius**2),

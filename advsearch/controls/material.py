@@ -84,10 +84,14 @@ def register_pattern(
 
 
 def _noise(grid: Grid, cells: tuple[int, int], seed: int) -> Float64Array:
-    """Return gradient noise (Perlin 1985) at points of a grid: about -1 to 1, mean 0.
+    """Return gradient noise (Perlin 1985) on a tile: about -1 to 1, with mean 0.
 
-    `cells` are the lattice cells across and down the tile; the noise goes on
-    periodically.
+    The noise is periodic, so that tiles meet without a seam.
+
+    Args:
+        grid: x and y of the texels, where the tile has length 1.
+        cells: number of lattice cells across and down the tile.
+        seed: seed of the gradients.
     """
     columns, rows = cells
     generator = np.random.Generator(np.random.PCG64(seed))
@@ -104,7 +108,7 @@ def _noise(grid: Grid, cells: tuple[int, int], seed: int) -> Float64Array:
 
         `right` and `below` are 0 or 1: the corner of the cell, from its upper left.
         """
-        # the lattice goes on periodically, so that tiles meet without a seam
+        # the lattice is periodic
         turn = angle[(row + below) % rows, (column + right) % columns]
         return np.asarray(np.cos(turn) * (x - right) + np.sin(turn) * (y - below))
 
@@ -147,15 +151,15 @@ def _warp_grid(grid: Grid, cells: int, amount: float, seed: int) -> Grid:
 def _scatter_points(count: int, seed: int) -> Float64Array:
     """Return irregular points of a torus, far from each other: (count, 2) in [0, 1).
 
-    Best candidate sampling (Mitchell 1991): each point is the farthest from those
-    before it of a few random ones.
+    This is best candidate sampling (Mitchell 1991): of 16 random candidates, the one
+    that is farthest from all points so far becomes the next point.
     """
     generator = np.random.Generator(np.random.PCG64(seed))
     points = generator.random((1, 2))
     while len(points) < count:
         candidates = generator.random((16, 2))
         offset = np.abs(candidates[:, None] - points[None])  # (16, N, 2)
-        offset = np.minimum(offset, 1.0 - offset)  # the shorter way on the torus
+        offset = np.minimum(offset, 1.0 - offset)  # shorter direction on the torus
         nearest_distance = (offset**2).sum(-1).min(1)
         farthest = np.argmax(nearest_distance)
         points = np.concatenate([points, candidates[[farthest]]])
@@ -178,7 +182,7 @@ def _find_nearest_points(
         Distances (SIDE, SIDE, count) in tiles, and indices of the points.
     """
     positions = np.stack([grid[0] % 1.0, grid[1] % 1.0], axis=-1)
-    # the tree wants positions below 1, to which a remainder may be rounded
+    # The tree needs positions below 1, but a remainder may be rounded to 1.
     positions = np.minimum(positions, np.nextafter(1.0, 0.0))
     distance, index = cKDTree(points, boxsize=1.0).query(positions, k=count)
     return np.asarray(distance), np.asarray(index, dtype=np.int64)
@@ -189,13 +193,13 @@ def _grow_turing_pattern(
 ) -> Float64Array:
     """Return animal stripes or spots (SIDE, SIDE) in [-1, 1].
 
-    Noise is filtered to waves of about one length and saturated, again and again; after
-    about ten rounds the pattern has settled.
+    Noise is filtered to waves of about one length and then saturated, many times. After
+    about ten rounds the pattern no longer changes.
 
     Args:
-        wavelength: along x and along y, in tiles; unequal ones make stripes across the
-            shorter.
-        bias: bias that is added before saturation: away from 0 stripes break up into
+        wavelength: wavelength along x and along y, in tiles. If they differ, stripes
+            repeat along the direction of the shorter one.
+        bias: number that is added before saturation; far from 0, stripes break up into
             spots.
         seed: seed of the noise.
         rounds: number of filterings.
@@ -255,9 +259,9 @@ def plain(grid: Grid) -> Float64Array:
 
 @register_pattern(0.6, roughness=0.45)
 def wood(grid: Grid) -> Float64Array:
-    """Paint year rings with fibres and pores.
+    """Paint year rings with fibres and pores, (SIDE, SIDE, 3) sRGB.
 
-    Numbers are chosen by eye.
+    Frequencies, strengths and colors are chosen by eye.
     """
     x, y = grid
     bend = 0.16 * _clouds(grid, cells=(2, 1), octaves=2, seed=11) + 0.012 * _noise(
@@ -289,15 +293,17 @@ def wood(grid: Grid) -> Float64Array:
 
 @register_pattern(0.9, roughness=0.15)
 def marble(grid: Grid) -> Float64Array:
-    """Paint clouds with dark veins.
+    """Paint marble, light clouds with dark veins, (SIDE, SIDE, 3) sRGB.
 
-    Numbers are chosen by eye.
+    Frequencies, strengths and colors are chosen by eye.
     """
     warped = _warp_grid(grid, cells=2, amount=0.22, seed=21)
     finely_warped = _warp_grid(warped, cells=6, amount=0.03, seed=22)
     x, y = finely_warped
     clouds = 0.5 + 0.5 * _clouds(warped, cells=(3, 3), octaves=4, seed=25)
     veins = np.zeros((TILE_SIDE, TILE_SIDE))
+    # A family of parallel veins crosses the tile n_right times to the right and n_down
+    # times down.
     for n_right, n_down, width, depth, seed in (
         (1, 1, 0.05, 0.75, 23),
         (2, 1, 0.02, 0.45, 24),
@@ -329,9 +335,9 @@ def _compute_vein_profile(phase: Float64Array, width: float) -> Float64Array:
 
 @register_pattern(0.6, roughness=0.9, specular=0.2)
 def brick(grid: Grid) -> Float64Array:
-    """Paint a wall of bricks with mortar.
+    """Paint a wall of bricks with mortar, (SIDE, SIDE, 3) sRGB.
 
-    Numbers are chosen by eye.
+    Frequencies, strengths and colors are chosen by eye.
     """
     x, y = _warp_grid(grid, cells=12, amount=0.0035, seed=31)
     rows = 8
@@ -372,9 +378,9 @@ def _paint_fired_clay(grid: Grid, brick_tone: Float64Array) -> Float64Array:
 
 @register_pattern(0.45, roughness=0.95, specular=0.1)
 def fabric(grid: Grid) -> Float64Array:
-    """Paint a plain weave of two threads.
+    """Paint a plain weave of two threads, (SIDE, SIDE, 3) sRGB.
 
-    Numbers are chosen by eye.
+    Frequencies, strengths and colors are chosen by eye.
     """
     x, y = _warp_grid(grid, cells=6, amount=0.004, seed=41)
     count = 16
@@ -383,7 +389,8 @@ def fabric(grid: Grid) -> Float64Array:
     # height of a round thread across its width
     round_x = np.sin(np.pi * (thread_x % 1.0))
     round_y = np.sin(np.pi * (thread_y % 1.0))
-    # the warp is the upright thread
+    # The warp is the upright thread. In a plain weave it lies over the level thread in
+    # every second cell, like the fields of a chessboard.
     warp_is_over = (np.floor(thread_x) + np.floor(thread_y)) % 2.0 > 0.5
     height = np.where(
         warp_is_over,
@@ -412,9 +419,9 @@ def _draw_thread_tones(
 
 @register_pattern(0.7, roughness=0.8, specular=0.2)
 def leopard(grid: Grid) -> Float64Array:
-    """Paint rosettes with dots between them.
+    """Paint a leopard's rosettes with dots between them, (SIDE, SIDE, 3) sRGB.
 
-    Numbers are chosen by eye, lengths in tiles.
+    Numbers and colors are chosen by eye; lengths are in tiles.
     """
     warped = _warp_grid(
         _warp_grid(grid, cells=4, amount=0.03, seed=51), cells=12, amount=0.012, seed=52
@@ -443,21 +450,24 @@ def _draw_rosettes(
     distance: Float64Array,
     index: npt.NDArray[np.int64],
 ) -> tuple[Float64Array, Float64Array]:
-    """Return where broken rings around points are, and their cores; each (SIDE, SIDE).
+    """Draw broken rings around points, and the cores inside of the rings.
 
-    Both are from 0 to 1. Numbers are chosen by eye, lengths in tiles.
+    Numbers are chosen by eye; lengths are in tiles.
 
     Args:
         grid: coordinates of the texels.
-        points: (N, 2) on the torus.
-        distance: (SIDE, SIDE) to the nearest point.
-        index: (SIDE, SIDE) of that point.
+        points: (N, 2) centers of the rings, on the torus.
+        distance: (SIDE, SIDE) from each texel to the nearest point.
+        index: (SIDE, SIDE) index of that point.
+
+    Returns:
+        Opacity of the rings and of the cores, from 0 to 1, (SIDE, SIDE) each.
     """
     generator = np.random.Generator(np.random.PCG64(54))
     size = generator.uniform(0.85, 1.15, len(points))[index]
     turn = generator.uniform(0.0, 2.0 * np.pi, len(points))[index]
     radius = distance / size
-    # the shorter way on the torus, -0.5 to 0.5
+    # in the shorter direction on the torus, from -0.5 to 0.5
     x_offset = (grid[0] - points[index, 0] + 0.5) % 1.0 - 0.5
     y_offset = (grid[1] - points[index, 1] + 0.5) % 1.0 - 0.5
     angle = np.arctan2(y_offset, x_offset)
@@ -490,9 +500,9 @@ def checker(grid: Grid) -> Float64Array:
 
 @register_pattern(0.7, roughness=0.85, metallic=0.1, specular=0.3)
 def rust(grid: Grid) -> Float64Array:
-    """Paint rust under flakes of paint.
+    """Paint rust under flakes of paint, (SIDE, SIDE, 3) sRGB.
 
-    Numbers are chosen by eye.
+    Frequencies, strengths and colors are chosen by eye.
     """
     warped = _warp_grid(grid, cells=4, amount=0.06, seed=71)
     broad = 0.5 + 0.5 * _clouds(warped, cells=(3, 3), octaves=5, seed=72)
@@ -529,12 +539,12 @@ def _bend_blades(
     """Return x and y (blades, along, across) of the samples of bent blades.
 
     Args:
-        root: (blades, 1, 1, 2) where they begin.
-        lean: (blades, 1, 1) angle at which they begin.
-        bend: (blades, 1, 1) angle by which they turn up to the tip.
-        length: (blades, 1, 1).
-        along: (1, along, 1) from 0 to 1.
-        across: (1, 1, across) from -1 to 1.
+        root: (blades, 1, 1, 2) positions of their roots, in tiles.
+        lean: (blades, 1, 1) direction at the root, radians.
+        bend: (blades, 1, 1) angle by which they turn from the root to the tip, radians.
+        length: (blades, 1, 1) lengths, in tiles.
+        along: (1, along, 1) positions of the samples along a blade, 0 to 1.
+        across: (1, 1, across) positions across a blade, -1 to 1.
     """
     # half a width of 0.0042 tiles at the root, 0 at the tip
     offset = across * 0.0042 * (1.0 - along**2)
@@ -548,9 +558,10 @@ def _bend_blades(
 
 @register_pattern(0.5, roughness=0.9, specular=0.1)
 def grass(grid: Grid) -> Float64Array:
-    """Paint blades over each other, bent and lighter towards the tip.
+    """Paint bent blades of grass over each other, (SIDE, SIDE, 3) sRGB.
 
-    Later ones lie on top.
+    They are lighter towards the tip; later ones lie on top. Numbers and colors are
+    chosen by eye; lengths are in tiles.
     """
     generator = np.random.Generator(np.random.PCG64(81))
     n_blades = 2600
@@ -572,9 +583,11 @@ def grass(grid: Grid) -> Float64Array:
 def _draw_points(
     x: Float64Array, y: Float64Array, colors: Float64Array
 ) -> Float64Array:
-    """Draw points of a torus on dark soil, and return the tile (SIDE, SIDE, 3).
+    """Draw points on a tile of dark soil; return the tile (SIDE, SIDE, 3).
 
-    `x` and `y` are (N,) in tiles, `colors` (N, 3). The last point in a texel is on top.
+    Args:
+        x, y: (N,) positions in tiles; those outside of the tile wrap around.
+        colors: (N, 3); of several points in a texel the last one is visible.
     """
     column = np.floor(x * TILE_SIDE).astype(np.int64) % TILE_SIDE
     row = np.floor(y * TILE_SIDE).astype(np.int64) % TILE_SIDE
@@ -588,9 +601,9 @@ def _draw_points(
 
 @register_pattern(0.5, roughness=0.85, specular=0.2)
 def elephant(grid: Grid) -> Float64Array:
-    """Paint skin with folds.
+    """Paint an elephant's skin with folds, (SIDE, SIDE, 3) sRGB.
 
-    Numbers are chosen by eye.
+    Frequencies, strengths and colors are chosen by eye.
     """
     warped = _warp_grid(
         _warp_grid(grid, cells=3, amount=0.05, seed=91), cells=14, amount=0.012, seed=92
@@ -653,16 +666,15 @@ def make_tile(name: str) -> Float32Array:
 def make_covering(mesh: Mesh, name: str, side: int = TILE_SIDE) -> Float32Array:
     """Return the texture that covers a mesh with a pattern at one scale.
 
-    Every texel of the texture looks up the tile at its place on the object, seen along
-    the three axes, weighted by the normal ("triplanar" mapping; Geiss, GPU Gems 3,
-    2007, section 1.5). So charts meet without a seam, and the pattern's scale does not
-    depend on how the object was unwrapped. Rows of the tile stand upright on upright
-    walls.
+    Each texel is projected along the three axes into the pattern's tile, and the three
+    colors are weighted by the normal ("triplanar" mapping; Geiss, GPU Gems 3, 2007,
+    section 1.5). So charts of the texture meet without a seam, and the pattern has the
+    same scale however the object was unwrapped. The tile is upright on upright walls.
 
     Args:
-        mesh: one object size large, in its own coordinates.
-        name: a key of `PATTERNS`.
-        side: side of the texture in texels.
+        mesh: mesh in its own coordinates, with the largest extent 1.
+        name: name of the pattern, a key of `PATTERNS`, e.g. "wood".
+        side: number of texels along a side of the texture.
 
     Returns:
         (side, side, 3) float32 display-referred sRGB in [0, 1], row 0 at v = 1.
@@ -725,11 +737,11 @@ class MaterialControl(Control):
         return scene
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
-        """Return a parameter; those of the surface have the value of the material as
-        default.
+        """Return a parameter for the scene.
 
-        Of several materials that is the object's own surface if it is among them, else
-        the first.
+        The default of a surface parameter, such as the roughness, is that of the
+        material. If several materials may be chosen, it is that of the object's own
+        surface, or that of the first material if the own one is not among them.
         """
         if parameter.name not in SURFACE_PARAMETERS:
             return parameter
@@ -752,7 +764,14 @@ class MaterialControl(Control):
     def scene_inputs(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return the numbers of the surface, and its tinted base color."""
+        """Return the numbers of the surface, and its tinted base color.
+
+        Args:
+            values: values of the control by parameter; "which" is the index of the
+                material.
+            earlier_inputs: inputs of earlier controls, which may have painted the
+                object's texture.
+        """
         which = (OBJECT_SURFACE, *PATTERNS)[int(values["which"])]
         material = self._get_material(which)
         inputs: dict[str, Tensor] = {}

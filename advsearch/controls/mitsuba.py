@@ -48,10 +48,13 @@ class MitsubaControl(Control):
         return tuple(_make_parameter(key) for key in settings)
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        """Add a part that holds the numbers which are set by Mitsuba's names.
+        """Return the scene with a part for the numbers that are set by Mitsuba's names.
 
-        Raises InputError: they are about more than the object, and the surroundings are
-        a photograph; or the scene has no such number.
+        A name is e.g. "mug.bsdf.reflectance".
+
+        Raises:
+            InputError: the scene has no such number; or it does not belong to the
+                object, and the surroundings are a photograph.
         """
         others = [key for key in self._settings if not key.startswith("object.")]
         if scene.backdrop_photograph is not None and others:
@@ -70,9 +73,12 @@ class MitsubaControl(Control):
         )
 
     def list_parameter_specs(self) -> Iterator[tuple[Parameter, Fixed | Range | OneOf]]:
-        """Yield one parameter for each number of what was set, with its spec.
+        """Yield one parameter for each number that was set, with its range or value.
 
-        Raises InputError: a color has a list of values.
+        A color has three parameters, one for each channel.
+
+        Raises:
+            InputError: a color was given a list of values.
         """
         for plugin_number in self._get_numbers():
             color_spec = self.specs.get(plugin_number.key)

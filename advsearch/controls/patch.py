@@ -158,13 +158,15 @@ class PatchControl(PictureControl):
     on_top = True
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
-        """Check that the settings of the pixels go together.
+        """Read the settings, and check that those of the pixels fit each other.
 
-        Pixels are a range or one number, not both pixels and a picture are set, and a
-        ball is set only for searched pixels.
+        Args:
+            name: name of the control; by default its kind.
+            **settings: values of its parameters and choices.
 
         Raises:
-            InputError: they do not.
+            InputError: pixels are neither a range nor one number; pixels and a picture
+                are both set; or a norm ball is set for pixels that are not searched.
         """
         super().__init__(name, **settings)
         self._check_pixels()
@@ -181,9 +183,10 @@ class PatchControl(PictureControl):
                 )
 
     def _check_pixels(self) -> None:
-        """Check that the pixels are a range or one number, and not beside a picture.
+        """Check that the pixels are a range or one number, and that no picture is set.
 
-        Raises InputError: they are not.
+        Raises:
+            InputError: they are something else, or a picture is set as well.
         """
         pixels = self.specs.get("pixels")
         if pixels is None:
@@ -254,8 +257,12 @@ class PatchControl(PictureControl):
     def _start_as_underneath(self, parameter: Parameter, pixel_range: Range) -> None:
         """Let searched pixels start as the texture underneath the patch.
 
-        Colors outside their range are clipped to it, and the start is recorded as an
-        adjusted default. `parameter` is that of the pixels.
+        Colors outside of the range are clipped to it. If there are any, the start is
+        recorded as an adjusted default.
+
+        Args:
+            parameter: parameter of the pixels.
+            pixel_range: range of their values.
         """
         low = pixel_range.low
         high = pixel_range.high
@@ -306,7 +313,7 @@ class PatchControl(PictureControl):
 def find_side_towards_camera(scene: SceneDescription) -> tuple[float, float]:
     """Return the azimuth and the height of a patch on the side that faces the camera.
 
-    It is the inverse of `_outward_direction`.
+    The inverse, from azimuth and height to a direction, is `_outward_direction`.
 
     Returns:
         Azimuth in degrees, and height from 0 to 1, as the parameters of the control.
@@ -317,7 +324,7 @@ def find_side_towards_camera(scene: SceneDescription) -> tuple[float, float]:
     x, y, z = np.linalg.solve(geometry.object_to_world(scene), camera)[:3] - center
     # at least a tiny distance: a camera straight above is at height 1
     level_distance = max(math.hypot(x, y), 1e-12)
-    # on a sphere into which the ellipsoid is scaled
+    # The ellipsoid around the object is scaled to a sphere for the elevation.
     elevation = math.atan2(z * radius, level_distance * half_height)
     azimuth = math.degrees(math.atan2(y, x)) % 360.0
     return azimuth, 0.5 + elevation / math.pi
@@ -339,10 +346,12 @@ def _compute_edge_opacity(on_patch: Tensor, size: Tensor, spacing: float) -> Ten
 
 
 def _sample_pixels(pixels: Tensor, positions: Tensor) -> Tensor:
-    """Interpolate pixels (n, n, 3) sRGB at positions (N, 2); return linear (N, 3).
+    """Interpolate the pixels of a patch; return linear colors (N, 3).
 
-    Positions are to the right and upwards of the center, in sides of the patch; those
-    beyond its edge have the color of the edge.
+    Args:
+        pixels: (n, n, 3) sRGB.
+        positions: (N, 2) to the right and upwards of the center, where 1 is the side of
+            the patch. Positions beyond the edge get the color of the edge.
     """
     # grid_sample wants (1, 1, N, 2) in [-1, 1], to the right and downwards
     grid = (positions * positions.new_tensor([2.0, -2.0]))[None, None]
@@ -406,12 +415,12 @@ class PatchPainter:
     def __init__(
         self, scene: SceneDescription, start_values: Mapping[str, float], side: int
     ) -> None:
-        """Prepare the object's map and its surface.
+        """Prepare the object's base-color map, and the surface point of each texel.
 
         Args:
             scene: scene with the object.
-            start_values: azimuth, height, size and rotation at the start.
-            side: side of the patch, pixels.
+            start_values: azimuth, height, size and rotation of the patch at the start.
+            side: number of pixels along a side of the patch.
 
         Raises:
             InputError: the object's texture repeats.
@@ -439,7 +448,7 @@ class PatchPainter:
         self._positions = charts.compute_positions()[is_used].astype(np.float64)
         self._normals = charts.compute_normals()[is_used].astype(np.float64)
         self._areas = charts.compute_areas()[is_used].astype(np.float64)
-        # many images in a row have the patch in the same position
+        # The patch often stays in the same position for many images.
         self._find_texels = lru_cache(maxsize=4)(self._find_nearby_texels)
 
     def paint(
@@ -450,9 +459,10 @@ class PatchPainter:
         Differentiable in the colors, not in the patch's position, size and rotation.
 
         Args:
-            base: what other controls made of it; None takes the object's own.
-            pixels: (n, n, 3) sRGB, of the patch.
-            numbers: azimuth, height, size and rotation of the patch, each ().
+            base: (h, w, 3) linear base color by earlier controls; None for the
+                object's own.
+            pixels: (n, n, 3) sRGB pixels of the patch.
+            numbers: azimuth, height, size and rotation of the patch, () each.
         """
         device = pixels.device
         if base is None:
@@ -508,7 +518,7 @@ class PatchPainter:
         """Find the texels that a patch of a size may cover at an azimuth and a height.
 
         The patch's center is the first hit of a ray from outside towards the center of
-        the object. Its normal is the mean of the surface's around there.
+        the object. Its normal is the mean normal of the surface around that point.
 
         Args:
             azimuth: degrees around the object.
@@ -542,9 +552,13 @@ class PatchPainter:
     ) -> assets.Float64Array:
         """Return the mean normal (3,) of the surface around a point of a face.
 
-        The radius is half of the patch's side at the start, so that it does not change
-        in a search. Weights fall smoothly to 0 there. The face's own normal stands in
-        if no texel is near.
+        Weights decrease smoothly to 0 at a radius of half the patch's side at the
+        start; this does not change during a search. If no texel is near, the face's own
+        normal is returned.
+
+        Args:
+            face: index of the face.
+            point: (3,) point of the face.
         """
         face_normal = self._surface.normals[face]
         radius = 0.5 * self._start_values["size"]
@@ -568,7 +582,14 @@ class PatchPainter:
     ) -> assets.IntArray:
         """Return the rows (N,) of texels within a radius of a point of a face.
 
-        They are connected to it, and their faces look to the side of the normal.
+        The texels are connected to the point over the surface, and their faces are on
+        the side to which the normal points.
+
+        Args:
+            face: index of the face.
+            point: (3,) point of the face.
+            normal: (3,) normal of the patch.
+            radius: largest distance from the point, object sizes.
         """
         is_face_near = self._surface.find_region(face, point, normal, radius)
         # a texel belongs to a face
@@ -596,8 +617,14 @@ def _outward_direction(
 ) -> assets.Float64Array:
     """Return the unit vector (3,) from the center of an object to a patch on it.
 
-    The patch lies on an ellipsoid with the object's radius and half-height. `height` is
-    its latitude: 0 at the lower pole, 0.5 at the equator, 1 at the upper pole.
+    The patch lies on an ellipsoid around the object.
+
+    Args:
+        azimuth: degrees around the vertical.
+        height: latitude on the ellipsoid: 0 at the lower pole, 0.5 at the equator, 1 at
+            the upper pole.
+        radius: level radius of the ellipsoid, object sizes.
+        half_height: half the height of the ellipsoid, object sizes.
     """
     angle = math.radians(azimuth)
     latitude = (height - 0.5) * math.pi
@@ -640,8 +667,8 @@ def _make_frame(
 ) -> assets.Float64Array:
     """Return a right-handed frame (3, 3), whose rows are right, up and the normal.
 
-    Up is `upwards` without its part along the normal. If nothing is left, it is the
-    axis that is least along the normal.
+    Up is `upwards` without its component along the normal. If both are parallel, the
+    axis that is most nearly perpendicular to the normal replaces `upwards`.
     """
     up = upwards - float(upwards @ normal) * normal
     if float(np.linalg.norm(up)) < 1e-6:
@@ -656,17 +683,17 @@ def unroll_surface(
     normals: assets.Float64Array,
     frame: assets.Float64Array,
 ) -> tuple[assets.Float64Array, assets.Float64Array]:
-    """Return the coordinates of points along a surface, and their normals' cosines.
+    """Unroll a surface around a point, as one unrolls a label from a bottle.
 
-    The surface around the center is taken for a cylinder. There a point lies at R
-    sin(phi) in the tangent plane, but at R phi along the surface, where R is the radius
-    and phi the angle by which the normal has turned. So the component along the
-    direction of turning is stretched by phi / sin(phi).
+    The surface is treated as a cylinder of radius R. If the normal has turned by the
+    angle phi, a point is R sin(phi) away in the tangent plane at the center, but R phi
+    away along the surface. So the component in the direction of turning is stretched by
+    phi / sin(phi).
 
     Args:
-        offsets: (N, 3) of the points from the center.
-        normals: (N, 3) at the points.
-        frame: rows right, up and normal at the center.
+        offsets: (N, 3) offsets of the points from the center.
+        normals: (N, 3) unit normals at the points.
+        frame: (3, 3) rows right, up and normal at the center.
 
     Returns:
         Coordinates (N, 2) to the right and upwards, and cosines (N,) with the normal of
@@ -688,9 +715,12 @@ def unroll_surface(
 
 
 def _average_in_pixels(colors: Tensor, positions: Tensor, side: int) -> Tensor:
-    """Average colors (N, 3) over the side x side pixels in which they lie.
+    """Average colors over the pixels of a square image in which they lie.
 
-    `positions` are (N, 2), column and row in [0, 1].
+    Args:
+        colors: (N, 3).
+        positions: (N, 2) column and row of each color, in [0, 1].
+        side: number of pixels along a side.
 
     Returns:
         (side * side, 3), row by row; a pixel without any color has the nearest one.

@@ -68,10 +68,10 @@ class PoseControl(Control):
     def scene_inputs(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return the pose of the mesh, scaled and turned about its center.
+        """Return the pose (4, 4) of the mesh, scaled and turned about its center.
 
-        z is added to the former height of its lowest point if it stays on the ground
-        however it is turned, and otherwise to the former height of its center.
+        With `on_ground`, the lowest point of the turned mesh stays at its former
+        height, plus z. Otherwise the center stays at its former height, plus z.
         """
         mesh = self.get_mesh(self.scene)
         device = values["scale"].device

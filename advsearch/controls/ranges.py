@@ -137,10 +137,12 @@ class DistributionRange(Range):
     label: str
 
     def interpolate(self, u: Tensor, *, log: bool = False) -> Tensor:
-        """Return the values at coordinates in [0, 1]: the quantiles of the
-        distribution.
+        """Return the values at coordinates in [0, 1], quantiles of the distribution.
 
-        The derivative is the slope of the quantiles, by finite differences.
+        Args:
+            u: coordinates of any shape. The result is differentiable in them; its
+                derivative is the slope of the quantiles, by finite differences.
+            log: has no effect; it is there because a plain range takes it.
         """
         values = self._compute_values(u.detach())
         if u.requires_grad:
@@ -148,7 +150,7 @@ class DistributionRange(Range):
             lower = (u.detach() - SLOPE_STEP).clamp(min=0.0)
             difference = self._compute_values(upper) - self._compute_values(lower)
             slope = difference / (upper - lower)
-            # 0, but with the derivative
+            # adds 0 to the values, and the slope to their derivative
             values = values + slope * (u - u.detach())
         return values
 
@@ -162,7 +164,11 @@ class DistributionRange(Range):
     def find_coordinate(self, value: float, *, log: bool = False) -> float:
         """Return the coordinate of a value, by bisection on the quantiles.
 
-        `log` has no effect. Values outside of the range have the nearest coordinate.
+        Values outside of the range get the nearest coordinate.
+
+        Args:
+            value: value of the parameter.
+            log: has no effect; it is there because a plain range takes it.
         """
         lower = 0.0
         upper = 1.0
@@ -177,7 +183,8 @@ class DistributionRange(Range):
                 lower = middle
             else:
                 upper = middle
-        # Beyond the last quantile nothing is found: the largest coordinate below 1.
+        # For a value beyond the last quantile `upper` is still 1, and coordinates are
+        # below 1.
         return upper if upper < 1.0 else lower
 
 
@@ -198,12 +205,14 @@ def to_plain_value(value: object) -> object:
 
 
 def list_set_names(settings: object, parameter: str) -> list[str]:
-    """Return the names that the settings of a control give a parameter.
+    """Return the names that the settings of a control allow for a parameter.
+
+    A parameter may be set to a name, a list of names, or {"choices": [...]}. Values
+    that are no text are left out.
 
     Args:
-        settings: settings of a control; names alone, without values, give none.
-        parameter: name of the parameter. It is set to a name, a list of names, or a
-            mapping with "choices"; what is no text is left out.
+        settings: settings of a control; if they are no mapping, the result is empty.
+        parameter: name of the parameter.
     """
     setting = settings.get(parameter) if isinstance(settings, Mapping) else None
     if isinstance(setting, Mapping):
@@ -271,7 +280,16 @@ def _read_choices(
 
 
 def _check_bounds(where: str, parameter: Parameter, low: float, high: float) -> None:
-    """Check the bounds of a range. Raises InputError: they are equal, or reversed."""
+    """Check the bounds of a range.
+
+    Args:
+        where: name of the parameter, for messages.
+        parameter: states whether it is an angle or has a logarithmic scale.
+        low, high: bounds of the range.
+
+    Raises:
+        InputError: they are equal or reversed, or not over 0 on a logarithmic scale.
+    """
     if low == high:
         raise InputError(
             f"{where}: the range [{low:g}, {high:g}] has no size; write "
@@ -292,13 +310,17 @@ def _check_bounds(where: str, parameter: Parameter, low: float, high: float) -> 
 
 
 def _explain_turn(parameter: Parameter, low: float, high: float) -> str:
-    """Return a clause about both ranges of angles that a reversed one may mean.
+    """Return the end of a message on a reversed range of angles, such as [350, 10].
 
-    From 350 to 10 may mean the 20 degrees through 0 or the 340 in between. The first
-    range is shifted by a turn, so that it ascends and stays within the parameter's
-    bounds.
+    It may mean the 20 degrees through 0 or the 340 degrees between 10 and 350; the user
+    reads how to write both. The former is written as an ascending range, [-10, 10] or
+    [350, 370], within the parameter's bounds.
+
+    Args:
+        parameter: parameter that is an angle, in degrees.
+        low, high: bounds as the user wrote them; `low` is larger.
     """
-    # a turn back, or if the parameter does not go so far, on
+    # `low` is moved back by a turn, or if the bounds forbid it, `high` on by a turn.
     begin = low
     end = high + FULL_TURN
     if low - FULL_TURN >= parameter.low:
@@ -315,8 +337,11 @@ def _explain_turn(parameter: Parameter, low: float, high: float) -> str:
 
 
 def _make_choice(where: str, values: Sequence[ParameterValue]) -> OneOf:
-    """Return a choice. Raises InputError: a value is there twice."""
-    # it would be drawn twice as often
+    """Return a choice among values.
+
+    Raises:
+        InputError: a value is there twice; it would be drawn twice as often.
+    """
     repeated = [value for value, count in Counter(values).items() if count > 1]
     if repeated:
         raise InputError(
@@ -335,8 +360,16 @@ def _make_weighted_choice(
     """Return a choice among values with weights.
 
     Each value is repeated in proportion to its weight, so that a uniform coordinate
-    selects it with that probability. Raises InputError: weights are missing or invalid,
-    or one is too small for `MAX_REPEATS`.
+    selects it with that probability.
+
+    Args:
+        where: name of the parameter, for messages.
+        values: the values.
+        weights: what the user set; should be one number of at least 0 for each value.
+
+    Raises:
+        InputError: weights are missing or invalid, or one is so small that its value
+            is not among `MAX_REPEATS` repeats.
     """
     weight_list = list(weights) if isinstance(weights, (list, tuple)) else []
     valid_weights = [
@@ -368,9 +401,9 @@ def _make_weighted_choice(
 def _count_repeats(probabilities: Sequence[float]) -> list[int]:
     """Return how often each value is repeated, in proportion to its probability.
 
-    The total is the smallest with which all counts are whole numbers, or `MAX_REPEATS`
-    if there is none. Counts are differences of rounded cumulative counts, so that their
-    sum is the total.
+    With probabilities 0.25 and 0.75 the counts are 1 and 3. The total is the smallest
+    one with which all counts are whole numbers, or `MAX_REPEATS` if there is none.
+    Cumulative counts are rounded, not the counts, so that their sum is the total.
     """
     total = MAX_REPEATS
     for candidate in range(1, MAX_REPEATS):
@@ -399,10 +432,16 @@ def _is_list(value: object) -> TypeGuard[Sequence[Any]]:
 
 
 def _check_value(label: str, parameter: Parameter, value: object) -> ParameterValue:
-    """Return a value of a parameter as a name or a float.
+    """Check one value of a parameter; return it as a name or a float.
 
-    Raises InputError or UnknownNameError: it is neither one of the options nor a number
-    within the parameter's bounds.
+    Args:
+        label: how messages name the parameter, e.g. "pose.yaw".
+        parameter: states the options, or the bounds and the unit.
+        value: what the user set.
+
+    Raises:
+        UnknownNameError: it is a name, but none of the options.
+        InputError: it is neither a name nor a number within the bounds.
     """
     if parameter.options:
         if not isinstance(value, str):
@@ -457,12 +496,16 @@ def compute_difference(first: float, second: float, *, is_angle: bool = False) -
 def clip_to_range(
     value: float, low: float, high: float, *, is_angle: bool = False
 ) -> float:
-    """Return the value in a range that is nearest to a given one.
+    """Return the value in a range that is nearest to another value.
 
-    Angles are compared the shorter way round.
+    Args:
+        value: any value.
+        low, high: bounds of the range.
+        is_angle: whether values are degrees, of which 0 and 360 are the same.
     """
     if is_angle:
-        # in [low, low + 360): above `high` the way on to `low` may be shorter
+        # The value is moved to [low, low + 360). If it is above `high` then, it may be
+        # nearer to `low` + 360, which is the same angle as `low`.
         value = low + (value - low) % FULL_TURN
         if value > high and value - high > low + FULL_TURN - value:
             value = low
@@ -562,15 +605,20 @@ def parse_distribution(
 ) -> DistributionRange:
     """Parse the distribution of a parameter, {distribution: NAME, PARAMETER: NUMBER}.
 
+    For example {"distribution": "norm", "loc": 20, "scale": 5}, with the names of
+    scipy.stats. It is cut off at the parameter's bounds. An infinite tail is cut off at
+    `TAIL_PROBABILITY`, as the range needs finite bounds.
+
     Args:
         label: how messages name the parameter.
-        parameter: parameter whose bounds cut the distribution off.
-        setting: the setting.
+        parameter: parameter with the bounds.
+        setting: the setting, or a function that was passed from Python.
 
     Raises:
-        InputError: it has other parameters, it was a function from Python, or more of
-            it than `MAX_OUTSIDE_PROBABILITY` lies outside of the bounds.
-        UnknownNameError: there is none of that name.
+        InputError: the distribution has other parameters; it was a function that this
+            session does not have; or more of it than `MAX_OUTSIDE_PROBABILITY` lies
+            outside of the bounds.
+        UnknownNameError: scipy has no distribution of that name.
     """
     if isinstance(setting, PythonQuantiles):
         return _read_python_quantiles(label, parameter, setting)
@@ -583,11 +631,11 @@ def parse_distribution(
         )
     arguments = {key: value for key, value in setting.items() if key != DISTRIBUTION}
     frozen, text = _freeze_distribution(label, name, arguments)
-    with np.errstate(all="ignore"):  # far from where it is, some formulas overflow
+    with np.errstate(all="ignore"):  # far out in the tails, some formulas overflow
         lower_probability = float(frozen.cdf(parameter.low))
         upper_probability = float(frozen.cdf(parameter.high))
         outside = lower_probability + float(frozen.sf(parameter.high))
-        # whether the distribution ends below and above
+        # whether the distribution has a smallest and a largest value
         has_end = np.isfinite(frozen.ppf(np.array([0.0, 1.0])))
     if outside > MAX_OUTSIDE_PROBABILITY:
         raise _make_outside_error(label, parameter, text, outside)
@@ -602,10 +650,13 @@ def parse_distribution(
 def _make_outside_error(
     label: str, parameter: Parameter, text: str, outside: float
 ) -> InputError:
-    """Return the error that a distribution reaches too far beyond a parameter's bounds.
+    """Return the error for a distribution that exceeds its parameter's bounds too much.
 
-    `text` is the distribution as messages write it, and `outside` the probability of
-    values out of the bounds.
+    Args:
+        label: how messages name the parameter.
+        parameter: states the bounds and the unit.
+        text: the distribution as messages write it, e.g. "norm(loc=20, scale=5)".
+        outside: probability of values out of the bounds.
     """
     return InputError(
         f"{label}: {100.0 * outside:.3g} % of {text} lies outside of "
@@ -622,11 +673,16 @@ def _freeze_distribution(
 ) -> tuple[Any, str]:
     """Return a distribution of scipy with its arguments, and how messages write it.
 
+    Args:
+        where: name of the parameter, for messages.
+        name: name of the distribution in scipy.stats, such as "norm".
+        arguments: its arguments by name, such as loc and scale.
+
     Raises:
-        UnknownNameError: scipy has none of that name.
+        UnknownNameError: scipy has no continuous distribution of that name.
         InputError: it does not take the arguments.
     """
-    # takes a quarter of a second, and few runs draw by a distribution
+    # imported here, as it takes a quarter of a second and few runs need it
     from scipy import stats
 
     family = getattr(stats, name, None) if isinstance(name, str) else None
@@ -669,8 +725,15 @@ def _read_python_quantiles(
     """Return the range of a parameter whose values a Python function gives.
 
     The function is an inverse CDF, from a probability to a value. It is checked at
-    `N_CHECKED_QUANTILES` probabilities. Raises InputError: its values leave the
-    parameter's bounds, or fall.
+    `N_CHECKED_QUANTILES` probabilities.
+
+    Args:
+        label: how messages name the parameter.
+        parameter: states the bounds and the unit.
+        setting: has the function and its name.
+
+    Raises:
+        InputError: its values leave the parameter's bounds, or fall.
     """
     name = str(setting["name"])
 
@@ -679,7 +742,7 @@ def _read_python_quantiles(
         return np.array(values).reshape(probabilities.shape)
 
     with np.errstate(all="ignore"):
-        # whether the distribution ends below and above; if not, its tails are cut off
+        # whether there is a smallest and a largest value; if not, tails are cut off
         has_end = np.isfinite(quantiles(np.array([0.0, 1.0])))
     lower_probability = 0.0 if has_end[0] else TAIL_PROBABILITY
     upper_probability = 1.0 if has_end[1] else 1.0 - TAIL_PROBABILITY
@@ -697,8 +760,14 @@ def _check_quantiles(
 ) -> None:
     """Check the values (n,) of an inverse CDF at ascending probabilities.
 
-    Raises InputError: they leave the parameter's bounds, or fall. `name` is that of the
-    function.
+    Args:
+        label: how messages name the parameter.
+        parameter: states the bounds and the unit.
+        name: name of the function.
+        values: (n,) its values.
+
+    Raises:
+        InputError: values leave the parameter's bounds, or fall.
     """
     is_inside = (values >= parameter.low) & (values <= parameter.high)
     if not is_inside.all():
@@ -726,8 +795,15 @@ def _make_range(
 ) -> DistributionRange:
     """Return the range of a distribution between two probabilities.
 
-    `label` is the distribution's name, and `setting_name` what was set to it, for
-    messages. Raises InputError: the range has a single value.
+    Args:
+        setting_name: name of the parameter, for messages.
+        quantiles: inverse CDF of the distribution.
+        lower_probability, upper_probability: probabilities below the smallest and the
+            largest value of the range.
+        label: the distribution as messages write it.
+
+    Raises:
+        InputError: the range has a single value.
     """
     low, high = (
         float(value)

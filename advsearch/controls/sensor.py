@@ -167,9 +167,11 @@ def apply_sensor(image: Tensor, values: Mapping[str, Tensor], seed: int = 0) -> 
 
 
 def compute_vignette(height: int, width: int, amount: Tensor) -> Tensor:
-    """Return the fraction of the light (H, W, 1) that comes through a lens.
+    """Return the fraction of the light (H, W, 1) that passes through a lens.
 
-    `amount` () is the fraction that is lost in the corners.
+    Args:
+        height, width: size of the image, pixels.
+        amount: () fraction of the light that is lost in the corners.
     """
     # Natural vignetting, (1 + k r^2)^-2 with r = 1 in the corners, where it is
     # 1 - amount.
@@ -184,7 +186,7 @@ def compute_vignette(height: int, width: int, amount: Tensor) -> Tensor:
 def apply_aberration(image: Tensor, amount: Tensor) -> Tensor:
     """Return an image (H, W, 3) with lateral chromatic aberration.
 
-    Red is larger about the center by the factor 1 + amount, blue smaller by 1 - amount.
+    Red is magnified about the center by 1 + amount, blue by 1 - amount.
     """
     height, width = image.shape[:2]
     down, right = torch.meshgrid(
@@ -204,7 +206,8 @@ def apply_aberration(image: Tensor, amount: Tensor) -> Tensor:
 def apply_mosaic(light: Tensor) -> Tensor:
     """Return an image (H, W, 3) after a Bayer mosaic (RGGB).
 
-    Each pixel keeps one channel, and gets the others from neighbors, bilinearly.
+    Each pixel measures one channel. The two others are interpolated bilinearly from its
+    neighbors.
     """
     height, width = light.shape[:2]
     rows = torch.arange(height)[:, None] % 2

@@ -135,7 +135,7 @@ class ShadowControl(Control):
     choices = (Choice("corners", 6, "Corners of the card.", whole=(3, 64)),)
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        """Add the card, out of sight."""
+        """Return the scene with the card, out of sight; `scene_inputs` moves it."""
         # a dark grey texture, the same everywhere
         texels = np.full((2, 2, 3), 0.1, dtype=np.float32)
         hidden_pose = geometry.make_hidden_pose(
@@ -153,8 +153,10 @@ class ShadowControl(Control):
         )
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
-        """Return a parameter, with the direction of the strongest light as the
-        default.
+        """Return a parameter for the scene.
+
+        The default azimuth and elevation are those of the strongest light, so that the
+        card is between it and the object. There is one radius for each corner.
         """
         light_direction, _ = find_strongest_light(self.scene)
         x, y, z = light_direction
@@ -173,8 +175,9 @@ class ShadowControl(Control):
     ) -> dict[str, Tensor]:
         """Return the card's pose and the offsets of its corners.
 
-        A corner is moved towards the center by its radius. The card is hidden if it has
-        no size, or the camera would see it from everywhere.
+        A radius of 1 leaves a corner where it is, and 0 moves it to the center. The
+        card is hidden if it has no size, or if the camera would see it at all
+        distances.
         """
         radii = values["radii"]
         rim = torch.from_numpy(parts.make_polygon(len(radii)).vertices[1:].copy()).to(
@@ -193,8 +196,12 @@ class ShadowControl(Control):
     def _pose(self, values: Values, distance: float) -> Tensor:
         """Return the card's pose (4, 4) at a distance from the object's center.
 
-        It faces the object, is shifted across by x and y, and turned about the line to
-        the object.
+        The card faces the object. It is shifted by x and y in its plane, and turned
+        about the line to the object.
+
+        Args:
+            values: values of the control by parameter.
+            distance: distance in object sizes.
         """
         right, up, outwards = torch.from_numpy(self._axes(values)).to(values["x"])
         turn = torch.deg2rad(values["turn"])
@@ -233,9 +240,13 @@ class ShadowControl(Control):
     ) -> float | None:
         """Find the smallest distance at which the camera does not see the card.
 
-        It is at least the requested one, and the card stays nearer than the lamp. A
-        distance counts if a ball around the card is outside of the cone through the
-        corners of the image.
+        It is at least the requested one, and the card stays nearer than the lamp. The
+        camera does not see the card if a ball around it is outside of the cone through
+        the corners of the image.
+
+        Args:
+            values: values of the control by parameter.
+            earlier_inputs: inputs of earlier controls, which may move the camera.
 
         Returns:
             The distance in object sizes; None if the card has no size, or is visible at
@@ -281,7 +292,7 @@ class ShadowControl(Control):
             widest = math.radians(float(fov.detach()))
         else:
             widest = math.radians(self.scene.get_number("camera.fov"))
-        # below 180 degrees, where it would be infinite
+        # 3.0 radians (172 degrees) at most, as the tangent is infinite at 180 degrees
         half_tangent = math.tan(min(widest, 3.0) / 2.0)
         corner = math.atan(half_tangent * math.hypot(1.0, min(aspect, 1.0 / aspect)))
         shift = earlier_inputs.get("camera.shift")
@@ -295,9 +306,9 @@ def _is_outside_cone(center: assets.Float64Array, radius: float, angle: float) -
     """Return whether a ball is outside of a cone about the camera's axis.
 
     Args:
-        center: (3,) of the ball, in the camera's coordinates.
+        center: (3,) center of the ball in camera coordinates; z is the cone's axis.
         radius: radius of the ball.
-        angle: angle of the cone, radians.
+        angle: angle between axis and side of the cone, radians.
     """
     distance = float(np.linalg.norm(center))
     if distance <= radius:
@@ -308,12 +319,12 @@ def _is_outside_cone(center: assets.Float64Array, radius: float, angle: float) -
 
 @geometry.cache_per_scene
 def find_strongest_light(scene: SceneDescription) -> tuple[assets.Float64Array, float]:
-    """Find what puts most light on a surface that faces it.
+    """Find the light that gives most irradiance to a surface that faces it.
 
     Returns:
-        The unit direction (3,) from the object's middle to a lamp, or to the brightest
-        part of the environment above the ground; and its distance, infinite for the
-        environment.
+        The unit direction (3,) from the object's center to a lamp, or to the brightest
+        part of the environment above `MIN_ELEVATION`; and the distance of the light,
+        infinite for the environment. Without any light the direction is straight up.
     """
     strongest_direction = np.array([0.0, 0.0, 1.0])
     strongest_distance = math.inf

@@ -82,11 +82,15 @@ def _at_turbidity(table: Tensor, turbidity: Tensor) -> Tensor:
 
     It is a cubic Hermite spline, so that the derivative is continuous. The slope at an
     integer turbidity is that between its neighbors (Catmull and Rom 1974), one-sided at
-    the ends. The authors of the table interpolate linearly: then the derivative jumps
-    at integers, the default of 3 among them.
+    1 and 10. The authors of the table interpolate linearly, but then the derivative
+    jumps at integers, and the default turbidity is the integer 3.
+
+    Args:
+        table: row k belongs to the turbidity k + 1.
+        turbidity: () turbidity, from 1 to 10.
     """
     last = len(table) - 1
-    # Row 0 is turbidity 1. At the last row the one before it, which has a next one.
+    # At the turbidity 10 it is the row for 9, so that there is a row above.
     below = min(last - 1, max(0, int(turbidity.detach()) - 1))
     t = turbidity - 1.0 - below  # from 0 at the entry below to 1 at the next
     lower = table[below]
@@ -107,10 +111,15 @@ def _at_turbidity(table: Tensor, turbidity: Tensor) -> Tensor:
 def compute_sun_irradiance(elevation: Tensor, turbidity: Tensor) -> Tensor:
     """Return the sun's irradiance (3,) on a surface that faces it.
 
-    Its unit is that of the sky's radiance times steradian. The model of the radiance
-    has `SUN_PIECES` pieces, whose bounds are even in the cube root of the elevation. A
-    piece is a cubic in the elevation above its lower bound, for each of 6 powers of
-    cos(psi), by which the disk darkens towards its limb.
+    Its unit is that of the sky's radiance times steradian. The range of elevations is
+    divided in `SUN_PIECES` pieces, evenly in the cube root of the elevation. In a piece
+    the radiance is a cubic in the elevation above the lower bound of the piece. There
+    is a cubic for each of 6 powers of cos(psi), which describe how the sun's disk
+    darkens towards its limb.
+
+    Args:
+        elevation: () elevation of the sun, degrees.
+        turbidity: () turbidity, from 1 to 10.
     """
     radians = torch.deg2rad(elevation)
     fraction = float(radians.detach()) / (math.pi / 2.0)
@@ -142,8 +151,10 @@ class Sky:
     def __init__(self, ground: Tensor) -> None:
         """Compute the directions and solid angles of the texels above the horizon.
 
-        Row 0 of the map is straight up. `ground` (3,) is the ground's albedo.
+        Args:
+            ground: (3,) albedo of the ground, in [0, 1].
         """
+        # Row 0 of the map is straight up. Only the upper half is above the horizon.
         self.ground = ground
         n_upper_rows = MAP_ROWS // 2
         row = torch.arange(n_upper_rows, device=ground.device)
@@ -170,20 +181,20 @@ class Sky:
 
         Args:
             sun: unit vector (3,) towards the sun.
-            elevation: () of the sun in degrees, over 0.
-            turbidity: () in `TURBIDITIES`.
+            elevation: () elevation of the sun in degrees, over 0.
+            turbidity: () turbidity in `TURBIDITIES`.
 
         Returns:
-            (H, W, 3). The letters are the coefficients of Hosek and Wilkie's formula,
-                in the order of its tables.
+            (H, W, 3) by the formula of Hosek and Wilkie 2012. The letters are its
+            coefficients, in the order of its tables.
         """
         coefficient_table, level_table, _ = load_tables(sun.device)
         a, b, c, d, e, f, g, i, h = self._interpolated(
             coefficient_table, elevation, turbidity
         ).unbind(-1)
         level = self._interpolated(level_table, elevation, turbidity)
-        # of the angle between a direction and the sun; `self.cosines` are of that
-        # between a direction and the zenith
+        # cosine of the angle between direction and sun; `self.cosines` are those of the
+        # angle between direction and zenith
         cosine = (self.directions @ sun)[..., None]
         angle = compute_angles(self.directions, sun)[..., None]
         horizon = 1.0 + a * torch.exp(b / (self.cosines + 0.01))
@@ -202,14 +213,21 @@ class Sky:
     def _interpolated(
         self, table: Tensor, elevation: Tensor, turbidity: Tensor
     ) -> Tensor:
-        """Interpolate a table (10, 2, 6, 3, ...) in turbidity, elevation and ground
-        albedo.
+        """Interpolate a table in turbidity, elevation and ground albedo.
 
-        Its axes are turbidity, albedo (0 or 1), control point and channel. It is a
-        quintic Bezier curve in the cube root of the elevation, and linear in the
-        albedo. Returns (3, ...).
+        It is a quintic Bezier curve in the cube root of the elevation, and linear in
+        the albedo.
+
+        Args:
+            table: (10, 2, 6, 3, ...); axes are turbidity, albedo (0 or 1), control
+                point and channel.
+            elevation: () elevation of the sun, degrees.
+            turbidity: () turbidity, from 1 to 10.
+
+        Returns:
+            (3, ...).
         """
-        # not 0, where the cube root has no derivative
+        # over 0, as the cube root has no derivative at 0
         x = (elevation / 90.0).clamp(1e-6, 1.0).pow(1.0 / 3.0)
         weights = torch.stack(
             [math.comb(5, k) * x**k * (1.0 - x) ** (5 - k) for k in range(6)]
@@ -240,13 +258,13 @@ class Sky:
         """Return the map of a sky, and the irradiance towards its sun.
 
         Args:
-            azimuth: () of the sun, degrees.
-            elevation: () of the sun, over 0 and at most 90 degrees.
-            turbidity: () in `TURBIDITIES`.
+            azimuth: () azimuth of the sun, degrees.
+            elevation: () elevation of the sun, over 0 and at most 90 degrees.
+            turbidity: () turbidity in `TURBIDITIES`.
 
         Returns:
-            Linear radiance (ROWS, COLUMNS, 3); the mean channel () of the
-                irradiance on a surface that faces the sun.
+            Linear radiance (ROWS, COLUMNS, 3); and the irradiance () on a surface that
+            faces the sun, as the mean of the channels.
         """
         sun = compute_direction(azimuth, elevation)
         upper = self.compute_dome(sun, elevation, turbidity) + self.compute_disk(
@@ -352,9 +370,10 @@ class SkyControl(Control):
         return {"environment.data": self.compute_radiance(values)}
 
     def compute_radiance(self, values: Values) -> Tensor:
-        """Return the map (H, W, 3) of linear radiance at some values.
+        """Return the map (H, W, 3) of linear radiance, differentiable in the values.
 
-        Differentiable.
+        The map is scaled as a camera would expose it: to a given irradiance towards the
+        sun. With the choice `exposure=fixed` the factor is that of the clean sky.
         """
         arguments = values["azimuth"], values["elevation"], values["turbidity"]
         radiance, metered = make_sky(self.scene.ground_color, arguments[0].device)(

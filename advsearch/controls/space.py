@@ -70,10 +70,11 @@ class Space:
 
     @cached_property
     def groups(self) -> tuple[Group, ...]:
-        """Groups of coordinates, in the order of u; their estimators are chosen later.
+        """Groups of coordinates, one for each searched parameter, in the order of u.
 
-        The valid ones of a group lack "material", the adjoint in material form, if the
-        scene does not support that.
+        A group lists the gradient estimators that are valid for it; one is chosen
+        later. "material", the adjoint in material form, is removed if the scene does
+        not support it.
         """
         lacks_material_form = not self._has_material_form()
         groups = []
@@ -92,9 +93,9 @@ class Space:
     def _has_material_form(self) -> bool:
         """Return whether the scene's derivatives can be computed in material form.
 
-        That adjoint follows points of a moving surface. It has no terms for a medium, a
-        backdrop, a lens, the edges of cut-out texels, normal maps, or meshes that emit
-        light.
+        That adjoint follows points of a moving surface. It is not implemented for a
+        medium, a backdrop, a lens, the edges of cut-out texels, normal maps, or meshes
+        that emit light.
         """
         scene = self.scene
         if scene is None:
@@ -130,11 +131,14 @@ class Space:
         return tuple(sorted(range(len(ranks)), key=lambda index: ranks[index]))
 
     def inputs(self, u: Tensor) -> dict[str, Tensor]:
-        """Map u to scene inputs, by differentiable torch operations.
+        """Map u (d,) to scene inputs by name, by differentiable torch operations.
 
-        Controls that refine what others set come later, and those that lie on top last,
-        whatever the order in which they were requested. Raises InputError: two controls
-        set one input.
+        Controls that refine the inputs of others come after them, and those with
+        `on_top` last, in whatever order the user listed them.
+
+        Raises:
+            InputError: two controls set the same input, or one of another package sets
+                an invalid one.
         """
         slices = u.split(self.sizes)
         merged = dict[str, Tensor]()
@@ -142,7 +146,7 @@ class Space:
         for index in self._evaluation_order:
             control = self.controls[index]
             new_inputs = control.inputs(slices[index], merged)
-            # tests check ours; a check of every image would take time
+            # Built-in controls are checked by tests; checks at every image take time.
             if not is_ours(type(control)):
                 _check_inputs(control.name, new_inputs)
             for name in new_inputs:
@@ -161,11 +165,14 @@ class Space:
     def _with_previous_inputs(
         self, u: Tensor
     ) -> list[tuple[Control, Tensor, Mapping[str, Tensor]]]:
-        """Return each control with its slice of u and the inputs set before it.
+        """Return each control with its slice of u and the inputs of earlier controls.
 
-        The result has the order of the controls; but inputs are set in the order of
-        evaluation. A control that refines nothing gets no inputs, and none are computed
-        after the last control that needs some.
+        "Earlier" is meant in the order of evaluation; the result has the order of
+        `controls`. A control that refines nothing gets no inputs. No inputs are
+        computed after the last control that needs some, as they take time.
+
+        Args:
+            u: (d,) the configuration.
         """
         slices = u.detach().split(self.sizes)
         order = self._evaluation_order
@@ -205,7 +212,7 @@ class Space:
 
         Args:
             u: (d,) the configuration.
-            controls: whose values are returned; None for all.
+            controls: only values of these controls are returned; None for all.
         """
         described = dict[str, Value]()
         for control, part, earlier_inputs in self._with_previous_inputs(u):
@@ -238,10 +245,10 @@ class Space:
 
     @property
     def exposure(self) -> tuple[float, float]:
-        """Seconds that the shutter is open, and in which rows are read.
+        """Seconds that the shutter is open, and that reading all rows takes.
 
-        They are those of the control with the longest exposure. The latter are below 0
-        where rows are read from the bottom.
+        The second is 0 without a rolling shutter, and negative if rows are read from
+        the bottom. Both are those of the control with the longest exposure.
         """
         exposures = (control.exposure for control in self.controls)
         return max(
@@ -258,20 +265,20 @@ class Space:
         )
 
     def fix_first_controls(self, u: Tensor) -> Space:
-        """Return the space whose first controls stay at a configuration.
+        """Return the space with its first controls fixed at a configuration.
 
-        The others vary. If the fixed controls choose the environment, the space
-        remembers which one.
+        Only the other controls have coordinates in it. If the fixed controls choose the
+        environment, the space has its name.
 
         Args:
-            u: (k,) coordinates of the first controls, whose number follows from k.
+            u: (k,) coordinates of the first controls; k decides how many are fixed.
 
         Raises:
             InputError: no number of controls has k coordinates.
         """
         sizes = self.sizes
-        # several counts are possible where controls have no coordinates; the smallest
-        # is taken
+        # A control may have no coordinates, so that several counts fit: take the
+        # smallest.
         counts = [
             count for count in range(len(sizes) + 1) if sum(sizes[:count]) == len(u)
         ]
@@ -306,12 +313,13 @@ class Space:
         return self.environment
 
     def list_notes(self, scene: SceneDescription) -> tuple[str, ...]:
-        """Return what a user should know of the scene, and of how far the camera goes.
+        """Return notes for the user on the scene and on the views that are searched.
 
-        See `advsearch.scene.grounds`.
+        A note says, for example, that the camera may enter a solid (see
+        `advsearch.scene.grounds`).
 
         Args:
-            scene: scene of a space without a scene of its own.
+            scene: used if the space has no scene.
         """
         scene = self.scene or scene
         rotates_map = any(
@@ -329,10 +337,10 @@ class Space:
         )
 
     def _sample_camera_views(self, scene: SceneDescription) -> list[CameraView]:
-        """Return views of the camera, spread over the box of the control that moves it.
+        """Return views of the camera, spread over the range in which it may move.
 
-        That is the first control that sets the camera's pose. If none does, the only
-        view is that of the scene.
+        They are spread over the coordinates of the first control that sets the camera's
+        pose. If none does, the only view is that of the scene.
         """
         for control, start in self.split_by_control(self.start):
             # A control without slots, such as a texture, moves no camera. A fixed one
@@ -388,9 +396,9 @@ class _FixedControl(Control):
     """A bound control that stays at one configuration, and takes no coordinates."""
 
     def __init__(self, control: Control, u: Tensor) -> None:
-        """Fix a bound control at a slice of u (k,).
+        """Fix a bound control at coordinates u (k,).
 
-        It passes that slice on in place of its own, which is empty.
+        This control takes no coordinates itself; it passes u to the one that it wraps.
         """
         self._control = control
         self._u = u
@@ -454,8 +462,13 @@ RANGE_TOLERANCE = 1e-4  # how far past its range rounding may put a colour
 def _check_inputs(control: str, inputs: object) -> None:
     """Check the inputs that a control of another package sets.
 
+    Args:
+        control: name of the control.
+        inputs: what it returned; it should be tensors by name, such as
+            "object.base_color".
+
     Raises:
-        InputError: they are no tensors by name, or have a wrong shape or range.
+        InputError: it is something else, or a tensor has a wrong shape or range.
     """
     if not isinstance(inputs, Mapping):
         raise InputError(
@@ -494,7 +507,16 @@ def _has_shape(value: Tensor, shape: tuple[int | None, ...]) -> bool:
 
 
 def _check_range(label: str, value: Tensor, low: float, high: float) -> None:
-    """Check that a tensor is in a range. Raises InputError: it is not, or has NaN."""
+    """Check that all elements of a tensor are in a range, but for rounding.
+
+    Args:
+        label: how the message names the tensor.
+        value: tensor of any shape.
+        low, high: bounds, perhaps infinite.
+
+    Raises:
+        InputError: an element is outside of the range, or NaN.
+    """
     if not value.numel():
         return
     smallest, largest = (float(bound) for bound in value.detach().aminmax())

@@ -163,7 +163,13 @@ class TextureControl(Control):
     )
 
     def check_choices(self) -> None:
-        """Check the form and the names of materials."""
+        """Check the form and the names of materials.
+
+        `materials` becomes a list without duplicates, as one name may be given as text.
+
+        Raises:
+            InputError: the form is not possible, or `materials` are no names.
+        """
         self.form = self.select_form(FORMS)
         names = self.chosen["materials"]
         if names is None:
@@ -184,7 +190,14 @@ class TextureControl(Control):
         self.chosen["materials"] = list(dict.fromkeys(names))
 
     def get_mesh(self, scene: SceneDescription) -> MeshPart:
-        """Return the mesh that it paints, which a material of the object may name."""
+        """Return the mesh that the control paints.
+
+        The name after the colon, as in "texture:chair", is that of a mesh, or that of a
+        material of the object.
+
+        Raises:
+            UnknownNameError: it is neither.
+        """
         if self._find_named_materials(scene):
             return scene.meshes[OBJECT]
         try:
@@ -199,13 +212,12 @@ class TextureControl(Control):
             raise UnknownNameError(kind, self.mesh, known, hint) from None
 
     def _find_named_materials(self, scene: SceneDescription) -> list[str]:
-        """Return the materials of the object that the control's name means, as in
-        `texture:paint`.
+        """Return the materials of the object that the control is named after.
 
-        A name is a material's own, or as it is written for the command line. Empty if a
-        mesh has that name, which wins, or no material has.
+        "texture:paint" means the material "paint", by its own name or as the command
+        line writes it. The list is empty if there is none, or if a mesh has that name.
         """
-        # imported here, as it takes time and most runs do without
+        # imported here, as it takes time and most runs do not need it
         from advsearch.scene.importing.files import sanitize_name
 
         if self.mesh in scene.meshes:
@@ -248,9 +260,13 @@ class TextureControl(Control):
     ) -> Tensor:
         """Return the original texture (h, w, 3) sRGB at the resolution of the search.
 
-        By default a full texture is resized to a square of its longer side within
-        `RESOLUTIONS`. If only some materials are painted, a large enough texture stays
-        as it is, so that the rest does not change.
+        By default a texture is resized to a square with its longer side, which is
+        limited to `RESOLUTIONS`. If only some materials are painted, a large enough
+        texture is not resized, so that the other materials stay exactly the same.
+
+        Args:
+            part: mesh with the texture.
+            materials: materials that are painted; None for the full texture.
         """
         original = torch.from_numpy(part.base_color.copy())
         longer_side = max(original.shape[:2])
@@ -263,10 +279,11 @@ class TextureControl(Control):
         return resize_to_square(original, int(resolution or default))
 
     def _make_painter(self, part: MeshPart, mask: Tensor) -> Painter:
-        """Return what paints the texels of a mask (h, w) bool.
+        """Return what paints the texels: a palette, waves, or each texel by itself.
 
-        The form that was chosen decides: a palette, waves, or every texel by itself.
-        `part` is the mesh, whose areas weigh the colors of a palette.
+        Args:
+            part: the mesh; the areas of its texels weight the colors of a palette.
+            mask: (h, w) bool, texels that are painted.
         """
         texels = self._original[mask]
         norm = self.chosen["norm"]
@@ -299,9 +316,14 @@ class TextureControl(Control):
     def _find_painted_texels(
         self, part: MeshPart, names: Sequence[str], shape: tuple[int, int]
     ) -> BoolArray:
-        """Return which texels (h, w) are read for some materials and for no others.
+        """Return which texels (h, w) only the painted materials use.
 
-        `names` are the materials; `shape` is that of the texture, `part` its mesh.
+        Texels that other materials use as well are not painted.
+
+        Args:
+            part: mesh with the materials.
+            names: names of the materials to paint.
+            shape: height and width of the texture.
 
         Raises:
             InputError: the mesh has no materials, or too many of the texels are shared.
@@ -412,13 +434,13 @@ def to_texels(u: Tensor) -> Tensor:
 def make_palette_painter(original: Tensor, centers: Tensor, budget: Budget) -> Painter:
     """Return a painter that changes a few colors, and all texels that resemble them.
 
-    A texel changes by the mean of the colors' changes, weighted by how near they are to
-    it.
+    A texel changes by a weighted mean of the changes of all palette colors. Colors that
+    are near to its own have the largest weights.
 
     Args:
         original: (n, 3) sRGB, the texels.
-        centers: (k, 3) sRGB, the original's palette.
-        budget: the ball around the palette.
+        centers: (k, 3) sRGB, the palette of the original texture.
+        budget: norm ball around the palette.
     """
     squared_distance = (original[..., None, :] - centers).square().sum(dim=-1)  # (n, k)
     # A color's influence falls off over half the mean distance to the nearest other
@@ -450,13 +472,14 @@ def _paint_palette(
 def make_wave_painter(
     original: Tensor, mask: Tensor, count: int, radius: float
 ) -> Painter:
-    """Return a painter of products of cosine waves down and to the right.
+    """Return a painter that adds cosine waves to a texture.
 
-    A tanh limits their sum. A coordinate is the amplitude of one product in one
-    channel: 0 at 0.5, and at the bounds one that falls with the product's frequency.
+    The change is a sum of products of a wave down and a wave to the right, limited by a
+    tanh. A coordinate of u is the amplitude of one product in one channel. 0.5 means
+    the amplitude 0; the amplitude at the bounds decreases with the frequency.
 
     Args:
-        original: (n, 3) sRGB.
+        original: (n, 3) sRGB, the texels that are painted.
         mask: (h, w) bool, the texels that are painted.
         count: number of waves along each side; wave m has m half periods.
         radius: largest change of a texel value.
@@ -488,10 +511,15 @@ def _paint_waves(
     waves: tuple[Tensor, Tensor, Tensor],
     u: Tensor,
 ) -> Tensor:
-    """Return the texels (n, 3) with the waves of a slice u; see `make_wave_painter`.
+    """Return the texels (n, 3) with waves added.
 
-    `waves` are those down (h, k) and to the right (w, k), and their largest amplitudes
-    (k, k, 1).
+    Args:
+        original: (n, 3) sRGB, the texels without waves.
+        mask: (h, w) bool, texels that are painted.
+        radius: largest change of a texel value.
+        waves: the waves down (h, k) and to the right (w, k), and the largest amplitude
+            (k, k, 1) of each product.
+        u: (3 k^2,) amplitudes, as coordinates in [0, 1].
     """
     down, right, max_amplitude = (wave.to(u.device) for wave in waves)
     amplitudes = (2.0 * u - 1.0).reshape(*max_amplitude.shape[:2], 3) * max_amplitude
@@ -503,10 +531,10 @@ def _paint_waves(
 def compute_palette(image: Tensor, weight: Float32Array, count: int) -> Tensor:
     """Return the colors of an image by weighted k-means, heaviest first.
 
-    Lloyd's algorithm on the image's 5-bit colors from a start without chance: the
-    heaviest color, then each time the one with the largest weight times squared
-    distance from those chosen (k-means++ of Arthur and Vassilvitskii 2007 with its draw
-    replaced by the most likely outcome).
+    Lloyd's algorithm runs on the image's colors, reduced to 5 bits a channel. It starts
+    from k-means++ (Arthur and Vassilvitskii 2007) without randomness: the first center
+    is the heaviest color, each next one the color with the largest weight times squared
+    distance from the nearest center.
 
     Args:
         image: (h, w, 3) sRGB in [0, 1].
@@ -537,10 +565,14 @@ def _quantise_colors(
 ) -> tuple[Float64Array, Float64Array]:
     """Return the different colors (N, 3) of an image, and their mass (N,).
 
-    The image is sorted into cells of 5 bits a channel; a color is the weighted mean of
-    its cell. The mass is the square root of the cell's weight: with the weight itself,
-    shades of the largest surface would take all centers. Cells without weight are left
-    out.
+    Colors with the same 5 highest bits in each channel are averaged, by their weights.
+    The mass is the square root of the total weight. With the weight itself, shades of
+    the largest surface would take all centers of the palette. Colors without weight are
+    left out.
+
+    Args:
+        image: (h, w, 3) sRGB in [0, 1].
+        weight: (h, w) weight of each texel, such as its area.
     """
     colors = image.reshape(-1, 3).double().numpy()
     weights = weight.reshape(-1).astype(np.float64)
@@ -562,15 +594,19 @@ def _quantise_colors(
 def _choose_first_centers(
     points: Float64Array, mass: Float64Array, count: int
 ) -> list[int]:
-    """Choose the points (N, 3) from which k-means starts, as up to `count` indices.
+    """Choose the points from which k-means starts; return their indices.
 
-    The heaviest is first. Then it is always the point with the largest mass times
-    squared distance from the nearest chosen one. There are fewer if no other color is
-    left.
+    The first is the heaviest. Each next one has the largest mass times squared distance
+    from the nearest chosen one. There are fewer than `count` if no other color is left.
+
+    Args:
+        points: (N, 3) colors.
+        mass: (N,) weight of each color.
+        count: largest number of points.
     """
     chosen = [int(mass.argmax())]
     while len(chosen) < min(count, len(points)):
-        # of each point from the nearest chosen one
+        # (N,) from each point to the nearest chosen one
         squared_distance = (
             ((points[:, None] - points[chosen]) ** 2).sum(axis=-1).min(axis=1)
         )

@@ -123,9 +123,11 @@ class ThingsControl(Control):
     def fit(self) -> None:
         """Find which things this control moves, and check that they stand free.
 
+        A thing is a further mesh of the scene, such as a car next to the object.
+
         Raises:
-            InputError: nothing stands beside the object, or a thing stands in another.
-            UnknownNameError: a parameter is about a thing that the scene has not.
+            InputError: the scene has no things, or one overlaps with something.
+            UnknownNameError: a parameter names a thing that the scene does not have.
         """
         things = self.scene.things
         if not things:
@@ -156,9 +158,10 @@ class ThingsControl(Control):
         return moved
 
     def _check_things_stand_free(self) -> None:
-        """Check the things that this control moves where the scene has them.
+        """Check that the things of this control stand free in the clean scene.
 
-        Raises InputError: one stands in something else.
+        Raises:
+            InputError: one overlaps with something else.
         """
         # with all parameters 0, things stand where the scene has them
         unmoved = {slot.parameter.name: torch.zeros(()) for slot in self.slots}
@@ -208,9 +211,13 @@ class ThingsControl(Control):
     ) -> dict[str, Tensor]:
         """Return the pose `<thing>.to_world` (4, 4) of each thing that it moves.
 
-        A thing is turned about its foot and put where it stands. An absent one is
-        scaled to almost nothing under the ground, so that the meshes stay the same.
-        Derivatives reach the heading, not the position.
+        A thing is turned about its foot and moved to its free position. An absent one
+        is made tiny and put under the ground, so that the scene keeps all its meshes.
+        The heading has a derivative, the position has none.
+
+        Args:
+            values: values of the control, such as "car.x" and "car.heading".
+            earlier_inputs: inputs of earlier controls, which may move obstacles.
         """
         inputs = {}
         for name, stand in self._compute_stands(values, earlier_inputs).items():
@@ -250,10 +257,14 @@ class ThingsControl(Control):
     def _compute_stands(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Stand]:
-        """Compute where the things that move stand, by name; without derivatives.
+        """Compute where the moved things stand, by name, without derivatives.
 
-        They are placed in their order, and each that is present is an obstacle to the
-        next ones.
+        They are placed one after the other, and each that is present is an obstacle to
+        those after it.
+
+        Args:
+            values: values of the control, such as "car.x" and "car.heading".
+            earlier_inputs: inputs of earlier controls, which may move obstacles.
         """
         scene = self.scene
         obstacles = self._list_obstacles(earlier_inputs)
@@ -279,11 +290,15 @@ class ThingsControl(Control):
     def _list_obstacles(
         self, earlier_inputs: Mapping[str, Tensor]
     ) -> list[parts.Footprint]:
-        """List the footprints of what a thing may not stand in.
+        """List the footprints that a thing must not overlap with.
 
-        The object is first, then the camera, then the things that do not move. The
-        camera's footprint is a circle around it, which is as high as wide, from the
-        camera upwards.
+        The object's is first, then the camera's, then those of things that this control
+        does not move. The camera's is a circle around it that keeps the view free; its
+        height, upwards from the camera, is its radius.
+
+        Args:
+            earlier_inputs: inputs of earlier controls, which may have moved object and
+                camera.
         """
         scene = self.scene
         object_footprint = _compute_footprint(scene, "object", earlier_inputs)
@@ -325,24 +340,24 @@ class ThingsControl(Control):
     ) -> tuple[Stand, assets.Float64Array]:
         """Find the free position of one thing, and its outline (K, 2) there.
 
-        A thing that would stand in something is pushed along the line from the object's
-        center through its requested position. An absent one is not.
+        A thing that would overlap with something is pushed along the line from the
+        object's center through its requested position. An absent one is not pushed.
 
         Args:
             name: name of the thing.
             values: values of the control.
             initial_footprint: footprint of the thing in the scene, before it is moved.
             object_center: (2,) the object's center.
-            obstacles: it is pushed away from the object until it is free of these.
-            solids: solids of the surroundings; it is first pushed towards the object
-                until it is free of these.
+            obstacles: footprints that it must not overlap with.
+            solids: solids of the surroundings, such as walls. If it overlaps with one,
+                it is first pushed towards the object.
         """
         scene = self.scene
         x, y, heading, is_absent = self._read_numbers(name, values)
         foot = _find_foot(scene.meshes[name])
         # x and y are metres from where the thing stands in the scene
         requested = foot[:2] + np.array([x, y]) / scene.size_in_metres
-        # about its foot
+        # (K, 2) outline relative to its foot, about which it is turned
         outline = _rotate_outline(initial_footprint.outline - foot[:2], heading)
         direction = _normalize(requested - object_center)
         push_distance = 0.0
@@ -387,20 +402,23 @@ def _find_free_shift(
     solids: Sequence[parts.Solid],
     gap: float,
 ) -> float:
-    """Find how far a thing is shifted along a direction so that it stands free.
+    """Find how far a thing has to be shifted along a direction to stand free.
 
-    If it stands in solids, it first goes backwards, out of all of them. From there it
-    goes forwards past each solid or obstacle that it stands in, in their order along
-    the direction. The shift is negative if it ends behind where it began.
+    If it overlaps with solids (e.g. walls), it first moves backwards, to the object,
+    out of all of them. From there it moves forwards past each solid or obstacle that it
+    overlaps with, in their order along the direction.
 
     Args:
         footprint: footprint of the thing at the requested position.
         direction: (2,) unit vector away from the object.
-        obstacles: footprints that it may not overlap with.
-        solids: solids of the surroundings, likewise.
-        gap: distance that stays free.
+        obstacles: footprints that it must not overlap with.
+        solids: solids of the surroundings, which it must not overlap with either.
+        gap: distance from obstacles that is left free.
+
+    Returns:
+        The shift, in scene units; negative if it is backwards.
     """
-    # (begin, end) of the shifts at which it overlaps
+    # (begin, end) of the shifts at which it overlaps with each
     solid_intervals = [
         geometry.find_overlap_interval(footprint, solid.footprint, direction)
         for solid in solids
@@ -410,11 +428,11 @@ def _find_free_shift(
         for obstacle in obstacles
     ]
     shift = 0.0
-    # of the solids in which the thing stands without a shift
+    # where the intervals begin that contain the shift 0
     solid_begins = [begin for begin, end in solid_intervals if begin < 0.0 < end]
     if solid_begins:
         shift = min(solid_begins) - gap
-    # in order of their begins, so that a shift past one is tested by all behind it
+    # sorted by their begins: after a shift past one, those that begin later are tested
     for begin, end in sorted(obstacle_intervals + solid_intervals):
         if begin < shift < end:
             shift = end + gap
@@ -426,9 +444,14 @@ def _compute_height(
     foot: assets.Float64Array,
     position: assets.Float64Array,
 ) -> float:
-    """Return the height of a thing's foot at a position (2,) of the ground.
+    """Return the height (z) of a thing's foot after it was moved over the ground.
 
-    The thing keeps its height above the ground, which it has at `foot` (3,) so far.
+    The thing keeps its height above the ground, which need not be flat.
+
+    Args:
+        scene: scene with the ground.
+        foot: (3,) foot of the thing before.
+        position: (2,) new position.
     """
     height_above_ground = foot[2] - scene.get_ground_height(foot[:2])
     height: float = height_above_ground + scene.get_ground_height(position)
@@ -449,11 +472,14 @@ def _find_foot(part: parts.MeshPart) -> assets.Float64Array:
 def _compute_footprint(
     scene: SceneDescription, name: str, earlier_inputs: Mapping[str, Tensor]
 ) -> parts.Footprint:
-    """Return the footprint of a mesh on the ground, as the controls before have left
-    it.
+    """Return the footprint of a mesh on the ground, after the earlier controls.
 
-    `earlier_inputs` are their inputs, among which may be the mesh's pose (4, 4) and the offsets
-    (N, 3) of its vertices; otherwise it is as in the scene.
+    Args:
+        scene: the scene.
+        name: name of the mesh.
+        earlier_inputs: inputs of earlier controls. They may have the mesh's pose
+            `<name>.to_world` (4, 4) and offsets of its vertices (N, 3); what is missing
+            is as in the scene.
     """
     part = scene.meshes[name]
     pose = earlier_inputs.get(f"{name}.to_world")

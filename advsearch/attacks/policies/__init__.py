@@ -63,10 +63,10 @@ policy itself.
 
 
 def make_policy(name: str, **options: Any) -> Policy[Any]:
-    """Return the policy of that name with the given options, which are its dataclass's
-    fields.
+    """Return a policy by its name, with options, the fields of its dataclass.
 
-    A wrapper's `policy` and `policies` may be given as a `Spec`, and as a list of them:
+    A policy that wraps others takes `policy`, or a list `policies`, by name or as a
+    mapping with a name and options:
 
         make_policy("restarts", policy="pgd", times=4)
         make_policy("portfolio", policies=["cmaes", {"name": "pgd", "momentum": 0.9}])
@@ -96,7 +96,7 @@ def _make_nested_policy(spec: Spec, where: str) -> Policy[Any]:
 
     Args:
         spec: a policy, a name, or a mapping with a `name` and options.
-        where: what it is of, for messages.
+        where: where the policy was stated, for messages, e.g. "policy of restarts".
 
     Raises:
         InputError: it is something else.

@@ -75,9 +75,10 @@ class ArchiveState:
     observations: policies.Observations | None = None
 
     def add_generation(self) -> ArchiveState:
-        """Return the state with a copy of the archive that has the generation so far.
+        """Return the state with the current generation added to a copy of the archive.
 
-        What could not be evaluated has no cell.
+        The generation may be incomplete. A configuration without a finite objective is
+        left out.
         """
         objectives = np.array(self.values)
         is_finite = np.isfinite(objectives)
@@ -96,13 +97,13 @@ class ArchiveState:
     def make_offspring(self, samples: Tensor, rng: torch.Generator) -> Tensor:
         """Return offspring (n, d) of the archive, which may be out of bounds.
 
-        Each has two parents: numbers are those of the first plus noise and a random
-        step along the line to the second; options are those of the first, or, with
-        probability `RESAMPLED_FRACTION`, those of a sample.
+        Each has two parents. Its numbers are those of the first, plus noise, plus a
+        random step along the line to the second. Its discrete choices are those of the
+        first, or with probability `RESAMPLED_FRACTION` those of a sample.
 
         Args:
-            samples: (n, d) configurations that are sampled anew.
-            rng: generator of the noise, the steps and what is sampled anew.
+            samples: (n, d) new random configurations.
+            rng: generator of random numbers; it advances.
         """
         count, dim = samples.shape
         first, second = self._sample_parents(count)
@@ -123,10 +124,10 @@ class ArchiveState:
     def _sample_parents(self, count: int) -> tuple[Tensor, Tensor]:
         """Return two parents (count, d) of each offspring.
 
-        Both are elites, the stored configurations of cells: the first is the best of
-        `TOURNAMENT` sampled ones, the second any.
+        Both are elites, which are the configurations stored in the cells. The first is
+        the best of `TOURNAMENT` random elites, the second any random elite.
         """
-        # Sampling changes the generator of an archive.
+        # Sampling changes the archive's random generator, so a copy is sampled.
         archive = copy.deepcopy(self.archive)
         elites = archive.sample_elites((TOURNAMENT + 1) * count)
         shape = (TOURNAMENT + 1, count)
@@ -141,9 +142,14 @@ class ArchiveState:
     ) -> Tensor:
         """Return the `count` most promising of the candidates `points` (n, d).
 
-        The promise of a candidate is the probability, by the surrogate, that it exceeds
-        the objective to beat in its cell; in a cell that fails already it counts
-        `IMPROVEMENT_WEIGHT` times. The best of each cell come first, then the rest.
+        The promise of a candidate is the probability that it exceeds the objective to
+        beat in its cell. In a cell that has a failure already, it is multiplied by
+        `IMPROVEMENT_WEIGHT`. The best candidate of each cell comes before all others.
+
+        Args:
+            surrogate: predicts mean and standard deviation of the objective.
+            points: (n, d) candidates.
+            count: number of candidates to return.
         """
         mean, deviation = surrogate.predict(surrogate.box.from_configuration(points))
         failed_objective_of_cell, threshold = self._find_objectives_to_beat()
@@ -164,11 +170,12 @@ class ArchiveState:
         return points[_order_by_cell(order, cells)[:count]]
 
     def _find_objectives_to_beat(self) -> tuple[dict[int, float], float]:
-        """Return the objectives to beat: those of the cells that fail, by index of the
-        cell, and a single one for all other cells.
+        """Return the objective that a new configuration has to beat in each cell.
 
-        The latter is the smallest objective of a failure; without any failure, the
-        largest objective.
+        Returns:
+            The objectives of cells that have a failure, by index of the cell; and one
+            value for all other cells. That is the smallest objective of a failure, or
+            without any failure the largest objective so far.
         """
         elites = self.archive.data()
         objectives = torch.from_numpy(elites["objective"])
@@ -223,16 +230,16 @@ def _find_cell_ranges(
 def _make_candidates(
     state: ArchiveState, observations: policies.Observations, rng: torch.Generator
 ) -> Tensor:
-    """Return candidates (n, d) for a surrogate to choose from: offspring, moved into
-    the box.
+    """Return candidates (n, d) for a surrogate to choose from.
 
-    The parameters that span the archive are sampled uniformly for some of them, so that
-    they may lie in any cell.
+    They are offspring of the archive, moved into the bounds. In a part of them
+    (`ANY_CELL_FRACTION`), the parameters that span the archive are sampled uniformly,
+    so that they reach cells far from their parents.
 
     Args:
         state: state of the search.
-        observations: have the box.
-        rng: generator of the samples.
+        observations: evaluations so far; only their box coordinates are used.
+        rng: generator of random numbers; it advances.
     """
     box = observations.box
     uniform = torch.rand(N_CANDIDATES, box.count, generator=rng)
@@ -253,11 +260,11 @@ def _make_archive(
 
     Args:
         domain: domain of the search.
-        measure_indices: (k,) indices in u of the parameters.
-        dims: number of cells along the axis of each.
+        measure_indices: (k,) indices in u of the parameters that span the archive.
+        dims: number of cells along each of these axes.
         seed: seed of the search.
     """
-    from ribs import archives  # an extra, and it takes seconds
+    from ribs import archives  # an optional package, which takes seconds to import
 
     lower = domain.lower[measure_indices].tolist()
     upper = domain.upper[measure_indices].tolist()
@@ -343,8 +350,15 @@ class MapElites(Policy[ArchiveState]):
     def start(
         self, domain: policies.Domain, generator: torch.Generator, steps: int
     ) -> ArchiveState:
-        """Start with an empty archive, and a generation of the initial point and
-        samples.
+        """Start with an empty archive.
+
+        The first generation has the initial point and random samples. A surrogate is
+        used only if `_make_observations` says that the domain suits it.
+
+        Args:
+            domain: domain of the search.
+            generator: source of the seed.
+            steps: renders of the search, which are not needed here.
 
         Raises:
             InputError: the domain has too many numbers, or the archive too many cells.
@@ -410,10 +424,9 @@ class MapElites(Policy[ArchiveState]):
         return self._start_generation(state.add_generation())
 
     def failures(self, state: ArchiveState) -> policies.Failures:
-        """Return the cells whose configuration is a failure of the model.
+        """Return how many cells contain a failure, and diverse examples of these.
 
-        They are counted, and so are the cells that are filled; a diverse selection is
-        returned as examples. A generation that is not complete yet counts.
+        A generation that is not complete yet is counted as well.
         """
         archive = state.add_generation().archive
         measure_indices = tuple(state.measure_indices.tolist())
@@ -448,15 +461,16 @@ class MapElites(Policy[ArchiveState]):
     def _start_generation(self, state: ArchiveState) -> ArchiveState:
         """Begin the next generation: sample or choose its configurations.
 
-        About one in ten is sampled from the domain; the others are offspring, chosen by
-        the surrogate if there is one. While the archive is empty all are sampled.
+        About one in ten is a random sample of the domain. The others are offspring of
+        the archive; if there is a surrogate, it chooses them among many candidates.
+        While the archive is empty, all are random samples.
         """
         state = replace(state, generation=state.generation + 1, values=(), successes=())
         domain = state.domain
         rng = policies.seeded(state.seed, state.generation)
         if state.archive.empty:  # nothing could be evaluated so far
             return replace(state, points=domain.sample(rng, self.population))
-        # each configuration is sampled with this probability; only their number counts
+        # A binomial number of configurations is sampled; their order has no meaning.
         is_sampled = torch.rand(self.population, generator=rng) < RESAMPLED_FRACTION
         n_new = int(is_sampled.sum())
         samples = domain.sample(rng, self.population)
@@ -478,7 +492,12 @@ class MapElites(Policy[ArchiveState]):
     def _find_measure_indices(self, domain: policies.Domain) -> Tensor:
         """Return the indices (k,) of the parameters that span the archive.
 
-        They are those named in `over`, by default the first two of the domain.
+        They are those named in the option `over`, such as "pose.yaw, pose.pitch", by
+        default the first two of the domain.
+
+        Raises:
+            UnknownNameError: the domain has no parameter of that name.
+            InputError: a name is there twice, or there are too many.
         """
         names = [name.strip() for name in self.over.split(",") if name.strip()]
         if not names:

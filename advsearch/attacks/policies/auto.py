@@ -101,11 +101,18 @@ class BudgetPlan:
 
 
 def make_plan(domain: Domain, box: BoxCoordinates, steps: int) -> BudgetPlan:
-    """Divide the renders of a search among screen, surrogate and ascent; see `Auto`.
+    """Divide the renders of a search among its three phases.
 
-    Without box coordinates all are the ascent's. With norm balls and box coordinates
-    there always is an ascent. In box coordinates alone there is one only if gradients
-    are cheap enough, see `MIN_DERIVATIVES_PER_RENDER`.
+    The phases are a screen of evenly spread points, a surrogate (Gaussian process), and
+    a gradient ascent. Box coordinates are numbers and choices in no norm ball. Without
+    them there is only the ascent. With norm balls as well, there always is an ascent.
+    With box coordinates alone, there is one only if gradients are cheap enough
+    (`MIN_DERIVATIVES_PER_RENDER`).
+
+    Args:
+        domain: domain of the search.
+        box: box coordinates of the domain.
+        steps: renders of the search.
     """
     if box.count == 0:
         return BudgetPlan(steps, screen=0, ascent_start=0, gradient=True)
@@ -126,7 +133,8 @@ def make_plan(domain: Domain, box: BoxCoordinates, steps: int) -> BudgetPlan:
     fits = MIN_DERIVATIVES_PER_RENDER * (1 + cost) <= renders_left
     if n_numbers and is_worth_renders and fits:
         return plan
-    # the ascent never begins, and the screen needn't be short
+    # `ascent_start=steps` means that the ascent never begins. Nothing has to be saved
+    # for it, so the screen may be longer.
     screen = math.ceil(SCREEN_FRACTION * steps)
     return replace(plan, screen=screen, ascent_start=steps)
 
@@ -139,7 +147,12 @@ def _count_numbers(box: BoxCoordinates) -> int:
 def _plan_box_ascent(box: BoxCoordinates, steps: int) -> BudgetPlan:
     """Divide renders in a domain of box coordinates alone, with an ascent.
 
-    Of many numbers a screen sees little: it is shorter, and the ascent follows at once.
+    With more than `LOW_DIM` numbers, evenly spread points tell little. Then the screen
+    is shorter, and the ascent follows it without a surrogate.
+
+    Args:
+        box: box coordinates of the domain.
+        steps: renders of the search.
     """
     n_numbers = _count_numbers(box)
     shortening = min(1.0, LOW_DIM / max(n_numbers, 1))
@@ -230,10 +243,15 @@ class Auto(Policy[AutoState]):
     def start(
         self, domain: Domain, generator: torch.Generator, steps: int
     ) -> AutoState:
-        """Divide the renders, and start with the screen: evenly spread points of the
-        box coordinates (the numbers and choices that belong to no norm ball).
+        """Divide the renders among the phases, and start the first one.
 
-        Without box coordinates there is nothing but the ascent, which starts at once.
+        That is the screen: evenly spread points of the box coordinates (numbers and
+        choices in no norm ball). Without box coordinates it is the gradient ascent.
+
+        Args:
+            domain: domain of the search.
+            generator: source of the seed.
+            steps: renders of the search.
         """
         box = find_box_coordinates(domain)
         no_points = torch.empty(0, box.count)
@@ -257,10 +275,14 @@ class Auto(Policy[AutoState]):
     def propose(
         self, state: AutoState, n: int
     ) -> tuple[tuple[Proposal, ...], AutoState]:
-        """Propose what the present phase has next: screen, surrogate or ascent.
+        """Propose what the current phase has next: screen, surrogate or ascent.
 
-        An ascent that has nothing more to propose ends the search in a domain with norm
-        balls; in box coordinates alone the surrogate goes on.
+        If the ascent has nothing more to propose, the search ends in a domain with norm
+        balls. In box coordinates alone the surrogate continues.
+
+        Args:
+            state: state of the search.
+            n: largest number of proposals.
         """
         state = replace(state, is_climbing=False, box_before_trial=None)
         if state.ascent is None and state.renders_spent >= state.plan.ascent_start:
@@ -283,9 +305,10 @@ class Auto(Policy[AutoState]):
 
     @staticmethod
     def _list_screen(state: AutoState, n: int) -> list[Tensor]:
-        """Return the next configurations (d,) of the screen, up to n; none after it.
+        """Return the next configurations (d,) of the screen, at most n.
 
-        They are the initial point, then the points of the screen.
+        They are the initial point, then the points of the screen; an empty list if all
+        of them were evaluated.
         """
         n_observed = len(state.observations.values)
         points = []
@@ -301,13 +324,14 @@ class Auto(Policy[AutoState]):
     ) -> tuple[tuple[Proposal, ...], AutoState]:
         """Propose a step of the ascent, with the gradient of the plan.
 
-        If only the norm balls have a gradient ("free"), every second step moves the box
-        coordinates at random besides.
+        If only the norm balls have a gradient ("free"), every second step also moves
+        the box coordinates at random. `_update_ascent` takes the move back if the
+        objective falls.
 
         Args:
             state: state of the search.
-            proposal: proposal of PGD.
-            count: evaluations of the ascent so far.
+            proposal: proposal of projected gradient ascent (PGD).
+            count: number of evaluations of the ascent so far.
         """
         proposal = replace(proposal, gradient=state.plan.gradient)
         state = replace(state, is_climbing=True)
@@ -316,7 +340,7 @@ class Auto(Policy[AutoState]):
             return (proposal,), state
         box = state.box
         x = box.from_configuration(proposal.u)
-        # numbers from `plan.steps` on: those before are the surrogate's
+        # Stream numbers below `plan.steps` are used by the surrogate.
         rng = seeded(state.seed, state.plan.steps + count)
         moved_x = box.sample_moves(x[None], rng)[0]
         u = state.domain.project(box.to_configuration(proposal.u, moved_x))
@@ -362,8 +386,9 @@ class Auto(Policy[AutoState]):
     def _choose_next_point(self, state: AutoState) -> tuple[Tensor, AutoState]:
         """Return the point (k,) of the unit box [0, 1]^k to evaluate next.
 
-        It is the candidate with the largest upper confidence bound of the surrogate; a
-        random point as long as no objective is finite.
+        It is the candidate with the largest upper confidence bound, mean + `UCB_KAPPA`
+        standard deviations of the surrogate. As long as no objective is finite, it is a
+        random point.
         """
         box = state.box
         generator = seeded(state.seed, len(state.observations.values))
@@ -378,11 +403,12 @@ class Auto(Policy[AutoState]):
         return best_candidate, replace(state, observations=observations)
 
     def _begin_ascent(self, state: AutoState) -> AutoState:
-        """Let PGD go on from the best point that was observed.
+        """Start gradient ascent (PGD) at the best point that was observed.
 
-        The best is by the mean of the surrogate; it is the initial point if no
-        objective is finite. Norm balls begin at their start. In box coordinates steps
-        are smaller than usual (`ASCENT_REACH`), as the screen has been everywhere else.
+        The best is the point with the largest mean of the surrogate, as single
+        objectives are noisy. It is the initial point if no objective is finite. Norm
+        balls begin at their start. In box coordinates, steps are smaller than usual
+        (`ASCENT_REACH`), because the screen has explored the rest of the box already.
         """
         # (k,) box coordinates of the best point
         x = state.box.from_configuration(state.domain.initial_point)
@@ -405,8 +431,12 @@ class Auto(Policy[AutoState]):
 def _sample_candidates(surrogate: Surrogate, generator: torch.Generator) -> Tensor:
     """Return points (n, k) of the box to choose the next one from.
 
-    They are the best known point, by the surrogate's mean; random moves of it, and as
-    many of the `N_CENTERS` best known points; and uniform points.
+    They are the best known point, by the surrogate's mean; random moves of it; as many
+    random moves of the `N_CENTERS` best known points; and uniform points.
+
+    Args:
+        surrogate: process fitted to the known points.
+        generator: generator of random numbers; it advances.
     """
     box = surrogate.box
     known_mean, _ = surrogate.predict(surrogate.x)
@@ -481,8 +511,8 @@ class Restarts(RacingPolicy[Race]):
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Race:
         """Start the policy from several points; the first is the domain's own.
 
-        There are at most `times`, and no more than the renders (`steps`) suffice for if
-        each has a single evaluation, with its gradient.
+        There are at most `times` starts, and so few that the renders (`steps`) allow
+        each at least one evaluation with its gradient.
         """
         seed = draw_seed(generator)
         renders_per_evaluation = 1
@@ -496,7 +526,7 @@ class Restarts(RacingPolicy[Race]):
             (self.policy, replace(domain, restart_point=point))
             for point in initial_points
         ]
-        # In a single round nobody drops out.
+        # With a single round, no search is dropped before the end.
         return start_race(searches, steps, seed, rounds=1)
 
 
@@ -554,7 +584,7 @@ class Portfolio(RacingPolicy[Race]):
         for policy in self.policies:
             wrapped = wrap_choices(policy, domain)
             try:
-                # only to learn whether it can; the race starts it again
+                # This only tests whether the policy can search the domain.
                 wrapped.start(domain, seeded(seed, 0), steps_each)
             except InputError as error:
                 errors.append(error)

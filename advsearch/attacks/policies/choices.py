@@ -95,7 +95,7 @@ class Race:
         """Return the race at the beginning of a round.
 
         Args:
-            field: indices of the searches that take part, which get equal renders.
+            field: indices of the searches that take part; they get equal renders.
             number: index of the round.
         """
         active_runners = tuple(field)
@@ -111,18 +111,21 @@ class Race:
         )
 
     def propose(self: Racing, n: int) -> tuple[tuple[Proposal, ...], Racing]:
-        """Return up to n proposals of this round that do not wait for each other.
+        """Return up to n proposals of this round that do not depend on each other.
 
-        There are none if the round is over. The search with the most renders left comes
-        first, of equals the first. Each is asked once for proposals, its part of n. The
-        batch ends with the first search whose proposals are used up, since what comes
-        after depends on their evaluations.
+        There are none if the round is over. Proposals are taken one by one from the
+        search with the most renders left. Each search makes its proposals in one call,
+        its part of n. The batch ends when it is the turn of a search whose proposals
+        are used up, because its next ones depend on evaluations of this batch.
+
+        Args:
+            n: largest number of proposals.
         """
         runners = list(self.runners)
         waiting = self._find_waiting(runners)
         max_proposals = math.ceil(n / max(1, len(waiting)))  # of each search
         proposals = dict[int, tuple[Proposal, ...]]()  # by index of the search
-        n_used = Counter[int]()  # likewise
+        n_used = Counter[int]()  # proposals in the batch, by index of the search
         batch = list[Proposal]()
         runner_of_proposal = list[int]()
         while waiting and len(batch) < n:
@@ -145,8 +148,8 @@ class Race:
                 n_used[k] += 1
                 runners[k] = proposer.charge(proposal)
             waiting = self._find_waiting(runners)
-        # a search whose proposals were not all used is asked again for just those that
-        # were, so that its state counts on no others
+        # A search whose proposals were not all used proposes again, only as many as
+        # were used, so that its state does not expect evaluations of the others.
         for k, count in n_used.items():
             if count < len(proposals[k]):
                 state = self._propose_again(k, count)
@@ -168,9 +171,13 @@ class Race:
         return [index for index in self.active_runners if runners[index].renders_left]
 
     def _retire(self, runners: list[Runner], k: int) -> None:
-        """End a search that has nothing more to propose, in a list of runners.
+        """End a search that has nothing more to propose.
 
-        Its renders go to those that are left in the round.
+        Its renders are divided among the searches that are left in the round.
+
+        Args:
+            runners: all searches of the race; the list is changed.
+            k: index of the search that ends.
         """
         renders = runners[k].renders_left
         runners[k] = replace(runners[k], renders_left=0, is_over=True)
@@ -202,13 +209,14 @@ def count_rounds(runners: int) -> int:
 
 
 def max_runners(steps: int, each: int, limit: int) -> int:
-    """Return how many searches a race can have at most if each needs `each` renders in
-    every round.
+    """Return the largest number of searches for which the renders of a race suffice.
+
+    It is at least 1, even if the renders do not suffice for that.
 
     Args:
         steps: renders of the race.
-        each: renders that a search needs in a round.
-        limit: the maximum; the minimum is 1, though the renders may not suffice.
+        each: renders that a search needs in every round.
+        limit: upper limit of the result.
     """
     count = 1
     while count < limit and (count + 1) * count_rounds(count + 1) * each <= steps:
@@ -223,18 +231,20 @@ def start_race(
     *,
     rounds: int | None = None,
 ) -> Race:
-    """Return a race before its first proposal.
+    """Start all searches of a race, and begin its first round.
+
+    After each round the worse half of the searches is dropped (successive halving).
 
     Args:
         searches: policies, each with the domain that it searches.
         steps: renders of the race.
         seed: seed of random numbers.
-        rounds: by default `count_rounds`.
+        rounds: number of rounds; by default as many as leave a single search.
     """
     steps = max(1, steps)
     rounds = rounds or count_rounds(len(searches))
-    # A search plans with the renders that it gets if it stays in to the end. Rounds have
-    # equally many, divided among the searches that are left, half of them each time.
+    # A search plans with the renders that it gets if it is never dropped. All rounds
+    # have equally many renders, which are divided among the searches that are left.
     planned_renders = 0.0
     n_active = len(searches)
     for _ in range(rounds):
@@ -255,15 +265,16 @@ class RacingPolicy(Policy[Racing]):
     """A policy that is a race, which its `start` makes."""
 
     def propose(self, state: Racing, n: int) -> tuple[tuple[Proposal, ...], Racing]:
-        """Return the next proposals, up to n, of this round or else of the next.
+        """Return the next proposals, at most n.
 
-        There are none once all searches are over.
+        If the round is over, the next one begins. There are no proposals once all
+        searches are over.
         """
         while True:
             batch, state = state.propose(n)
             if batch or all(runner.is_over for runner in state.runners):
                 return batch, state
-            # after the last round there may be renders left over: it goes on
+            # Renders may be left after the last round, which then is repeated.
             next_round = min(state.round + 1, state.n_rounds - 1)
             state = state.begin_round(self._select_continuing(state), next_round)
 
@@ -271,9 +282,9 @@ class RacingPolicy(Policy[Racing]):
     def _select_continuing(race: Race) -> list[int]:
         """Return the indices of the searches of the next round, the best first.
 
-        They are the better half of this round without those that are over. After the
-        last round, or if all of that half are over, the best search that is not over
-        gets the rest of the renders, even if it dropped out before.
+        They are the better half of this round, without searches that are over. After
+        the last round, or if all of that half are over, only the best search that is
+        not over continues, even if it was dropped before.
         """
         runners = race.runners
         ranked = sorted(
@@ -289,8 +300,10 @@ class RacingPolicy(Policy[Racing]):
     def update(self, state: Racing, evaluated: Evaluated) -> Racing:
         """Update each search with the evaluations of its proposals.
 
-        Configurations and gradients are those of the searches' own domain. There may be
-        fewer evaluations than proposals.
+        Args:
+            state: state of the race.
+            evaluated: configurations and their evaluations, in the order of the latest
+                proposals; there may be fewer, if the search is interrupted.
         """
         evaluated_by_runner = defaultdict[int, list[Any]](list)
         for k, (u, evaluation) in zip(
@@ -395,8 +408,13 @@ class Choices(RacingPolicy[ChoicesState]):
     ) -> ChoicesState:
         """Start one search of the numbers for each combination of options.
 
-        If nothing but choices may vary, the inner search is a random one over a number
-        that is dropped afterwards (`ChoicesState.join_choices`).
+        If all parameters are choices, the inner search is a random one over a dummy
+        number, which `ChoicesState.join_choices` drops.
+
+        Args:
+            domain: domain of numbers and choices.
+            generator: source of the seed.
+            steps: renders of the search.
         """
         seed = draw_seed(generator)
         is_choice = domain.options > 0  # a number has 0 options
@@ -438,8 +456,10 @@ class Choices(RacingPolicy[ChoicesState]):
         return joined, state
 
     def update(self, state: ChoicesState, evaluated: Evaluated) -> ChoicesState:
-        """Update each search with its evaluations, whose configurations and gradients
-        are reduced to the numbers: the inner searches know no choices.
+        """Update each inner search with the evaluations of its proposals.
+
+        The inner searches have no choices, so configurations and gradients are reduced
+        to the numbers.
         """
         inner_evaluated = []
         numbers = state.numbers
@@ -509,21 +529,25 @@ def _select_combinations(
     max_combinations: int,
     generator: torch.Generator,
 ) -> Tensor:
-    """Return combinations of options as elements of u (n, c), the initial one first.
+    """Select combinations of options, the initial one first.
 
-    If there are few enough to list, they follow in a random order; otherwise different
-    ones are sampled, in ascending order.
+    If there are few combinations, all are listed and the others follow in a random
+    order. Otherwise different ones are sampled; these are sorted.
 
     Args:
         n_options: number of options of each of the c choices.
-        initial_point: (c,) elements of u.
-        max_combinations: number of combinations, or fewer if there are fewer.
-        generator: generator of random numbers.
+        initial_point: (c,) elements of u that are choices, at the initial point.
+        max_combinations: largest number of combinations.
+        generator: generator of random numbers; it advances.
+
+    Returns:
+        (n, c) elements of u, at the centers of the options.
     """
     sizes = torch.tensor(n_options)
     # index of the option of each choice; u = 1 belongs to the last
     initial = torch.floor(initial_point * sizes).long().clamp(max=sizes - 1)
-    # far more combinations are sampled until enough of them are different
+    # With more combinations than this, samples are rarely equal, so that drawing until
+    # enough of them differ takes few draws.
     max_listed = max(MIN_LISTED_COMBINATIONS, 4 * max_combinations)
     if math.prod(n_options) <= max_listed:
         combinations = _shuffle_combinations(n_options, generator)
@@ -554,15 +578,17 @@ def _sample_combinations(
     count: int,
     generator: torch.Generator,
 ) -> Tensor:
-    """Sample different combinations of options (count, c), as their indices, in
-    ascending order.
+    """Sample different combinations of options.
 
     Args:
-        n_options: number of options of each of the c choices; there are far more
-            combinations than are sampled.
-        initial: the combination that is not sampled.
+        n_options: number of options of each of the c choices. There must be far more
+            combinations than `count`, or this would take long.
+        initial: index of the option of each choice in a combination to leave out.
         count: number of combinations.
-        generator: generator of random numbers.
+        generator: generator of random numbers; it advances.
+
+    Returns:
+        (count, c) indices of options; rows in ascending order.
     """
     sampled = set[tuple[int, ...]]()
     while len(sampled) < count:

@@ -55,11 +55,11 @@ Float64Array = npt.NDArray[np.float64]
 
 
 def utilities(values: Sequence[float]) -> list[float]:
-    """Return the weight of each of n objectives by its rank, of which the largest has
-    rank 1: max(0, ln(n/2 + 1) - ln(rank)), over the sum of these, less 1/n.
+    """Return the weight of each of n objectives by its rank (Wierstra et al. 2014).
 
-    They sum to zero and are larger for larger objectives. Equal objectives take up as
-    many ranks as they are, and each gets the mean of the weights of these.
+    The largest objective has rank 1. The weight is max(0, ln(n/2 + 1) - ln(rank)),
+    divided by the sum of these over all ranks, minus 1/n. Weights sum to zero and are
+    larger for larger objectives. Equal objectives share the mean weight of their ranks.
     """
     n = len(values)
     rank_weights = [
@@ -112,13 +112,15 @@ class NESState:
         return noise.neg_() if is_mirrored else noise
 
     def sum_weighted_noise(self) -> tuple[Tensor, Tensor]:
-        """Return sum_k w_k s_k and sum_k w_k s_k^2, both (d,), over the samples of a
-        complete generation, with weights w_k by rank (`utilities`) and noise s_k.
+        """Return sum_k w_k s_k and sum_k w_k s_k^2 of a complete generation, (d,) each.
+
+        Sample k has the standard normal noise s_k (d,), and a weight w_k by the rank of
+        its objective (`utilities`).
         """
         weights = utilities(self.values)
         noise_sum = torch.zeros(self.domain.dim)
         square_sum = torch.zeros(self.domain.dim)
-        # Samples come in pairs, s and -s.
+        # Samples come in pairs with the noise s and -s, which is drawn once.
         for number in range(0, self.population, 2):
             noise = self.noise(number)
             weight = weights[number]
@@ -176,7 +178,15 @@ class NES(Policy[NESState]):
             )
 
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> NESState:
-        """Start at the domain's initial point, with `sigma` of each half range."""
+        """Start at the domain's initial point.
+
+        The standard deviation of an element is `sigma` times half of its range.
+
+        Args:
+            domain: domain of the search.
+            generator: source of the seed.
+            steps: renders of the search, which are not needed here.
+        """
         # the default of CMA-ES (Hansen 2016), made even for pairs
         default_population = 4 + int(3 * math.log(domain.dim))
         default_population += default_population % 2
@@ -199,10 +209,10 @@ class NES(Policy[NESState]):
         return tuple(proposals), state
 
     def update(self, state: NESState, evaluated: Evaluated) -> NESState:
-        """Add evaluations to the generation; once it is complete, move the
-        distribution.
+        """Add evaluations to the generation, and update the distribution at its end.
 
-        With weights w_k of the objectives and standard normal samples s_k:
+        With weights w_k by the rank of the objectives, standard normal samples s_k and
+        the projection P onto the domain:
 
             mean      <- P(mean + deviation * sum_k w_k s_k)
             deviation <- deviation * exp(rate / 2 * sum_k w_k (s_k^2 - 1))
@@ -213,7 +223,8 @@ class NES(Policy[NESState]):
             return state
         d = state.domain.dim
         mean_gradient, square_sum = state.sum_weighted_noise()
-        # weights sum to zero, so the -1 of every term of the deviation drops out
+        # Weights sum to zero, so that the -1 in the formula of the deviation cancels.
+        # The rate is that of Wierstra et al. 2014.
         rate = (3.0 + math.log(d)) / (5.0 * math.sqrt(d))
         deviation = (state.deviation * square_sum.mul_(rate / 2.0).exp_()).clamp_(
             MIN_STEP_SIZE, MAX_STEP_SIZE
@@ -243,8 +254,13 @@ def _sample_normal(*shape: int) -> Float64Array:
 
 @contextmanager
 def _isolate_numpy_random(seed: int, generation: int) -> Iterator[None]:
-    """Seed numpy's global generator for pycma inside the context, and restore its state
-    afterwards; pycma's warnings are ignored.
+    """Seed numpy's global random generator for pycma, and restore it afterwards.
+
+    pycma draws from that generator. Its warnings are ignored inside the context.
+
+    Args:
+        seed: seed of the search.
+        generation: index of the generation; each has random numbers of its own.
     """
     state_before = np.random.get_state()  # noqa: NPY002
     np.random.seed(stream(seed, "pycma", generation))  # noqa: NPY002
@@ -302,10 +318,15 @@ class CMAESState:
         )
 
     def project(self, x: Float64Array) -> tuple[Tensor, float]:
-        """Return the configuration for pycma's coordinates x (d,), and how far they lie
-        outside the domain: mean squared distance over the elements, in half ranges.
+        """Return the configuration for pycma's coordinates, and how far out they are.
 
-        Periodic elements wrap, so that they are never outside.
+        Args:
+            x: (d,) coordinates; 1 is half of the range of an element.
+
+        Returns:
+            The configuration (d,), projected onto the domain; and the mean squared
+            distance from the domain over all elements of x, in units of x. Periodic
+            elements wrap around and are never outside.
         """
         unprojected = torch.add(
             self.origin, self.half_widths * torch.from_numpy(x).float()
@@ -327,12 +348,11 @@ class CMAESState:
         return replace(self, generation=number, points=points, values=(), violations=())
 
     def tell(self) -> CMAESState:
-        """Return the state with a copy of the strategy that has learnt the objectives
-        of a complete generation.
+        """Return the state after passing a complete generation to a copy of pycma.
 
-        A point that could not be evaluated counts as worse than the worst, by the
-        distance between the quartiles. Points outside the domain, whose projections
-        were evaluated, are penalised by their distance from it.
+        A point that could not be evaluated gets an objective below the smallest, by the
+        interquartile range. For a point outside of the domain, its projection was
+        evaluated; it is penalised by its squared distance from the domain.
         """
         values = np.array(self.values)
         spread = 0.0
@@ -344,8 +364,8 @@ class CMAESState:
         else:  # all equal: nothing is learnt
             values[:] = 0.0
         strategy = copy.deepcopy(self.strategy)
-        # at a distance of one step, a penalty is worth as much as objectives differ
-        step_size = max(strategy.sigma, 1e-30)  # not 0
+        # At a distance of one step size the penalty is one interquartile range.
+        step_size = max(strategy.sigma, 1e-30)  # avoids a division by 0
         penalty = spread * np.array(self.violations) / step_size**2
         with _isolate_numpy_random(self.seed, self.generation):
             # pycma minimises
@@ -410,8 +430,15 @@ class CMAES(Policy[CMAESState]):
     def start(
         self, domain: Domain, generator: torch.Generator, steps: int
     ) -> CMAESState:
-        """Start pycma at the domain's initial point, and ask it for a first
-        generation.
+        """Start pycma at the domain's initial point, and sample the first generation.
+
+        Args:
+            domain: domain of the search.
+            generator: source of the seed.
+            steps: renders of the search, which are not needed here.
+
+        Raises:
+            InputError: the domain has more than `MAX_DIM` numbers.
         """
         d = domain.dim
         if d > MAX_DIM:
@@ -443,7 +470,9 @@ class CMAES(Policy[CMAESState]):
     def update(self, state: CMAESState, evaluated: Evaluated) -> CMAESState:
         """Add evaluations to the generation; begin the next once it is complete.
 
-        If the run has converged, another begins elsewhere with twice the population.
+        If the run has converged (its standard deviations are tiny), another run begins
+        at a random point with twice the population, as in IPOP-CMA-ES (Auger and Hansen
+        2005).
         """
         values = [evaluation.objective for _, evaluation in evaluated]
         evaluated_points = state.points[len(state.values) :][: len(values)]
@@ -461,7 +490,7 @@ class CMAES(Policy[CMAESState]):
         has_converged = float(state.stds.max()) <= MIN_STEP_SIZE
         if not has_converged:
             return state.ask()
-        # of the best run so far: its best objective and its distribution
+        # best objective and distribution of the best run so far
         best_run = state.best_run
         if best_run is None or state.best > best_run[0]:
             best_run = (state.best, state.distribution)
@@ -479,8 +508,12 @@ class CMAES(Policy[CMAESState]):
         return state.distribution
 
     def _make_strategy(self, d: int, population: int, seed: int) -> Any:
-        """Return pycma's strategy for d coordinates, around 0 with the standard
-        deviation `sigma`.
+        """Return pycma's strategy, centered on 0 with the standard deviation `sigma`.
+
+        Args:
+            d: number of coordinates.
+            population: number of samples of a generation.
+            seed: seed of the search.
         """
         options = {
             "CMA_diagonal": d > MAX_FULL_DIM,
@@ -491,7 +524,7 @@ class CMAES(Policy[CMAESState]):
         # no files, and nothing printed
         options |= {"signals_filename": "", "verbose": -9, "verb_log": 0}
         with _isolate_numpy_random(seed, 0):
-            # takes most of a second, and complains where there is no matplotlib
+            # imported here: it takes most of a second, and warns without matplotlib
             import cma
 
             return cma.CMAEvolutionStrategy(np.zeros(d), self.sigma, options)

@@ -132,10 +132,14 @@ class Components:
         return -0.5 * z.square() - torch.log(normalizer)
 
     def _compute_categorical_log_densities(self, x: Tensor, ranges: Ranges) -> Tensor:
-        """Return log densities (n, k, d) of the options that x lies in.
+        """Return the log densities (n, k, d) of discrete choices in each component.
 
-        An option of n takes up 1 / n of its range, so that its density relative to the
-        uniform one is n times its probability.
+        They are relative to the uniform density. One of m options takes up 1 / m of the
+        range, so that its relative density is m times its probability.
+
+        Args:
+            x: (n, d) points, in fractions of each range.
+            ranges: kinds of the d elements.
         """
         n_points = len(x)
         n_components, _, max_options = self.option_probs.shape
@@ -149,8 +153,13 @@ class Components:
     def sample(self, generator: torch.Generator, ranges: Ranges) -> Tensor:
         """Return one sample (d,) of the mixture, in fractions of each range.
 
-        Numbers are sampled by inverting the distribution function between the bounds;
-        of a discrete choice, it is the center of the option's part of the range.
+        A number is sampled from its truncated normal distribution, by inverting the
+        distribution function. A discrete choice is the center of its option's part of
+        [0, 1].
+
+        Args:
+            generator: generator of random numbers; it advances.
+            ranges: kinds of the d elements.
         """
         k = int(torch.multinomial(self.weights, 1, generator=generator))
         mean = self.means[k]
@@ -173,15 +182,16 @@ class Components:
     def maximize(
         self, x: Tensor, weights: Tensor, ranges: Ranges, uniform_probs: Tensor
     ) -> Components:
-        """Return the components after one step of expectation and maximisation.
+        """Return the components after one step of expectation maximisation (EM).
 
-        A part of the new weights of the components, `UNIFORM_WEIGHT`, is uniform, so
-        that none dies out.
+        The fraction `UNIFORM_WEIGHT` of the total weight is divided equally among the
+        components, so that none vanishes.
 
         Args:
             x: (n, d) samples, in fractions of each range.
-            weights: (n,) of the samples.
-            ranges: ranges of the elements.
+            weights: (n,) weights of the samples; their sum is the effective number of
+                samples.
+            ranges: kinds of the d elements.
             uniform_probs: (k, d, m) uniform probabilities of options, the prior.
         """
         log_densities = self.compute_log_densities(x, ranges)
@@ -209,22 +219,25 @@ class Components:
     def _divide_out_prior(
         self, mean_offset: Tensor, variance: Tensor, counts: Tensor, ranges: Ranges
     ) -> tuple[Tensor, Tensor]:
-        """Return means and standard deviations (k, d) of normal distributions before
-        truncation, by the moments of samples of the truncated ones.
+        """Estimate normal distributions from samples that are truncated to [0, 1].
 
-        Samples of a truncated normal distribution have about the moments of a normal
-        density times the uniform one, taken as a normal density too (mean 1/2). So the
-        precision of the uniform density is subtracted from that of the samples, and
-        the mean is corrected likewise, except of an angle, which is not truncated.
+        A truncated normal density is a normal density times the uniform one. If the
+        uniform density is replaced by a normal one of equal mean (1/2) and variance,
+        precisions (1 / variance) add up. So the precision of the uniform density is
+        subtracted from that of the samples, and the mean is corrected in the same way.
+        The mean of an angle is not corrected, as angles wrap and are not truncated.
 
         Args:
-            mean_offset: (k, d) from the old means to those of the samples.
-            variance: (k, d) of the samples.
-            counts: (k, 1) samples of each component.
-            ranges: ranges of the elements.
+            mean_offset: (k, d) means of the samples minus the old means.
+            variance: (k, d) variances of the samples.
+            counts: (k, 1) number of samples of each component.
+            ranges: kinds of the d elements.
+
+        Returns:
+            Means and standard deviations, (k, d) each.
         """
-        # averaged with the uniform variance, the prior; below it, so that the precision
-        # stays positive
+        # The variance is averaged with that of the uniform density, the prior. It stays
+        # below that, so that the difference of precisions is positive.
         shrunk_variance = (
             (counts * variance + PRIOR_COUNT * UNIFORM_STD**2) / (counts + PRIOR_COUNT)
         ).clamp(max=0.999 * UNIFORM_STD**2)
@@ -252,9 +265,10 @@ def _estimate_option_probs(
     probabilities that count as `PRIOR_COUNT` samples.
 
     Args:
-        sample_weights: (k, n) of samples in each component; the sum of a row is 1.
+        sample_weights: (k, n) weights of the samples in each component; each row sums
+            to 1.
         option: (n, d) int64, index of the option of each sample.
-        counts: (k,) samples of each component.
+        counts: (k,) number of samples of each component.
         uniform_probs: (k, d, m) uniform probabilities.
     """
     max_options = uniform_probs.shape[2]
@@ -306,9 +320,17 @@ class MixtureState:
     ) -> dict[int, tuple[float, float]]:
         """Return the ranges (low, high) that distinguish component k, by index in u.
 
-        A range reaches two standard deviations to both sides of the mean, or is that
-        of the most probable option. An element that does not distinguish the
-        component is left out. Bounds are in the units of u, not fractions.
+        They describe the failures that a component stands for. The range of a number
+        extends two standard deviations below and above the mean; that of a choice is
+        its most probable option. An element whose distribution is nearly uniform is
+        left out.
+
+        Args:
+            mixture: the mixture.
+            k: index of the component.
+
+        Returns:
+            Bounds in the units of u, by index in u.
         """
         lower = self.domain.lower.double()
         width = (self.domain.upper - self.domain.lower).double()
@@ -341,9 +363,10 @@ class MixtureState:
     def _number_bounds(
         mean: float, std: float, *, is_periodic: bool
     ) -> tuple[float, float] | None:
-        """Return the range of a number, in fractions; None if it is too wide.
+        """Return the range of a number, in fractions of the full range, or None.
 
-        None too for an angle whose range goes through 0, which two bounds cannot state.
+        It is None if it is too wide to be distinctive. It is also None for an angle
+        whose range goes through 0, which two ascending bounds can't express.
         """
         is_distinctive = std < DISTINCTIVE_FRACTION * UNIFORM_STD
         lower = mean - 2.0 * std
@@ -404,7 +427,16 @@ class Mixture(Policy[MixtureState]):
     def start(
         self, domain: policies.Domain, generator: torch.Generator, steps: int
     ) -> MixtureState:
-        """Start with a generation of uniform samples."""
+        """Start with a generation of uniform samples.
+
+        Args:
+            domain: domain of the search.
+            generator: source of the seed.
+            steps: renders of the search, which are not needed here.
+
+        Raises:
+            InputError: the domain has more than `MAX_DIM` numbers.
+        """
         if domain.dim > MAX_DIM:
             raise InputError(
                 f"policy 'mixture': expected at most {MAX_DIM} numbers, got "
@@ -434,17 +466,16 @@ class Mixture(Policy[MixtureState]):
     def update(
         self, state: MixtureState, evaluated: policies.Evaluated
     ) -> MixtureState:
-        """Log evaluations with their importance weights; fit a mixture after each
-        generation.
+        """Log evaluations, and fit a new mixture after each complete generation.
 
-        The weight of a sample is the uniform density over the one that it was drawn
-        from.
+        The importance weight of a sample is the uniform density divided by the density
+        from which it was drawn.
         """
         points = state.points[state.n_evaluated :][: len(evaluated)]
         mixture = state.mixtures[-1]
         with policies.limit_to_single_thread():
             weights = (1.0 / self._density(mixture, points, state.ranges)).tolist()
-        # The density is `even` at least, by the uniform samples of the generation.
+        # The fraction `even` of samples is uniform, so the density is at least `even`.
         max_weight = 1.0 if mixture is None else 1.0 / self.even
         # in the order of the columns of `log`
         rows = [
@@ -469,10 +500,10 @@ class Mixture(Policy[MixtureState]):
         return self._begin_generation(state, self._fit(state))
 
     def failures(self, state: MixtureState) -> policies.Failures:
-        """Return a failure for each component that has some, and the failure rate.
+        """Return the worst failure of each component, and the estimated failure rate.
 
-        In an l2 ball there is no rate: points are projected onto it, so that the
-        uniform ones are not uniform there.
+        With an l2 ball no rate is estimated: points are projected onto the ball, so
+        that they are not uniform in it.
         """
         has_failed = state.log[:, FAILED_COLUMN] > 0
         is_unknown = state.log[:, UNKNOWN_COLUMN] > 0
@@ -495,11 +526,10 @@ class Mixture(Policy[MixtureState]):
         )
 
     def _list_examples(self, state: MixtureState) -> tuple[policies.FoundFailure, ...]:
-        """Return the worst failure of each component of the mixture, the components of
-        most weight first; a component without a failure has none.
+        """Return the worst failure of each component, by descending weight.
 
-        Only the latest samples count, those in the window. Before the first mixture,
-        all samples belong to one component.
+        A component without failures is left out. Only samples in the window, the latest
+        ones, are used. Before the first mixture all samples form one component.
         """
         log = state.log[-len(state.evaluated_points) :]
         mixture = state.mixtures[-1]
@@ -540,8 +570,12 @@ class Mixture(Policy[MixtureState]):
     ) -> MixtureState:
         """Begin the next generation: sample its points from a mixture.
 
-        Each is uniform with probability `even`; without a mixture all are. Mixtures and
-        points that leave the window, the latest `WINDOW` samples, are dropped.
+        Each point is uniform with probability `even`; without a mixture all are. Only
+        mixtures and points of the latest `WINDOW` samples are stored.
+
+        Args:
+            state: state of the search.
+            mixture: mixture to sample from, or None.
         """
         generation = state.generation + 1
         rng = policies.seeded(state.seed, generation)
@@ -589,11 +623,11 @@ class Mixture(Policy[MixtureState]):
         return self.even + (1.0 - self.even) * mixture_density
 
     def _fit(self, state: MixtureState) -> Components | None:
-        """Return the mixture fitted to the failures in the window.
+        """Fit a mixture to the failures among the latest samples, by EM.
 
-        Samples are weighted by the uniform density over the mean density of the
-        generations in the window. The first centers are diverse failures. None if
-        nothing could be evaluated.
+        Samples are weighted by the uniform density divided by the mean density of all
+        generations in the window. The components begin at failures that differ most
+        from each other. The result is None if nothing could be evaluated.
         """
         log = state.log[-len(state.evaluated_points) :]
         ranges = state.ranges
@@ -638,8 +672,11 @@ class Mixture(Policy[MixtureState]):
     def _find_elite(log: Tensor) -> Tensor:
         """Return which samples a mixture is fitted to, (n,) bool.
 
-        These are the failures; where they are few, the largest objectives too. Of a
-        sample that could not be evaluated ("unknown") there is no objective.
+        These are the failures; if they are few, also the samples with the largest
+        objectives. A sample that could not be evaluated ("unknown") is left out.
+
+        Args:
+            log: (n, 5) samples; columns are objective, failed, unknown and two weights.
         """
         is_known = ~log[:, UNKNOWN_COLUMN].bool()
         is_elite = is_known & log[:, FAILED_COLUMN].bool()

@@ -39,26 +39,27 @@ MIN_CLIPPED_SIZE = 8  # smaller blocks have no meaningful median
 def clip_gradient(
     domain: Domain, gradient: Tensor, lengths: tuple[float, ...]
 ) -> tuple[Tensor, tuple[float, ...], Counts]:
-    """Clip the outliers of a gradient.
+    """Clip the outliers of a gradient, which stem from the noise of a render.
 
     - In a norm ball of at least `MIN_CLIPPED_SIZE` elements, each element is clipped to
-      a multiple of the median magnitude of those that are not zero: `CLIP` in an
-      l-infinity ball, where the step follows the signs, so that clipping changes how
-      gradients are averaged but no single step; `CLIP_L2` in an l2 ball.
+      a multiple of the median magnitude of the nonzero elements. The multiple is `CLIP`
+      in an l-infinity ball: steps use the signs only, so clipping changes the average
+      of gradients but no single step. In an l2 ball it is `CLIP_L2`.
     - Then a gradient that is longer than `CLIP` times the median of the last `MEMORY`
-      lengths, its own included, is scaled down to that.
-    - In a domain that is `exact`, or `draws_conditions`, nothing is an outlier.
+      lengths, this one included, is scaled down to that length.
+    - If the domain is `exact` or `draws_conditions`, renders have no noise, and nothing
+      is clipped.
 
     Args:
         domain: domain of the gradient.
         gradient: (d,), finite.
-        lengths: lengths of the latest gradients, before this.
+        lengths: lengths of the gradients before this one, at most `MEMORY`.
 
     Returns:
-        The clipped gradient; the lengths with this one's, before it was scaled down;
+        The clipped gradient; the lengths, with this one's before it was scaled down;
         and the counts of outliers.
     """
-    # Without noise of the renders, what is large is so for a reason.
+    # Without noise, large elements are real.
     if domain.exact or domain.draws_conditions:
         return gradient, lengths, NO_COUNTS
     clipped_gradient = gradient.clone()
@@ -161,12 +162,14 @@ class StepWindow:
         return replace(self, values=(*self.values, value), n_improved=n_improved)
 
     def stalled(self, best: float) -> bool:
-        """Return whether the step size is due for halving (conditions 1 and 2 of
-        Auto-PGD).
+        """Return whether the step size should be halved (Auto-PGD, conditions 1 and 2).
 
-        That is if too few steps improved the objective, or if the best objective of the
-        search, `best`, has not grown since the last checkpoint although the step size
-        was not halved there.
+        It should if too few steps of this window improved the objective; or if the best
+        objective has not grown since the last checkpoint, although the step size was
+        not halved there.
+
+        Args:
+            best: largest objective of the search so far.
         """
         has_improved_seldom = self.n_improved < MIN_IMPROVING_FRACTION * len(
             self.values
@@ -193,7 +196,8 @@ class StepWindow:
             best: objective of the search so far.
             halved: whether the step size is halved between the two.
         """
-        # shorter than this one by a fixed part of the steps, with two lower limits
+        # Shorter than this one by a fixed fraction of the steps; the first two are
+        # lower limits.
         length = max(
             MIN_WINDOW,
             round(MIN_WINDOW_FRACTION * steps),
@@ -277,11 +281,15 @@ class AscentPolicy(Policy[Ascent]):
         return (Proposal(state.u, gradient=True, step_size=self.pace(state)),), state
 
     def update(self, state: Ascent, evaluated: Evaluated) -> Ascent:
-        """Accumulate the gradient, remember the best evaluation, and take a step.
+        """Accumulate the gradient, store the best evaluation so far, and take a step.
 
-        After an evaluation whose objective could not be computed, the search retreats
-        with half the step size. Without a gradient the step follows the accumulated
-        one.
+        If the objective could not be computed, the search goes back (`retreat`) with
+        half the step size. Without a gradient, e.g. when the renders do not suffice for
+        it, the step follows the accumulated one.
+
+        Args:
+            state: state of the ascent.
+            evaluated: one configuration and its evaluation.
         """
         ((u, evaluation),) = evaluated
         state = replace(state, count=state.count + 1)
@@ -297,9 +305,10 @@ class AscentPolicy(Policy[Ascent]):
         return self.step(state, u, evaluation.objective)
 
     def _accumulate(self, state: Ascent, gradient: Tensor) -> Ascent:
-        """Return the state with a gradient (d,), without its outliers, accumulated.
+        """Return the state after accumulating a gradient (d,), without its outliers.
 
-        A gradient of zero (a "flat" one) is only counted: how many come in a row.
+        A gradient of zero ("flat") is not accumulated; such gradients are counted as
+        long as they follow each other.
         """
         clipped_gradient, lengths, outliers = clip_gradient(
             state.domain, gradient, state.lengths
@@ -402,7 +411,15 @@ class PGD(AscentPolicy):
             raise self.make_range_error("momentum", "[0, 1)", 0.5)
 
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Ascent:
-        """Start at the initial point, or at a sample, with the first window."""
+        """Start at the initial point, or at a random sample if `random_start` is set.
+
+        The first window begins: the evaluations before the step size may be halved.
+
+        Args:
+            domain: domain of the search.
+            generator: source of the seed.
+            steps: renders of the search.
+        """
         seed = draw_seed(generator)
         u = domain.initial_point
         if self.random_start:
@@ -450,11 +467,11 @@ class PGD(AscentPolicy):
         return replace(state, direction=direction)
 
     def step(self, state: Ascent, u: Tensor, objective: float) -> Ascent:
-        """Take a step from u, whose objective was evaluated.
+        """Take a step from u (d,), whose objective was evaluated.
 
-        Steps come in windows, after each of which the step size may be halved; where
-        each evaluation has other conditions, objectives can't be compared, and there
-        are no windows.
+        Steps are grouped in windows, and after each window the step size may be halved.
+        If every evaluation draws other conditions, objectives can't be compared, so
+        that there are no windows.
         """
         if math.isnan(state.start_objective):
             state = replace(state, start_objective=objective)
@@ -468,11 +485,11 @@ class PGD(AscentPolicy):
         return self._end_noisy_window(state, window, u)
 
     def _end_exact_window(self, state: Ascent, window: StepWindow) -> Ascent:
-        """Halve the step size if the best objective of a window, without noise, is not
-        clearly above that of the window before; start the next one, as long.
+        """End a window of a search without noise, and start one of equal length.
 
-        It is compared with that window, not with the best of the search, which may stem
-        from another matrix of light transport.
+        The step size is halved if the best objective of the window is not clearly above
+        that of the window before. It is not compared with the best of the search: that
+        may have been predicted by another light transport matrix.
         """
         best = max(window.values)
         gain = best - window.reference_best
@@ -492,12 +509,17 @@ class PGD(AscentPolicy):
         )
 
     def _end_noisy_window(self, state: Ascent, window: StepWindow, u: Tensor) -> Ascent:
-        """Halve the step size if the objective stalled in a window, and take a step
-        from u, the latest configuration.
+        """End a window of a noisy search, and take a step.
 
-        If besides the window lags behind the best evaluation of the search (the peak),
-        the step starts there instead, in the direction of that time; the steps since
-        then count as a rejected one.
+        If the objective stalled in the window, the step size is halved. If the window
+        also lags behind the best evaluation of the search (the peak), the step starts
+        at the peak, with the direction that was accumulated there. The steps since the
+        peak are then counted as one rejected step.
+
+        Args:
+            state: state of the ascent.
+            window: the window that is complete.
+            u: (d,) the latest configuration, from which the step starts otherwise.
         """
         peak = state.peak
         best = peak.objective if peak else -math.inf
@@ -583,8 +605,9 @@ class Adam(AscentPolicy):
         return state.decay_step_size(state.count)
 
     def retreat(self, state: Ascent) -> Ascent:
-        """Go back to the best configuration, or else to the start, and forget all
-        gradients.
+        """Go back to the best configuration, or to the initial point if there is none.
+
+        The accumulated gradients are set to zero.
         """
         u = state.domain.initial_point if state.peak is None else state.peak.u
         return replace(
@@ -614,16 +637,22 @@ class Adam(AscentPolicy):
         )
 
     def step(self, state: Ascent, u: Tensor, objective: float) -> Ascent:
-        """Take a step along the mean gradient over its root mean square; see `Adam`."""
+        """Take a step along the mean gradient divided by its root mean square.
+
+        Args:
+            state: state of the ascent.
+            u: (d,) the latest configuration.
+            objective: its objective, which Adam does not use.
+        """
         if state.n_updates:
             # m' / sqrt(v'), without the bias of means that began at zero
             mean = state.direction / (1.0 - self.beta1**state.n_updates)
             mean_square = state.mean_square / (1.0 - self.beta2**state.n_updates)
             direction = mean / mean_square.sqrt_().clamp_(min=1e-30)
-        else:  # at random as long as nothing is known
+        else:  # without any gradient so far, in a direction of random signs
             noise = torch.randn(u.numel(), generator=seeded(state.seed, state.count))
             direction = noise.sign_()
-        # of the evaluation that this step follows, which is counted already
+        # `count` includes the latest evaluation already
         rate = state.decay_step_size(state.count - 1)
         half_widths = compute_half_widths(state.domain)
         u = torch.addcmul(u, half_widths, direction, value=rate)

@@ -133,8 +133,9 @@ class Sobol(NonAdaptivePolicy):
     def propose(
         self, state: PointsState, n: int
     ) -> tuple[tuple[Proposal, ...], PointsState]:
-        """Propose the next points of the present chunk, up to n; of the next chunk once
-        this one is used up.
+        """Propose the next points of the sequence, at most n.
+
+        Points are computed in chunks; the next chunk follows once this one is used up.
         """
         chunk_size, size = state.points.shape
         index_in_chunk = state.n_proposed % chunk_size
@@ -163,11 +164,14 @@ def sample_sobol_points(size: int, seed: int, begin: int, count: int) -> Tensor:
 
 
 def to_domain(domain: Domain, x: Tensor) -> Tensor:
-    """Return the configuration (d,) for a point x (d + number of l2 blocks,) of the
-    unit cube; see `Sobol`.
+    """Return the configuration (d,) for a point of the unit cube.
 
-    The first d elements of x belong to the elements of u; the others give the radius in
-    each l2 ball.
+    Uniform points give uniform configurations, but for l2 balls that bounds cut.
+
+    Args:
+        domain: domain of the configuration.
+        x: (d + number of l2 blocks,) in [0, 1]. The first d elements belong to those of
+            u; the others decide the distance from the center in each l2 ball.
     """
     u = torch.lerp(domain.lower, domain.upper, x[: domain.dim])
     radii = iter(x[domain.dim :].tolist())
@@ -236,9 +240,13 @@ def _list_blocks(domain: Domain) -> list[Block]:
 
 
 def _make_axes(domain: Domain, counts: Sequence[int]) -> list[Tensor]:
-    """Return the values of each element of u, (count,) in ascending order.
+    """Return the grid's values for each element of u, ascending, (count,) each.
 
-    Bounds of an l2 ball are those of the cube around it, cut by its block's.
+    An l2 ball is replaced by the smallest cube around it, cut by the block's bounds.
+
+    Args:
+        domain: domain of the search.
+        counts: number of values of each element.
     """
     lower = domain.lower.clone()
     upper = domain.upper.clone()
@@ -263,36 +271,37 @@ def _make_axes(domain: Domain, counts: Sequence[int]) -> list[Tensor]:
 def _order_coarse_to_fine(blocks: Sequence[Block], counts: Sequence[int]) -> Tensor:
     """Return the indices of all points of a grid, (n,), the coarse ones first.
 
-    A value on an axis has level 0 at its ends, 1 in the middle, 2 at the quarters, and
-    so on. Points are sorted by the largest level of their values, then by the sum of
-    these. The last axis of the grid runs fastest.
+    A value at the end of an axis has level 0, in the middle 1, at a quarter 2, and so
+    on. Points are sorted by the largest level of their values, then by the sum of the
+    levels. So a search that ends early has seen a coarse grid. The last axis of the
+    grid varies fastest.
 
     Args:
-        blocks: blocks of each axis.
+        blocks: block of each axis.
         counts: number of values of each axis.
     """
-    # of all points of the grid over the axes so far
+    # for all points of the grid over the axes so far
     max_level = torch.zeros(1, dtype=torch.long)
     level_sum = torch.zeros(1, dtype=torch.long)
     for level in map(_compute_levels, blocks, counts):
         # each point so far with each value of this axis
         max_level = torch.maximum(max_level[:, None], level).flatten()
         level_sum = (level_sum[:, None] + level).flatten()
-    # a number of two digits: any difference of `max_level` exceeds all of `level_sum`
+    # Like a number of two digits: the sum decides only if `max_level` is equal.
     sort_key = max_level * (int(level_sum.max()) + 1) + level_sum
     return sort_key.argsort(stable=True)
 
 
 def _count_values(domain: Domain, steps: int, points: int) -> list[int]:
-    """Return how many values each element of u takes.
+    """Return how many values the grid has for each element of u.
 
-    A choice takes all its options. Without `points` all numbers take as many values as
-    fit, at least 2; then each in turn takes one more as long as the grid fits.
+    A choice has all its options. Numbers have `points` values each, or as many as the
+    renders allow, at least 2.
 
     Args:
         domain: domain to search.
         steps: renders that the grid may take.
-        points: values of each number; 0 for as many as fit.
+        points: number of values of each number; 0 for as many as fit.
 
     Raises:
         InputError: the grid does not fit into the renders.
@@ -301,7 +310,7 @@ def _count_values(domain: Domain, steps: int, points: int) -> list[int]:
     n_numbers = options.count(0)
     n_combinations = math.prod(count for count in options if count)
     min_values = points or 2
-    # 2^64 is too much for any budget; more would only take long to compute
+    # 2^64 exceeds any budget already; a larger power would only take long to compute
     min_renders = n_combinations * min_values ** min(n_numbers, 64)
     if min_renders > steps:
         combinations_text = ""
@@ -321,15 +330,16 @@ def _count_values(domain: Domain, steps: int, points: int) -> list[int]:
 
 
 def _fill_budget(options: Sequence[int], steps: int) -> list[int]:
-    """Return how many values each element of u takes so that the grid just fits.
+    """Return how many values each element of u has so that the grid just fits.
 
     Args:
-        options: options of each element; 0 of a number, which takes at least 2 values.
-        steps: points of the grid, at most.
+        options: number of options of each element; 0 for a number, which gets at least
+            2 values.
+        steps: largest number of points of the grid.
     """
     n_combinations = math.prod(count for count in options if count)
     root = (steps // n_combinations) ** (1.0 / max(options.count(0), 1))
-    # reduced a little, since a root that is rounded up would not fit
+    # reduced a little, as rounding errors might make the root too large
     values_each = max(2, int(root * (1 - 1e-9)))
     counts = [count or values_each for count in options]
     total = math.prod(counts)
@@ -346,10 +356,10 @@ def _fill_budget(options: Sequence[int], steps: int) -> list[int]:
 
 
 def _compute_levels(block: Block, count: int) -> Tensor:
-    """Return the level (count,) of each value of an axis: how often the axis must be
-    halved until the value is met.
+    """Return the level (count,) of each value of an axis.
 
-    It is 0 for both ends of a number's range and for every option.
+    It is how often the axis must be halved until the value is reached: 0 at both ends,
+    1 in the middle. All options of a choice have level 0.
     """
     level = torch.zeros(count, dtype=torch.long)
     if block.options:

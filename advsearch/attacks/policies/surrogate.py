@@ -84,10 +84,15 @@ class BoxCoordinates:
         return self.normalize(engine.draw(n))
 
     def sample_moves(self, x: Tensor, generator: torch.Generator) -> Tensor:
-        """Return a random move (n, k) of each of the points x (n, k).
+        """Return the points x (n, k) after a random move of each, (n, k).
 
-        A few coordinates move, at least one. Numbers move by normal noise whose size is
-        random; choices are sampled anew, or stay.
+        A few coordinates of each point move, at least one. Numbers change by normal
+        noise of a random size. Choices are sampled again with the probability
+        `RESAMPLED_FRACTION`.
+
+        Args:
+            x: (n, k) points of the unit box.
+            generator: generator of random numbers; it advances.
         """
         n, k = x.shape
         # log-uniform from `MIN_MOVE` to `MAX_MOVE`
@@ -105,11 +110,18 @@ class BoxCoordinates:
         return self.normalize(torch.where(is_resampled, uniform, x))
 
     def embed(self, x: Tensor, lengths: Tensor) -> Tensor:
-        """Return points x (n, k) as features (n, f) whose Euclidean distances are those
-        of the kernel.
+        """Map points to features whose Euclidean distances the kernel uses.
 
-        Differences are divided by the length scales (k,). An angle becomes a circle of
-        circumference 2, an option the corner of a simplex with edges of length 1.
+        Every coordinate is divided by its length scale. An angle becomes a point on a
+        circle of circumference 2. An option becomes the corner of a simplex, so that
+        different options have the distance 1.
+
+        Args:
+            x: (n, k) points of the unit box.
+            lengths: (k,) length scales.
+
+        Returns:
+            (n, f) float64.
         """
         x = x.double()
         is_plain = ~self.periodic & (self.options == 0)
@@ -212,8 +224,13 @@ class Surrogate:
     likelihood: float
 
     def predict(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean and standard deviation (m,) of the noise-free objective at points
-        (m, k).
+        """Predict the noise-free objective at points.
+
+        Args:
+            x: (m, k) points of the unit box.
+
+        Returns:
+            Mean and standard deviation, (m,) each.
         """
         lengths = self.scales.lengths
         # (m, n) correlations of the new points with the known ones
@@ -261,11 +278,12 @@ class Observations:
         )
 
     def fit_surrogate(self) -> tuple[Surrogate, Observations]:
-        """Fit a process; return it, and the observations with its scales.
+        """Fit a Gaussian process; return it, and the observations with its scales.
 
-        At least one value must be finite; those that are not count as the smallest. Of
-        many points the best and the latest are used. The scales are fitted again only
-        after `REFIT_INTERVAL` new points, or a tenth of all if that is more.
+        At least one value must be finite; others count as the smallest one. If there
+        are many points, only the best and the latest are used. The scales (length
+        scales and noise) take long to fit. So they are fitted again only after
+        `REFIT_INTERVAL` new points, or a tenth of all points if that is more.
         """
         n_points = len(self.values)
         values = torch.tensor(self.values, dtype=torch.float64)
@@ -305,10 +323,16 @@ def kernel(a: Tensor, b: Tensor) -> Tensor:
 def fit(
     box: BoxCoordinates, x: Tensor, y: Tensor, scales: Scales | None = None
 ) -> Surrogate:
-    """Return the Gaussian process for values y (n,) at points x (n, k) of the unit box.
+    """Fit a Gaussian process to values at points of the unit box.
 
-    Its mean and variance are those of maximum likelihood; so are the scales (lengths of
-    the kernel and variance of the noise), unless they are passed.
+    Its mean and variance maximise the likelihood.
+
+    Args:
+        box: kinds of the k coordinates.
+        x: (n, k) points.
+        y: (n,) values.
+        scales: length scales of the kernel and variance of the noise; by default those
+            of maximum likelihood.
     """
     scales = scales or _find_best_scales(box, x, y)
     features = box.embed(x, scales.lengths)
@@ -330,13 +354,19 @@ def fit(
 
 
 def _find_best_scales(box: BoxCoordinates, x: Tensor, y: Tensor) -> Scales:
-    """Return the scales of greatest likelihood for values y (n,) at points x (n, k).
+    """Return the length scales and the noise with the largest likelihood.
 
-    First a common length scale and the noise are chosen from the grids. Then the length
-    scale of one coordinate after the other is changed if that brings at least
-    `MIN_LIKELIHOOD_GAIN`.
+    First a common length scale and the noise are chosen from grids. Then the length
+    scale of each coordinate in turn is multiplied by a factor, if that increases the
+    log likelihood by more than `MIN_LIKELIHOOD_GAIN`.
+
+    Args:
+        box: kinds of the k coordinates.
+        x: (n, k) points of the unit box.
+        y: (n,) values.
     """
     k = x.shape[1]
+    # Distances in the unit box grow with the square root of its dimension.
     length_unit = math.sqrt(k)
 
     def find_most_likely(candidates: list[Scales]) -> Surrogate:
@@ -351,7 +381,7 @@ def _find_best_scales(box: BoxCoordinates, x: Tensor, y: Tensor) -> Scales:
             for noise in NOISE_VARIANCES
         ]
     )
-    # a single coordinate has a length of its own already; many share one
+    # A single coordinate is fitted already. With many coordinates all share one scale.
     if not 1 < k <= MAX_SCALED_DIM:
         return best.scales
     for coordinate in range(k):

@@ -61,10 +61,10 @@ def saturate(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 
 def pixelate(image: Tensor, severity: int) -> Tensor:
-    """Average the picture over square cells; linear in the picture.
+    """Average the picture (H, W, 3) over square cells; linear in the picture.
 
-    At the reference size a cell is 1.7 to 4 pixels wide, by the severity; in a larger
-    picture it has more pixels, in a smaller one as many.
+    At the reference size a cell is 1.7 to 4 pixels wide, depending on the severity. In
+    a larger picture a cell is larger in proportion; in a smaller one it is not smaller.
     """
     height, width = image.shape[:2]
     fraction = PIXELATE[severity - 1] / max(
@@ -223,8 +223,8 @@ def _apply_stepped(
 ) -> Tensor:
     """Corrupt an image at the integer severity nearest to a severity ().
 
-    A staircase has no slope: the gradient is that of the straight lines between its
-    steps.
+    A rounded severity has no derivative. The gradient is that of a linear interpolation
+    between the results at integer severities.
 
     Args:
         image: (H, W, 3) display-referred sRGB in [0, 1].

@@ -71,7 +71,7 @@ def interpolate_severity(
     # at the largest severity the one before it, so that there is one above
     below = min(int(severity.detach()), MAX_SEVERITY - 1)
     fraction = severity - below
-    # the result above has no effect, and takes time to make
+    # At an integer severity the upper result has no weight, and takes time to compute.
     if float(fraction.detach()) == 0.0 and not fraction.requires_grad:
         return make_at_severity(below).to(severity.device)
     lower = make_at_severity(below).to(severity.device)
@@ -80,9 +80,13 @@ def interpolate_severity(
 
 
 def blur_gaussian(image: Tensor, sigma: Tensor) -> Tensor:
-    """Blur an (H, W, C) picture with a Gaussian of () standard deviation in pixels.
+    """Blur an image (H, W, C) with a Gaussian.
 
-    Edges are continued.
+    Beyond the image, the pixels of its edges are repeated.
+
+    Args:
+        image: (H, W, C).
+        sigma: () standard deviation in pixels; the result is differentiable in it.
     """
     # cut off at four standard deviations
     reach = max(1, math.ceil(4.0 * float(sigma.detach())))
@@ -173,8 +177,14 @@ def speckle_noise(image: Tensor, severity: Tensor, seed: int) -> Tensor:
 def shot_noise(image: Tensor, severity: Tensor, seed: int) -> Tensor:
     """Replace the image by photon counts: Poisson numbers with the image as their mean.
 
-    Counts have no derivative. So the noise is written as z standard deviations; z stays
-    fixed, and the derivative is that of the mean and of the standard deviation.
+    Counts have no derivative. So the noise is written as z standard deviations, where z
+    is treated as a constant. The derivative is then that of the mean and of the
+    standard deviation.
+
+    Args:
+        image: (H, W, 3) in [0, 1].
+        severity: () in [1, 5]; larger ones have fewer photons.
+        seed: chooses the noise.
     """
     # photons in a white pixel; `quantile` (H, W, 3) is uniform
     (photons,) = interpolate_table(SHOT, severity)
@@ -199,13 +209,13 @@ def sample_poisson(mean: Tensor, quantile: Tensor) -> Tensor:
     probability = torch.exp(-mean.double())
     total = probability.clone()
     count = torch.zeros_like(probability)
-    # far beyond any count with a mean of 80
+    # 400 is far beyond any count with a mean of 80
     for candidate in range(1, 400):
         is_above = quantile > total
         if not bool(is_above.any()):
             break
         count += is_above
-        # of the next count
+        # P(k) = P(k - 1) * mean / k, the Poisson probability of the next count
         probability *= mean / candidate
         total += probability
     return count.to(mean.dtype)
@@ -214,9 +224,14 @@ def sample_poisson(mean: Tensor, quantile: Tensor) -> Tensor:
 def impulse_noise(image: Tensor, severity: Tensor, seed: int) -> Tensor:
     """Replace a fraction of the values by 0 or 1 ("salt and pepper").
 
-    A single value changes at once, which has no derivative by the fraction. The
-    derivative is that of the expected value, which moves from the image's to 0 or 1
-    with the fraction.
+    A single value jumps from the image's to 0 or 1, so that it has no derivative in the
+    fraction. The derivative of its expected value is used, which is linear in the
+    fraction.
+
+    Args:
+        image: (H, W, 3) in [0, 1].
+        severity: () in [1, 5]; larger ones replace more values.
+        seed: chooses the values.
     """
     (lost_fraction,) = interpolate_table(IMPULSE, severity)
     uniform = _draw_noise(image, seed, "impulse noise", normal=False)
@@ -257,7 +272,7 @@ def gaussian_blur(image: Tensor, severity: Tensor, seed: int) -> Tensor:
 
 
 def defocus_blur(image: Tensor, severity: Tensor, seed: int) -> Tensor:
-    """Blur with a disc, the picture of a point that a lens has out of focus.
+    """Blur with a disc, which is how a lens shows a point that is out of focus.
 
     Args:
         image: (H, W, 3).
@@ -276,9 +291,10 @@ def defocus_blur(image: Tensor, severity: Tensor, seed: int) -> Tensor:
 
 
 def _convolve(image: Tensor, kernel: Tensor, reach: int) -> Tensor:
-    """Return an image (H, W, C) convolved with a square kernel; edges are continued.
+    """Return an image (H, W, C) convolved with a square kernel.
 
-    It is done by Fourier transforms, which are faster for large kernels.
+    Beyond the image, the pixels of its edges are repeated. The convolution is computed
+    by Fourier transforms, which are faster for large kernels.
 
     Args:
         image: (H, W, C).
@@ -287,8 +303,8 @@ def _convolve(image: Tensor, kernel: Tensor, reach: int) -> Tensor:
     """
     height, width = image.shape[:2]
     padded = F.pad(images.to_planes(image), (reach,) * 4, mode="replicate")
-    # The full convolution is larger than the padded image by the reach on each side,
-    # and this larger than the image by another one.
+    # The padded image has `reach` more pixels on each side than the image, and the full
+    # convolution another `reach`. So the result begins at 2 * reach.
     size = (padded.shape[2] + 2 * reach, padded.shape[3] + 2 * reach)
     product = torch.fft.rfft2(padded, s=size) * torch.fft.rfft2(kernel, s=size)
     convolved = torch.fft.irfft2(product, s=size)
@@ -312,7 +328,13 @@ def motion_blur(image: Tensor, severity: Tensor, seed: int) -> Tensor:
 
 
 def zoom_blur(image: Tensor, severity: Tensor, seed: int) -> Tensor:
-    """Average the image with magnified ones, like a camera that moves ahead."""
+    """Average the image with magnified ones, like a camera that moves ahead.
+
+    Args:
+        image: (H, W, 3).
+        severity: () in [1, 5]; larger ones magnify more.
+        seed: has no effect.
+    """
     (largest,) = interpolate_table(ZOOM, severity)
     zooms = 1.0 + (largest - 1.0) * torch.linspace(
         0.0, 1.0, ZOOM_STEPS, device=severity.device
@@ -355,8 +377,9 @@ def _compute_shifts(origin: Tensor, columns: int) -> Tensor:
 def _make_glass_shift(height: int, width: int, seed: int, severity: int) -> Tensor:
     """Make the shift of each pixel to where it is taken from behind frosted glass.
 
-    One pixel after another, from the bottom right, takes over what a random neighbor
-    has by then; so it may come from further away than one step.
+    One pixel after the other, from the bottom right on, takes over the content of a
+    random neighbor. The neighbor may have taken it over itself before, so that a pixel
+    may come from farther away than one step.
 
     Args:
         height: height of the image.
@@ -440,11 +463,10 @@ def _make_elastic_shift(height: int, width: int, seed: int, severity: int) -> Te
 
 
 def _make_shear(rows: int, columns: int, corners: Tensor) -> Tensor:
-    """Make the affine shift (rows, columns, 2) that moves three corners by given
-    shifts.
+    """Make the affine shift (rows, columns, 2) that moves three points as requested.
 
-    They are corners of a square around the image's center whose sides are two thirds of
-    the reference side.
+    The points are corners of a square around the image's center, whose side is two
+    thirds of the reference side.
 
     Args:
         rows: rows of the image.
@@ -503,7 +525,11 @@ def fog(image: Tensor, severity: Tensor, seed: int) -> Tensor:
 def _make_drift(height: int, width: int, seed: int, decay: float) -> Tensor:
     """Make fog (H, W, 1) in [0, 1].
 
-    `decay` is as for `make_fractal_noise`: the larger it is, the smoother is the fog.
+    Args:
+        height, width: size of the image, pixels.
+        seed: chooses the fog.
+        decay: how fast the noise loses height on finer grids; the larger it is, the
+            smoother is the fog.
     """
     rows, columns = compute_reference_size(height, width)
     noise = make_fractal_noise(max(rows, columns), decay, make_generator(seed, "fog"))
@@ -513,10 +539,13 @@ def _make_drift(height: int, width: int, seed: int, decay: float) -> Tensor:
 def make_fractal_noise(side: int, decay: float, source: torch.Generator) -> Tensor:
     """Make fractal noise in [0, 1] by midpoint displacement on a torus.
 
-    The result is square, with a power of two of at least `side` texels a side. Each
-    step doubles the grid: a new point is the mean of its four neighbors plus noise,
-    whose height is divided by `decay` squared from step to step (Fournier, Fussell,
-    Carpenter 1982, Computer rendering of stochastic models).
+    Each step doubles the grid: a new point is the mean of its four neighbors plus noise
+    (Fournier, Fussell, Carpenter 1982, Computer rendering of stochastic models).
+
+    Args:
+        side: smallest side of the result; it is rounded up to a power of two.
+        decay: the height of the noise is divided by its square after each step.
+        source: generator of random numbers; it advances.
     """
     grid = torch.zeros(1, 1)
     height = 1.0
@@ -550,7 +579,7 @@ def frost(image: Tensor, severity: Tensor, seed: int) -> Tensor:
 def _make_ice(height: int, width: int, seed: int) -> Tensor:
     """Make ice (H, W, 3) in [0, 1]: feathers of crystals over an uneven film.
 
-    Numbers are chosen by eye.
+    The constants of brightness and roughness are chosen by eye.
     """
     rows, columns = compute_reference_size(height, width)
     source = make_generator(seed, "frost")
@@ -592,7 +621,7 @@ def _draw_feather(
         shine: brightness in [0, 1].
     """
     direction = cmath.rect(1.0, 2.0 * math.pi * turn)
-    # in pixels; most needles are short
+    # in pixels, chosen by eye; by the cube most needles are short
     length = 12.0 + 110.0 * size**3
     _draw_line(pen, start, start + length * direction, shine)
     for step in range(4, int(length), 4):
@@ -628,10 +657,10 @@ def snow(image: Tensor, severity: Tensor, seed: int) -> Tensor:
 
 @lru_cache(maxsize=8)
 def _make_snowfall(height: int, width: int, seed: int, severity: int) -> Tensor:
-    """Make falling snow (H, W, 1) in [0, 1] at a whole severity.
+    """Make falling snow (H, W, 1) in [0, 1] at an integer severity.
 
-    Noise on a coarse grid is cut off below a threshold, which leaves flakes, and
-    blurred along the direction of their fall.
+    Noise on a coarse grid is set to 0 below a threshold, which leaves flakes. They are
+    blurred along the direction in which they fall.
     """
     rows, columns = compute_reference_size(height, width)
     mean, spread, flake_size, threshold, radius, sigma = SNOW[severity - 1]

@@ -200,7 +200,11 @@ class OcclusionControl(Control):
     )
 
     def check_choices(self) -> None:
-        """Check the occluder that was chosen in place of `which`. Raises InputError."""
+        """Check the choice `object`, an occluder of the user's.
+
+        Raises:
+            InputError: it is no name or path, or `which` is set as well.
+        """
         occluder = self.chosen["object"]
         if occluder is None:
             return
@@ -217,7 +221,10 @@ class OcclusionControl(Control):
         self._settings["object"] = self.chosen["object"] = str(occluder)
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        """Add every occluder that can be chosen, out of sight."""
+        """Return the scene with a mesh for every occluder that may be chosen.
+
+        They are placed out of sight; `scene_inputs` moves the one that is used.
+        """
         hidden_pose = geometry.make_hidden_pose(
             torch.from_numpy(geometry.camera_to_world(scene))
         ).numpy()
@@ -285,21 +292,26 @@ class OcclusionControl(Control):
     def find_placement(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> Placement:
-        """Find where the occluder goes, given the pose of camera and object by the
-        controls before this one; without derivatives.
+        """Find where the occluder goes, without derivatives.
 
-        It moves in from its side of the image until it hides the requested coverage. It
-        is out of sight if the object is not in the image, or nothing is to be hidden.
+        It moves into the image from the side that "direction" states, until it hides
+        the fraction "coverage" of the object. It is placed out of sight if the object
+        is not in the image, or nothing is to be hidden.
+
+        Args:
+            values: values of the control, by parameter.
+            earlier_inputs: inputs of earlier controls, which may have moved camera and
+                object.
         """
         requested = {name: float(value.detach()) for name, value in values.items()}
         view = _ObjectView.of(self.scene, earlier_inputs)
-        # the parameter is a fraction of the way to the object's middle
+        # "distance" is a fraction of the distance from the camera to the object
         requested_distance = requested["distance"] * view.far
         if view.directions is None or requested["coverage"] <= 0.0:
             return _make_hidden_placement(requested["size"], requested_distance)
         mesh = _load_asset(self._select_option(values)).mesh
         turn = geometry.make_rotation(requested["turn"], 0.0, 0.0)
-        # of the occluder about the origin, one object size large
+        # vertices of the turned occluder, centered on the origin, largest extent 1
         points = mesh.vertices.astype(np.float64) @ turn.T
         size, distance = _fit_occluder(
             points, requested["size"], requested_distance, view.near
@@ -329,11 +341,16 @@ class OcclusionControl(Control):
 def _find_covering_angle(
     view: _ObjectView, passage: silhouettes.Passage, coverage: float
 ) -> float:
-    """Find the angle, radians, at which an occluder hides a fraction of the object.
+    """Find the angle, in radians, at which an occluder hides a fraction of the object.
 
-    The angle is that between the occluder and the object's center, seen from the
-    camera. Below `EASE_IN_COVERAGE` the occluder slides in from outside of the image,
-    in proportion to the fraction.
+    The angle is that between the occluder's and the object's centers, seen from the
+    camera. For fractions below `EASE_IN_COVERAGE` it is interpolated from the angle
+    outside of the image, so that the occluder does not jump in at a tiny fraction.
+
+    Args:
+        view: the object as the camera sees it.
+        passage: the occluder and the line on which it moves.
+        coverage: fraction of the visible object that should be hidden, over 0.
     """
     outside = silhouettes.find_angle_outside(
         view.directions_of_image,
@@ -377,10 +394,12 @@ class _ObjectView:
     def of(
         scene: SceneDescription, earlier_inputs: Mapping[str, Tensor]
     ) -> _ObjectView:
-        """Compute how the camera sees a scene's object; without derivatives.
+        """Compute how the camera sees a scene's object, without derivatives.
 
-        `earlier_inputs` are the inputs of the controls before, which may move camera and
-        object.
+        Args:
+            scene: the scene.
+            earlier_inputs: inputs of earlier controls, which may have moved camera and
+                object, or changed the lens.
         """
         points = _object_in_camera(scene, earlier_inputs)
         faces = scene.object.mesh.faces
@@ -391,7 +410,7 @@ class _ObjectView:
             directions_of_image = _spread_directions(
                 model, (0.0, 1.0), (0.0, 1.0), silhouettes.DIRECTION_GRID
             )
-            # The edge of a distorted image is not known: all its directions stand in.
+            # The edge of a distorted image is not computed: all directions are used.
             rim = directions_of_image
             directions = _directions_through_lens(model, points, faces)
         else:
@@ -409,8 +428,12 @@ class _ObjectView:
 def _object_in_camera(
     scene: SceneDescription, earlier_inputs: Mapping[str, Tensor]
 ) -> assets.Float64Array:
-    """Return the object's vertices (V, 3) to the right, up and forward of the
-    camera.
+    """Return the object's vertices (V, 3) in camera coordinates: right, up, forward.
+
+    Args:
+        scene: the scene.
+        earlier_inputs: inputs of earlier controls: the poses of camera and object, and
+            offsets (V, 3) of the vertices. What is missing is as in the scene.
     """
     camera = (
         geometry.get_camera_pose(scene, earlier_inputs).detach().double().cpu().numpy()
@@ -444,12 +467,14 @@ def _directions_through_lens(
     Args:
         model: model of the camera.
         points: (V, 3) vertices in camera coordinates.
-        faces: (F, 3) of the mesh.
+        faces: (F, 3) vertex indices of the mesh.
 
     Returns:
-        Unit directions (N, 3), each for the same area of the image; None if it is not
-        in the image.
+        Unit directions (N, 3), each for the same area of the image; None if the mesh is
+        not in the image.
     """
+    # A pinhole camera that looks at the mesh gives its silhouette. Directions through
+    # the lens that hit the silhouette are those in which the mesh is seen.
     vertex_directions = points / np.linalg.norm(points, axis=1, keepdims=True)
     axes = silhouettes.compute_center_axes(vertex_directions)
     cover = silhouettes.rasterise_silhouette(points @ axes.T, faces)
@@ -478,14 +503,14 @@ def _spread_directions(
 ) -> assets.Float64Array:
     """Return unit directions (N, 3) in which a lens sees a part of the image.
 
-    There is one in each cell of a grid of count x count, at a point of a
-    low-discrepancy sequence; directions that the lens does not have are left out.
+    There is one in each cell of a grid, at a position from a low-discrepancy sequence.
+    Cells that the lens does not see, such as the corners of a fisheye, are left out.
 
     Args:
         model: model of the camera.
-        across: bounds of the part, fractions of the width from the left.
-        down: bounds of the part, fractions of the height from the top.
-        count: count of rows and columns.
+        across: left and right bound of the part, as fractions of the width.
+        down: upper and lower bound of the part, as fractions of the height.
+        count: number of rows, and of columns, of the grid.
     """
     row, column = np.divmod(np.arange(count * count), count)
     index = np.arange(count * count)
@@ -514,13 +539,14 @@ def _fit_occluder(
 ) -> tuple[float, float]:
     """Fit an occluder between the camera and the object.
 
-    It keeps `MIN_CAMERA_DISTANCE` from the camera, and no vertex is farther from the
-    camera than the object's nearest one. It is made smaller where it does not fit.
+    It keeps `MIN_CAMERA_DISTANCE` from the camera, and none of its vertices is farther
+    from the camera than the object's nearest one. It is made smaller until it fits.
 
     Args:
-        points: (V, 3) of the occluder, one object size large around the origin.
-        size: size that is requested.
-        distance: distance from the camera that is requested.
+        points: (V, 3) vertices of the occluder, centered on the origin, largest extent
+            1; x points to the camera.
+        size: requested size.
+        distance: requested distance from the camera.
         near: distance of the object's nearest vertex from the camera.
 
     Returns:
@@ -529,7 +555,7 @@ def _fit_occluder(
     front = float(points[:, 0].max())
     back = float(-points[:, 0].min())
     half_width = float(np.hypot(points[:, 1], points[:, 2]).max())
-    # so that something fits at all
+    # An object very close to the camera would leave no room for any occluder.
     near = max(near, 3.0 * MIN_CAMERA_DISTANCE)
     # 0.95 to the 200th is 1 / 28,000: by then anything fits
     for _ in range(200):
@@ -549,11 +575,15 @@ def _fit_occluder(
 def _to_facing_camera(
     points: assets.Float64Array, size: float, distance: float
 ) -> assets.Float64Array:
-    """Return an occluder's points (N, 3) in the axes of a camera: right, up and
-    forward.
+    """Return an occluder's points in the axes of a camera that looks at its center.
 
-    The camera looks at the occluder's center from `distance`, and the occluder's x axis
-    points to the camera. `size` scales the points.
+    Args:
+        points: (N, 3) points of the occluder, whose x axis points to the camera.
+        size: factor of the points.
+        distance: distance of the camera from the occluder's center.
+
+    Returns:
+        (N, 3), right, up and forward.
     """
     right = points[:, 1] * size
     up = points[:, 2] * size
@@ -571,9 +601,14 @@ def _rotate_pair(first: Tensor, second: Tensor, angle: float) -> tuple[Tensor, T
 def _compute_pose(camera: Tensor, placement: Placement, values: Values) -> Tensor:
     """Return the occluder's pose (4, 4).
 
-    Differentiable in the camera, the direction and the turn, at the angle of the
-    placement; nothing else has a derivative here, which is why the control is
-    differentiated by differences.
+    It is differentiable in the camera's pose, the direction and the turn, but not in
+    what the placement was found from. So gradients of this control are estimated by
+    finite differences.
+
+    Args:
+        camera: (4, 4) pose of the camera.
+        placement: where the occluder goes.
+        values: values of the control, with "direction" and "turn" in degrees.
     """
     right, up, forward = torch.from_numpy(placement.axes).to(camera)
     direction = torch.deg2rad(values["direction"])

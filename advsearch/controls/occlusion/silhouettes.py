@@ -40,14 +40,15 @@ class Silhouette:
     def list_directions(self) -> assets.Float64Array:
         """Return unit directions (N, 3), one in each covered pixel.
 
-        All stand for the same area of the image. Their positions within pixels are a
-        low-discrepancy sequence (Roberts 2018), or an upright edge would hide whole
-        columns.
+        Each stands for the same area of the image. Their positions within the pixels
+        vary by a low-discrepancy sequence (Roberts 2018). With pixel centers, the edge
+        of an occluder would hide whole columns at once.
         """
         row, column = np.nonzero(self.mask)
         height, width = self.mask.shape
         window = self.window
         index = np.arange(len(row))
+        # 1 / g and 1 / g^2 of the plastic number g (Roberts 2018)
         x_in_pixels = column + (0.5 + 0.7548777 * index) % 1.0
         y_in_pixels = row + (0.5 + 0.5698403 * index) % 1.0
         x = window.left + x_in_pixels * (window.right - window.left) / width
@@ -60,13 +61,17 @@ class Silhouette:
         y: assets.Float64Array,
         forwards: assets.Float64Array,
     ) -> NDArray[np.bool_]:
-        """Return whether directions lie in the silhouette; none behind the camera does.
+        """Return whether directions lie in the silhouette.
 
-        `x`, `y` and `forwards` are their components, of one shape and any length.
+        Directions behind the camera do not.
+
+        Args:
+            x, y, forwards: components of the directions, to the right, up and forwards;
+                all of the same shape. They need not have length 1.
         """
         height, width = self.mask.shape
         window = self.window
-        # only to divide by: those behind the camera are left out below
+        # This only avoids a division by 0: `is_inside` excludes what is not in front.
         depth = np.maximum(forwards, geometry.MIN_DEPTH)
         column = np.floor(
             (x / depth - window.left) / (window.right - window.left) * width
@@ -92,9 +97,10 @@ def rasterise_silhouette(
     """Rasterise a mesh as the camera sees it; None if nothing of it is visible.
 
     Args:
-        points: (V, 3) vertices in camera coordinates.
-        faces: (F, 3); those that reach behind the camera are left out.
-        frame: what the camera shows; None for all in front of it.
+        points: (V, 3) vertices in camera coordinates: right, up and forward.
+        faces: (F, 3) vertex indices; faces that reach behind the camera are left out.
+        frame: bounds of the image, in tangents; None for everything in front of the
+            camera.
     """
     corners = points[faces.astype(np.int64)]
     corners = corners[(corners[..., 2] > geometry.MIN_DEPTH).all(axis=1)]
@@ -123,7 +129,12 @@ def rasterise_silhouette(
 def _find_window(
     tangents: assets.Float64Array, frame: geometry.Frame | None
 ) -> geometry.Frame | None:
-    """Return the box of tangents (F, 3, 2) within a frame; None if it is empty."""
+    """Return the bounding box of triangles in the image; None if it is empty.
+
+    Args:
+        tangents: (F, 3, 2) corners of the triangles, x / z and y / z.
+        frame: bounds of the image that cut the box off; None for no bounds.
+    """
     left, low = tangents.min(axis=(0, 1))
     right, high = tangents.max(axis=(0, 1))
     if frame is not None:
@@ -155,12 +166,14 @@ class Passage:
     direction: float
 
     def compute_coverage(self, angles: assets.Float64Array) -> assets.Float64Array:
-        """Return the fraction of the target (K,) that is hidden at angles (K,), in
-        radians.
+        """Return the fraction of the target that is hidden at each angle, (K,).
 
-        An angle is that of the occluder from the target's center. Instead of moving the
-        occluder, the directions of the target are turned back by the angle and looked
-        up in its silhouette.
+        The occluder is not rasterised again for each angle. Instead, the directions of
+        the target are turned back by the angle and looked up in its silhouette.
+
+        Args:
+            angles: (K,) radians, between the centers of occluder and target as seen
+                from the camera.
         """
         turn = math.radians(self.direction)
         right, up, forward = (self.hidden @ self.axes.T).T
@@ -178,14 +191,15 @@ class Passage:
         return np.array(fractions)
 
     def find_angle(self, fraction: float, outside: float) -> float:
-        """Find the largest angle at which a fraction is hidden, by bisection.
+        """Find the largest angle, in radians, at which a fraction is hidden.
 
-        The occluder comes in from outside, and stops where it first hides as much. If
-        it never does, the angle at which it hides most is returned.
+        The occluder moves in from outside and stops where it first hides as much. Its
+        angles are scanned first, then bisected. If it never hides as much, the angle at
+        which it hides most is returned.
 
         Args:
-            fraction: fraction of the target.
-            outside: angle at which the occluder is outside of the image, radians.
+            fraction: fraction of the target that should be hidden.
+            outside: angle at which the occluder is outside of the image, in radians.
         """
         angles = np.linspace(outside, 0.0, N_SCAN_ANGLES)
         fractions = self.compute_coverage(angles)
@@ -220,11 +234,12 @@ def compute_center_axes(directions: assets.Float64Array) -> assets.Float64Array:
     Rows are right, up and forward.
 
     Args:
-        directions: (N, 3) of the silhouette's points, from the camera.
+        directions: (N, 3) unit directions of the silhouette's points.
     """
     forward = directions.mean(axis=0)
     forward = forward / max(float(np.linalg.norm(forward)), 1e-12)
-    # forward is never straight up: it is in front of the camera
+    # (0, 1, 0) is up. `forward` is never parallel to it, as it is in front of the
+    # camera.
     right = np.cross((0.0, 1.0, 0.0), forward)
     right = right / max(float(np.linalg.norm(right)), 1e-12)
     return np.stack([right, np.cross(forward, right), forward])
@@ -243,12 +258,14 @@ def find_angle_outside(
     occluder covers any direction of the image.
 
     Args:
-        directions: (N, 3) directions spread over the full image.
-        rim: (M, 3) directions at the edge of the image.
-        cover: silhouette of the occluder, as of `Passage`.
-        axes: as of `Passage`.
-        direction: side that it comes from, as of `Passage`.
+        directions: (N, 3) unit directions spread over the full image.
+        rim: (M, 3) unit directions at the edge of the image.
+        cover: silhouette of the occluder, straight ahead of the camera.
+        axes: (3, 3) rows right, up and forward of a camera that looks at the target.
+        direction: side that the occluder comes from, in degrees: 0 is the right, 90 the
+            top.
     """
+    # the largest angles of the occluder and of the image from their centers
     corners = cover.window.corners()
     occluder_radius = float(np.arccos(np.clip(corners[:, 2], -1.0, 1.0)).max())
     image_radius = float(np.arccos(np.clip(rim @ axes[2], -1.0, 1.0)).max())

@@ -118,7 +118,7 @@ class Waypoints:
         Returns:
             (...,) or (..., k).
         """
-        # of the waypoint after the time; the last one, if there is none after it
+        # index of the first waypoint after the time, or of the last waypoint
         index = torch.searchsorted(self.times, time.detach(), right=True)
         index = index.clamp(1, len(self.times) - 1)
         begin = self.times[index - 1]
@@ -132,9 +132,9 @@ class Waypoints:
     def interpolate_rotation(self, time: Tensor) -> Tensor:
         """Return the camera's rotation (..., 3, 3) at times (...,).
 
-        Its columns are the camera's right, down and ahead. Between waypoints,
-        quaternions are interpolated linearly and normalized. There have to be
-        `rotations`.
+        Its columns are the directions right, down and ahead of the camera. Between
+        waypoints, quaternions are interpolated linearly and normalized. The path must
+        have `rotations`.
         """
         assert self.rotations is not None
         quaternion = self.interpolate(time, self.rotations)
@@ -272,10 +272,14 @@ class PathControl(Control):
         return (*cls.parameters, choice)
 
     def check_choices(self) -> None:
-        """Read the paths, and check the choices that go with them.
+        """Read the paths, and check the other choices against them.
 
-        Files state their times; so `seconds` must not be set beside one with times, nor
-        `reach` if all paths are files.
+        The choice `path` has one name or several, e.g. "orbit" or "drive.csv". A file
+        with times states its duration, so `seconds` must not be set as well; `reach`
+        must not be set if all paths are files.
+
+        Raises:
+            InputError: choices contradict each other or the files.
         """
         names = _split_paths(self.chosen["path"])
         if len(set(names)) < len(names) or len(names) > MAX_PATHS:
@@ -306,8 +310,10 @@ class PathControl(Control):
     ) -> None:
         """Raise InputError if a choice is set that the paths state themselves.
 
-        `names` are those of the paths; `are_all_files` is whether no movement is one of
-        `PATHS`.
+        Args:
+            names: names of the paths, e.g. "orbit" or "drive.csv".
+            are_all_files: whether every movement is from a file, none a named one such
+                as "orbit".
         """
         has_single_path = any(MOVER_SEPARATOR not in name for name in names)
         if "moves" in self._settings and not has_single_path:
@@ -325,8 +331,10 @@ class PathControl(Control):
             self._check_not_set("reach")
 
     def _check_not_set(self, setting: str) -> None:
-        """Check that a choice which files state is not set. Raises InputError: it
-        is.
+        """Check that a choice is not set, because the files of the paths state it.
+
+        Raises:
+            InputError: it is set.
         """
         if setting in self._settings:
             raise InputError(
@@ -335,10 +343,12 @@ class PathControl(Control):
             )
 
     def _read_path(self, name: str) -> MovementByMover:
-        """Return what camera and object do on the path of a name.
+        """Return the movement of the camera, the object or both on a path.
 
-        The name is one path for whatever `moves` states, or, with a "+" between two
-        paths, the camera's and the object's. A path is one of `PATHS` or a file.
+        Args:
+            name: a path, e.g. "orbit" or "drive.csv", for what the choice `moves`
+                states; or two with a "+" between them, e.g. "approach+orbit": the
+                camera's and the object's.
         """
         names = [name]
         halves = name.split(MOVER_SEPARATOR)
@@ -365,9 +375,12 @@ class PathControl(Control):
         return movements
 
     def _check_trajectory_choices(self) -> None:
-        """Check that choices about trajectories are set only if there is a trajectory.
+        """Check that choices such as `axes` and `up` are set only with a trajectory.
 
-        Raises InputError: they are set without one.
+        A trajectory is a file of camera poses (TUM, EuRoC or KITTI).
+
+        Raises:
+            InputError: one is set without a trajectory.
         """
         needless = [
             name for name in TRAJECTORY_CHOICES if self.chosen[name] is not None
@@ -380,7 +393,11 @@ class PathControl(Control):
             )
 
     def _check_object_at(self) -> None:
-        """Check the position of the object in a file's world. Raises InputError."""
+        """Check the choice `object_at`, the object's position in a file's world.
+
+        Raises:
+            InputError: it is set, and is not three finite numbers.
+        """
         position = self.chosen["object_at"]
         if position is None:
             return
@@ -396,7 +413,11 @@ class PathControl(Control):
     def _read_file(self, path: Path, mover: str, is_single: bool) -> MovementByMover:
         """Read the file of a path: a trajectory, or a table of waypoints.
 
-        `is_single` is whether the file may also state what the object does.
+        Args:
+            path: the file.
+            mover: "camera" or "object", which moves along it.
+            is_single: whether no other file is about the object, so that a file about
+                the camera may state the object's movement too.
         """
         text = _read_text(path)
         trajectory = read_trajectory(path, text)
@@ -413,7 +434,12 @@ class PathControl(Control):
     def _read_camera_path(self, path: Path, trajectory: Trajectory) -> Waypoints:
         """Return the path of the camera on a trajectory.
 
-        Its notes say what the file does not state.
+        Its notes list what the file does not state and was assumed, and warn if the
+        camera seems to be tilted.
+
+        Args:
+            path: the file, for messages.
+            trajectory: what was read from it.
         """
         # choices that were left out by name, with the defaults taken for them
         assumed = dict[str, str]()
@@ -451,8 +477,13 @@ class PathControl(Control):
     ) -> assets.Float64Array:
         """Return the times (n,) of a trajectory, in seconds.
 
-        KITTI's poses have none: they are spread evenly over `seconds`, or come at
-        KITTI's rate, which is added to `assumed`.
+        A KITTI file has no times. Its poses are spread evenly over the choice
+        `seconds`, or else follow each other at the rate of KITTI's camera.
+
+        Args:
+            trajectory: the trajectory.
+            assumed: defaults by the name of the choice; the rate is added if it is
+                used.
         """
         if trajectory.times is not None:
             return trajectory.times
@@ -471,11 +502,18 @@ class PathControl(Control):
     ) -> tuple[assets.Float64Array, Rotation | None]:
         """Return a trajectory's positions and rotations in a world whose z is up.
 
-        Choices that the user left out get defaults, which are added to `assumed` by
-        name. See `Trajectory.orient` for the results.
+        Args:
+            path: the file, for messages.
+            trajectory: what was read from it.
+            assumed: defaults by the name of the choice; those that are used here, for
+                choices that the user left out, are added.
+
+        Returns:
+            Positions (n, 3) relative to the object, in the file's unit, and rotations;
+            None if the file has none or they are not used.
 
         Raises:
-            InputError: axes are set for a file without rotations.
+            InputError: the file has no rotations, and `axes` asks to ignore them.
             FileFormatError: it is too far from the object.
         """
         axes = str(self.chosen["axes"] or OPTICAL)
@@ -528,10 +566,11 @@ class PathControl(Control):
         return shifted
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        """Add notes on the files, and check the paths in the scene.
+        """Return the scene with notes on the files, after checking the paths in it.
 
-        Raises InputError: another control or camera has the camera, or a path is
-        impossible.
+        Raises:
+            InputError: something else fixes the camera, or the camera would be where it
+                looks.
         """
         if CAMERA in self._movers:
             self._check_camera_is_free(scene)
@@ -564,9 +603,10 @@ class PathControl(Control):
             )
 
     def _list_notes(self) -> list[str]:
-        """Return notes on the files, and one if the files of several paths end early.
+        """Return notes on the files, and one if they have different durations.
 
-        A frame is drawn from the duration of the longest.
+        Frames are drawn from the duration of the longest, so that on a shorter path
+        some frames show the end position.
         """
         notes = [note for waypoints in self._files for note in waypoints.notes]
         durations = [float(waypoints.times[-1]) for waypoints in self._files]
@@ -581,12 +621,17 @@ class PathControl(Control):
         return notes
 
     def _check_camera_off_target(self, name: str, movements: MovementByMover) -> None:
-        """Check that the camera is never at what it looks at, also between waypoints.
+        """Check that the camera is never at the point that it looks at.
 
-        The way is taken as straight between the checked times.
+        There it would have no direction. The vector from the camera to that point is
+        computed at many times, waypoints included, and taken as linear between them.
+
+        Args:
+            name: name of the path, for messages.
+            movements: movements of camera and object on it.
 
         Raises:
-            InputError: it is at some time.
+            InputError: the camera is there at some time.
         """
         waypoint_times = [
             movement.times
@@ -615,7 +660,14 @@ class PathControl(Control):
             )
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
-        """Return the time, with the path's range, and the clean time as its default."""
+        """Return the parameter for a scene: its range, and the time of the clean scene.
+
+        The clean time is the one at which camera and object are as the scene describes
+        them, e.g. the end of an approach. It is the default. The range is the duration.
+
+        Args:
+            parameter: the time; or the choice of a path, which is returned unchanged.
+        """
         if parameter.name == Control.PATH_PARAMETER:
             return parameter
         # The clean time is that of the first path's first movement. If that is an
@@ -637,7 +689,12 @@ class PathControl(Control):
     def scene_inputs(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return the poses of the camera, the object or both at the time."""
+        """Return the poses (4, 4) of the camera, the object or both at a time.
+
+        Args:
+            values: values of the control, "time" in seconds and the index of the path.
+            earlier_inputs: inputs of earlier controls, which are not used.
+        """
         time = values["time"] + self._time_shift
         movements = self._select_movements(values)
         start = get_start_poses(self.scene, time.device)
@@ -708,20 +765,21 @@ class PathControl(Control):
     ) -> tuple[Tensor, Tensor]:
         """Return where the camera is, and what it looks at.
 
-        It looks at the object, with its shift, unless a file says something else. Of
-        the named paths, approach comes straight ahead to where the camera stands, pass
-        goes straight past it from left to right, and orbit goes once around the object.
+        It looks at the moved object, unless a file says something else. On "approach"
+        it moves straight ahead and ends where the scene has it, on "pass" it moves past
+        that position from left to right, and on "orbit" once around the object.
 
         Args:
-            movements: what camera and object do.
-            scene_start: the scene as it is described.
+            movements: movements of camera and object; it may have none.
+            scene_start: poses of the scene as it is described.
             time: (...,) seconds.
-            shift: (..., 3) of the object.
+            shift: (..., 3) how far the object has moved, in object sizes.
 
         Returns:
-            Two positions (..., 3), object sizes.
+            The camera's position and the point that it looks at, (..., 3) each, in
+            object sizes.
         """
-        # the columns of the pose
+        # columns of the pose: the camera's x axis points to the left, y up, z ahead
         left, _, forward, start = scene_start.camera[:3].unbind(dim=1)
         center = scene_start.middle
         movement = movements.get(CAMERA)
@@ -749,9 +807,18 @@ class PathControl(Control):
     ) -> tuple[Tensor, Tensor]:
         """Return where the camera is on waypoints, and what it looks at.
 
-        It looks along its own rotation, if the waypoints have one; else at their
-        targets; else at the object. Arguments and results are those of
-        `_position_camera`, `center` is that of the object.
+        It looks along its rotation if the waypoints have rotations, otherwise at their
+        targets, otherwise at the object.
+
+        Args:
+            waypoints: waypoints of the camera, in metres from the object's center.
+            center: (3,) the object's center in the scene.
+            time: (...,) seconds.
+            shift: (..., 3) how far the object has moved.
+
+        Returns:
+            The camera's position and the point that it looks at, (..., 3) each, in
+            object sizes.
         """
         position = (
             center
@@ -771,17 +838,22 @@ class PathControl(Control):
     def _shift_object(
         self, movements: MovementByMover, scene_start: Start, time: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return how far the object is shifted and turned from where it stands.
+        """Return how far the object is shifted and turned from its pose in the scene.
 
-        Of the named paths, approach comes level towards the camera to where the object
-        stands, pass goes past that place from right to left, and orbit turns the object
-        once on the spot.
+        On "approach" it moves level towards the camera and ends where the scene has it,
+        on "pass" it moves past that position from right to left, and on "orbit" it
+        turns once about its own vertical.
+
+        Args:
+            movements: movements of camera and object; it may have none.
+            scene_start: poses of the scene as it is described.
+            time: (...,) seconds.
 
         Returns:
-            (..., 3) object sizes, and (...,) degrees.
+            The shift (..., 3) in object sizes, and the turn (...,) in degrees.
         """
         camera = scene_start.camera
-        # the columns of the pose
+        # columns of the pose: the camera's x axis points to the left, y up, z ahead
         left, _, forward, position = camera[:3].unbind(dim=1)
         movement = movements.get(OBJECT)
         no_shift = camera.new_zeros(3)
@@ -831,14 +903,14 @@ def _find_closest_to_origin(points: Tensor) -> tuple[Tensor, Tensor]:
     """Find where the segments of a polyline are closest to the origin.
 
     Args:
-        points: (n, 3) of the polyline.
+        points: (n, 3) corners of the polyline.
 
     Returns:
-        Of each segment the position from 0 to 1 along it, and the distance there, both
-            (n - 1,).
+        For each segment, the position of its closest point along it, from 0 to 1, and
+        the distance of that point; (n - 1,) each.
     """
     delta = points[1:] - points[:-1]
-    # not 0, for segments without a length
+    # a segment may have no length, and must not be divided by 0
     squared_length = delta.square().sum(dim=1).clamp_min(1e-300)
     fraction = (-(points[:-1] * delta).sum(dim=1) / squared_length).clamp(0.0, 1.0)
     return fraction, (points[:-1] + fraction[:, None] * delta).norm(dim=1)
@@ -856,17 +928,17 @@ def _turn_about_vertical(offset: Tensor, turns: Tensor) -> Tensor:
 
 
 def make_look_at_pose(position: Tensor, target: Tensor, roll: float) -> Tensor:
-    """Return the pose (4, 4) of a camera that looks at a target.
+    """Return the pose (4, 4) of a camera that looks at a target, with z up.
 
     Args:
-        position: (3,) of the camera.
-        target: (3,).
-        roll: degrees.
+        position: (3,) position of the camera.
+        target: (3,) point that it looks at.
+        roll: degrees by which it is turned about its viewing direction.
     """
     ahead = (target - position) / (target - position).norm().clamp_min(1e-9)
     level_left = torch.stack([-ahead[1], ahead[0], torch.zeros_like(ahead[0])])
     length = level_left.norm()
-    # for a camera that looks straight up or down, every level direction is to the left
+    # If it looks straight up or down, there is no level left: y is used.
     default_left = torch.tensor([0.0, 1.0, 0.0]).to(ahead)
     left = torch.where(length > 1e-6, level_left / length.clamp_min(1e-6), default_left)
     return _roll_camera(position, left, torch.linalg.cross(ahead, left), ahead, roll)
@@ -887,10 +959,12 @@ def make_camera_pose(position: Tensor, rotation: Tensor, roll: float) -> Tensor:
 def _roll_camera(
     position: Tensor, left: Tensor, up: Tensor, ahead: Tensor, roll: float
 ) -> Tensor:
-    """Return the pose (4, 4) of a camera that is turned about where it looks.
+    """Return the pose (4, 4) of a camera that is turned about its viewing direction.
 
-    `left`, `up` and `ahead` are its unit vectors (3,) before, at right angles; `roll`
-    is in degrees.
+    Args:
+        position: (3,) position of the camera.
+        left, up, ahead: (3,) its unit axes without roll, at right angles.
+        roll: degrees.
     """
     cos = math.cos(math.radians(roll))
     sin = math.sin(math.radians(roll))
@@ -920,9 +994,15 @@ def align_quaternions(quaternions: assets.Float64Array) -> assets.Float64Array:
 
 
 def check_times(path: Path, times: assets.Float64Array) -> None:
-    """Check times (n,) in seconds from the first on.
+    """Check the times of waypoints.
 
-    Raises FileFormatError: they are too few or many, or do not ascend within limits.
+    Args:
+        path: the file, for messages.
+        times: (n,) seconds, the first of which is 0.
+
+    Raises:
+        FileFormatError: they are too few or too many, do not ascend, follow each other
+            within less than `MIN_SECONDS`, or exceed `MAX_SECONDS`.
     """
     if not 2 <= len(times) <= MAX_WAYPOINTS:
         raise errors.FileFormatError(
@@ -943,9 +1023,9 @@ def make_object_pose(start: Start, shift: Tensor, heading: Tensor) -> Tensor:
     """Return the pose (4, 4) of an object that is turned and shifted.
 
     Args:
-        start: the scene as it is described.
-        shift: (3,) object sizes.
-        heading: () degrees about the vertical through its middle.
+        start: poses of the scene as it is described.
+        shift: (3,) shift in object sizes.
+        heading: () degrees by which it turns about the vertical through its center.
     """
     turn = geometry.make_euler_rotation(heading, *heading.new_zeros(2))
     center = start.middle
@@ -958,24 +1038,26 @@ def make_object_pose(start: Start, shift: Tensor, heading: Tensor) -> Tensor:
 def unwrap_headings(
     degrees: assets.Float64Array,
 ) -> tuple[assets.Float64Array, str | None]:
-    """Return headings (n,) of which each goes to the next the shorter way round, and a
-    note.
+    """Unwrap headings, so that each turns to the next in the shorter direction.
 
-    Only headings within one turn are changed: all in [0, 360] or all in [-180, 180],
-    with less than a full turn between them. A file with others counts turns itself. The
-    note is None if nothing changes.
+    From 350 to 10 degrees the object then turns by 20 degrees, not back by 340. Only
+    headings within one turn are changed: all in [0, 360] or all in [-180, 180], less
+    than 360 apart. A file with other headings counts full turns itself.
 
     Args:
-        degrees: (n,) headings, at the waypoints in turn.
+        degrees: (n,) headings at the waypoints, in order.
+
+    Returns:
+        The headings (n,), and a note for the user; None if nothing was changed.
     """
     low = float(degrees.min())
     high = float(degrees.max())
-    # steps for which the other way round is shorter
+    # steps for which the other direction is shorter
     jumps = np.nonzero(np.abs(np.diff(degrees)) > 180.0)[0]
     is_within_turn = (0.0 <= low and high <= 360.0) or (-180.0 <= low and high <= 180.0)
     if not len(jumps) or high - low >= 360.0 or not is_within_turn:
         return degrees, None
-    # of the first such step
+    # headings before and after the first such step, for the note
     first = f"{degrees[jumps[0]]:g}"
     last = f"{degrees[jumps[0] + 1]:g}"
     note = (
@@ -1014,7 +1096,11 @@ def _is_path(name: str) -> bool:
 
 
 def _read_text(path: Path) -> str:
-    """Read a file of waypoints, without a byte order mark. Raises FileFormatError."""
+    """Read a file of waypoints, without a byte order mark.
+
+    Raises:
+        FileFormatError: the file can't be read.
+    """
     try:
         return stored_files.read_text(
             path, "a table of waypoints", MAX_FILE_BYTES
@@ -1043,14 +1129,14 @@ def read_waypoints(
 
     Args:
         path: path of the file, for messages.
-        mover: the camera or the object, which the file is about.
-        text: text of a .csv file with the columns time, x, y, z, and look_x, look_y,
-            look_z or heading.
-        is_single_path: whether a file about the camera may say what the object does at
-            the same times.
+        mover: "camera" or "object", which the file is about.
+        text: text of a .csv file with the columns time, x, y, z, and perhaps look_x,
+            look_y, look_z (camera) or heading (object).
+        is_single_path: whether a file about the camera may also have the object's
+            movement at the same times.
 
     Returns:
-        The path of each that moves; times begin at 0.
+        The waypoints by mover; times begin at 0.
 
     Raises:
         FileFormatError: it is no table of numbers with the columns that a path needs,
@@ -1096,9 +1182,9 @@ def _make_object_waypoints(
     """Return what the object does in a file about the camera; None for nothing.
 
     Args:
-        column: the columns (n,) of the file by name.
+        column: columns (n,) of the file by name.
         seconds: (n,) times of the waypoints.
-        notes: the notes on the object's headings.
+        notes: notes on the object's headings.
     """
     shift = _stack_columns(column, OBJECT_SHIFT_COLUMNS)
     turn = _stack_columns(column, (OBJECT_HEADING_COLUMN,))
@@ -1126,7 +1212,16 @@ def _read_csv(path: Path, text: str) -> tuple[list[str], list[list[str]]]:
 
 
 def _check_header(path: Path, header: list[str], optional: tuple[str, ...]) -> None:
-    """Check the names of columns. Raises FileFormatError: some lack, or are unknown."""
+    """Check the names of the columns of a table of waypoints.
+
+    Args:
+        path: the file, for messages.
+        header: names of its columns.
+        optional: names of columns that it may have besides time, x, y and z.
+
+    Raises:
+        FileFormatError: a column is missing, unknown or there twice.
+    """
     required = (TIME_COLUMN, *POSITION_COLUMNS)
     names = set(header)
     is_missing = not set(required) <= names
@@ -1151,7 +1246,13 @@ def _parse_numbers(
 ) -> assets.Float64Array:
     """Return the numbers (rows, columns) of a table of waypoints.
 
-    Raises FileFormatError: it has too few or many rows, or something else than numbers.
+    Args:
+        path: the file, for messages.
+        header: names of its columns.
+        rows: cells of each row, as text.
+
+    Raises:
+        FileFormatError: it has too few or too many rows, or a cell is no number.
     """
     if not 2 <= len(rows) <= MAX_WAYPOINTS:
         raise errors.FileFormatError(

@@ -104,7 +104,7 @@ class Trajectory:
         Args:
             axes: axes of the sensor, a key of `SENSOR_AXES`, or `NO_AXES`.
             up: what is up in the file's world, a key of `WORLD_TO_Z_UP`.
-            origin: (3,) in the file's world.
+            origin: (3,) the object's position in the file's world.
 
         Returns:
             Positions (n, 3) from the origin; rotations from a camera's axes (x
@@ -123,10 +123,10 @@ class Trajectory:
 def read_trajectory(path: Path, text: str) -> Trajectory | None:
     """Read the poses in the text of a file; None if it is in none of the formats.
 
-    The lines before the first row of numbers may be headers, also as comments ("#");
-    the last one with the columns of a trajectory counts. Without a header, rows of 8
-    numbers are TUM's and rows of 12 are KITTI's. A table with another header is None: a
-    table of waypoints, for example.
+    Lines before the first row of numbers may be headers, also as comments ("#"). The
+    last one that names the columns of a trajectory is used. Without a header, rows of 8
+    numbers are TUM's and rows of 12 are KITTI's. For a table with another header, e.g.
+    of waypoints, the result is None.
 
     Raises:
         FileFormatError: rows of different lengths, numbers that are not finite,
@@ -161,7 +161,10 @@ def _read_unnamed_columns(
 ) -> Trajectory:
     """Read a table without a header: 8 columns are TUM's, and 12 are KITTI's.
 
-    `has_commas` is whether commas are between the columns, which is EuRoC's way.
+    Args:
+        path: the file, for messages.
+        rows: cells of each row, as text.
+        has_commas: whether commas separate the columns, as in EuRoC's files.
 
     Raises:
         FileFormatError: it has commas, or other columns.
@@ -216,9 +219,9 @@ def _find_column(name: str) -> str | None:
 def _find_columns(names: Sequence[str]) -> dict[str, int]:
     """Return the index of each column of a trajectory by our names for them.
 
-    These are time, x, y, z, and perhaps qx, qy, qz and qw. Empty if it is no such
-    table: one that lacks a time, a position or a part of a quaternion, has a column
-    twice, or is a table of waypoints.
+    The names are time, x, y, z, and perhaps qx, qy, qz and qw. The result is empty if
+    the table is no trajectory: if the time, a coordinate or a part of the quaternion is
+    missing, a column is there twice, or it is a table of waypoints.
     """
     # time, x, y and z at least
     if not 4 <= len(names) <= MAX_COLUMNS:
@@ -242,7 +245,11 @@ def _find_columns(names: Sequence[str]) -> dict[str, int]:
 def _read_table(
     path: Path, rows: Sequence[Sequence[str]], count: int
 ) -> assets.Float64Array:
-    """Return a table of numbers (rows, count). Raises FileFormatError: it is none."""
+    """Return a table of numbers (rows, count).
+
+    Raises:
+        FileFormatError: a row has another length, or a cell is no finite number.
+    """
     for row in rows:
         if len(row) != count or not all(map(reading.is_number, row)):
             raise errors.FileFormatError(
@@ -260,8 +267,14 @@ def _read_named_columns(
 ) -> Trajectory:
     """Read a table whose columns have the names of TUM or EuRoC.
 
-    With commas it is EuRoC's. Times are converted to seconds from the first on. Columns
-    that are not known are left out, with a note.
+    Times are converted to seconds after the first pose. Unknown columns are left out,
+    with a note.
+
+    Args:
+        path: the file, for messages.
+        names: names of the columns.
+        rows: cells of each row, as text.
+        has_commas: whether commas separate the columns, as in EuRoC's files.
     """
     columns = _find_columns(names)
     table = _read_table(path, rows, len(names))
@@ -284,8 +297,19 @@ def _read_named_columns(
 def _find_time_unit(
     path: Path, name: str, times: assets.Float64Array, notes: list[str]
 ) -> str:
-    """Return the unit of a column of times; note it where the name does not state
-    it.
+    """Return the unit of a column of times, such as "ns".
+
+    If the column's name does not state it, it is guessed from the size of the times,
+    and a note is added.
+
+    Args:
+        path: the file, for messages.
+        name: name of the column, e.g. "timestamp [ns]".
+        times: (n,) times as in the file.
+        notes: notes for the user; it may be extended.
+
+    Raises:
+        FileFormatError: the stated unit is unknown.
     """
     stated = UNIT.search(name)
     if stated:
@@ -320,7 +344,11 @@ def _check_quaternions(path: Path, quaternions: assets.Float64Array) -> None:
 
 
 def _read_kitti(path: Path, rows: Sequence[Sequence[str]]) -> Trajectory:
-    """Read KITTI's poses. Raises FileFormatError: a matrix is no rotation."""
+    """Read KITTI's poses: in each row a matrix (3, 4), a rotation and a shift.
+
+    Raises:
+        FileFormatError: a matrix is no rotation.
+    """
     poses = _read_table(path, rows, 12).reshape(-1, 3, 4)
     matrices = poses[:, :, :3]
     # A rotation times its transpose is the identity. So is a reflection, which has a

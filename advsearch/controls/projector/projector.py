@@ -213,7 +213,11 @@ class ProjectorControl(PictureControl):
     )
 
     def check_choices(self) -> None:
-        """Check that pattern, picture and ball go together. Raises InputError."""
+        """Check that the choices of pattern, picture and norm ball fit each other.
+
+        Raises:
+            InputError: a picture is set together with a choice about searched texels.
+        """
         self._check_pattern()
         picture = self.chosen["picture"]
         if picture is None:
@@ -236,9 +240,12 @@ class ProjectorControl(PictureControl):
             )
 
     def _check_pattern(self) -> None:
-        """Check that the pattern, if it is set, has its full range.
+        """Check that the pattern, if it is set, has its full range [0, 1].
 
-        Raises InputError: it has another one.
+        A narrower range is stated by `epsilon`.
+
+        Raises:
+            InputError: it has another range.
         """
         pattern = self._settings.get("pattern")
         if isinstance(pattern, (list, tuple)):
@@ -255,10 +262,11 @@ class ProjectorControl(PictureControl):
     # ---- in a scene
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        """Add the projector, and a remark if the place's brightness has no unit.
+        """Return the scene with the projector.
 
-        By default its field of view covers the object from where the projector stands
-        at the start, `MAX_DEFAULT_FOV` at most.
+        By default its field of view is as wide as the object seen from the projector at
+        the start, at most `MAX_DEFAULT_FOV`. A remark is added if the scene's
+        brightness has no unit, as lumens can't be compared with it then.
         """
         picture = self.read_picture()
         if picture is None:
@@ -290,8 +298,8 @@ class ProjectorControl(PictureControl):
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
         """Return a parameter with its default in this scene.
 
-        By default the projector stands beside the scene's camera, as far away and as
-        high.
+        By default the projector has the distance and the elevation of the scene's
+        camera, and another azimuth, by `DEFAULT_CAMERA_ANGLE`.
         """
         parameter = super().resolve_parameter(parameter)
         scene = self.scene
@@ -357,7 +365,10 @@ class ProjectorControl(PictureControl):
         return float(self.get_clean_value("distance"))
 
     def fit(self) -> None:
-        """Find the projector in the scene, and how often it flashes."""
+        """Find the projector's part of the scene, and its largest flash rate.
+
+        The rate, `flashes`, is the upper bound of the parameter "flicker".
+        """
         (self.part,) = (
             part
             for part in self.scene.parts
@@ -374,8 +385,10 @@ class ProjectorControl(PictureControl):
             self.flashes = max(map(float, self.list_allowed_values("flicker", 0.0)))
 
     def read_picture(self) -> Tensor | None:
-        """Return the image of the `picture` file. Raises InputError: a side has one
-        texel.
+        """Return the image (h, w, 3) sRGB of the `picture` file, or None.
+
+        Raises:
+            InputError: a side has only one texel.
         """
         picture = super().read_picture()
         if picture is not None and min(picture.shape[:2]) < 2:
@@ -418,9 +431,10 @@ class ProjectorControl(PictureControl):
     def scene_inputs(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return the projector's pose and its light, which is 0 while it flashes off.
+        """Return the projector's pose and the light of its texels.
 
-        The light is radiance of the scene at a distance of one unit.
+        The light is 0 while a flickering projector is off. It is in the scene's unit of
+        radiance, at a distance of one scene unit from the projector.
         """
         pose = make_projector_pose(
             self.scene,
@@ -493,16 +507,18 @@ class ProjectorControl(PictureControl):
 
 
 def blur_light(light: Tensor, blur: Tensor) -> Tensor:
-    """Return an image (h, w, 3) after a Gaussian blur; there is no light outside it.
+    """Return an image (h, w, 3) after a Gaussian blur; outside of it is no light.
 
-    `blur` () is the standard deviation in texels; differentiable in both.
+    Args:
+        light: (h, w, 3) linear light.
+        blur: () standard deviation in texels. The result is differentiable in both.
     """
     sigma = float(blur.detach())
     if not sigma and not blur.requires_grad:
         return light
     radius = math.ceil(3.0 * sigma) + 1
     offsets = torch.arange(-radius, radius + 1).to(blur)
-    # not 0, where the derivative is undefined; 0.1 texels blur nothing visible
+    # at least 0.1 texels, which is invisible: the derivative is undefined at 0
     kernel = torch.exp(-0.5 * (offsets / blur.clamp_min(0.1)) ** 2)
     kernel = (kernel / kernel.sum()).expand(3, 1, 1, -1)
     blurred_rows = functional.conv2d(
@@ -524,9 +540,9 @@ def make_projector_pose(
 
     Args:
         scene: scene with the object.
-        azimuth: degrees.
-        elevation: degrees.
-        distance: as `ProjectorControl` has it.
+        azimuth: degrees around the object's center.
+        elevation: degrees over the object's center.
+        distance: metres from the object's center; object sizes if it has no size.
     """
     left, up, outwards = torch.from_numpy(
         geometry.compute_camera_axes(azimuth, elevation, 0.0)

@@ -139,11 +139,11 @@ class SpotControl(ProjectorControl):
         self.chosen = {"aspect": 1.0, "picture": None, **self.chosen}
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
-        """Return a parameter; lumens are searched up to what is bright in this scene.
+        """Return a parameter for the scene.
 
-        That is `MAX_AMBIENT_FACTOR` times the ambient light, for a spot of the default
-        width. The default of the lumens is 0; but it is that maximum if only other
-        parameters are searched, which would not show without light.
+        Lumens are searched from 0 to `MAX_AMBIENT_FACTOR` times the ambient light, for
+        a spot of the default width. Their default is 0. But if only other parameters
+        are searched, it is that maximum, because a spot without light has no effect.
         """
         if parameter.name != "lumens":
             return super().resolve_parameter(parameter)
@@ -166,9 +166,9 @@ class SpotControl(ProjectorControl):
         """Return the round spot (h, w, 3) as it is thrown, linear.
 
         It is a Gaussian in the plane through the object's center, scaled so that its
-        light does not depend on the width.
+        total light does not depend on the width.
         """
-        # of the projector's image in the plane through the object's center
+        # half the width of the projector's image in that plane, object sizes
         half_width = (
             math.tan(math.radians(self.part.fov) / 2.0)
             * values["distance"].detach()

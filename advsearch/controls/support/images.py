@@ -77,10 +77,12 @@ def to_image(stack: Tensor) -> Tensor:
 
 
 def warp(image: Tensor, offsets: Tensor) -> Tensor:
-    """Look every pixel of an image (H, W, C) up at another position.
+    """Look every pixel of an image up at another position.
 
-    `offsets` is (H, W, 2), pixels to the right and down; positions outside are mirrored
-    inwards.
+    Args:
+        image: (H, W, C).
+        offsets: (H, W, 2) from each pixel to that position, in pixels to the right and
+            down. Positions outside of the image are mirrored inwards.
     """
     height, width = image.shape[:2]
     rows, columns = torch.meshgrid(
@@ -132,8 +134,8 @@ def draw_noise(
 def rotate_map(radiance: Tensor, degrees: Tensor) -> Tensor:
     """Rotate a map (H, W, 3) about the vertical, as `environment.rotation` does.
 
-    Its columns are interpolated linearly and go round. Differentiable in both
-    arguments; exact at whole columns.
+    Columns wrap around, and are interpolated linearly. The result is differentiable in
+    both arguments. A rotation by a full number of columns is exact.
     """
     columns = radiance.shape[1]
     shift = torch.remainder(degrees / 360.0, 1.0) * columns
