@@ -237,7 +237,11 @@ LOSSES = {
 
 
 def make_check_view(result: CheckResult) -> ShownResult:
-    """Return the view of a check."""
+    """Return the view of a check.
+
+    It has tables of derivatives, of the model's gradients, of the plan of a search, and
+    of what that plan leaves out.
+    """
     sections = [ResultPart(text=[READING] if result.rows else [])]
     for loss, title in LOSSES.items():
         derivatives = [

@@ -45,11 +45,11 @@ class PairImages:
     def list_examples(
         self, first: Side, second: Side, pair_number: int
     ) -> Iterator[PairPicture]:
-        """Yield pairs of which one prediction is right, the largest margin gaps first.
+        """Yield pairs in which only one prediction is right, largest differences first.
 
-        There are at most as many in favor of either side as the setting `pictures`
-        says. Their images are stored in the run; a pair of which one cannot be has
-        none.
+        The difference is that of the margins. The setting `pictures` limits the number
+        of pairs in favor of each side. Their images are stored in the run. If one image
+        of a pair cannot be stored, the pair has none.
 
         Args:
             first, second: the sides, with rows in the same order.

@@ -164,6 +164,9 @@ def make_lessons(
 ) -> list[Lesson]:
     """Make lessons from views of one scene, each with its own sampled conditions.
 
+    A lesson holds what one training step needs of a scene: an image with its right
+    classes, and the worse images that the step chooses from.
+
     Args:
         problem: the scene with the controls that make it harder.
         n_views: number of views that have worst images.
@@ -173,8 +176,11 @@ def make_lessons(
             light transport does not give the images (see `sample_configurations`). None
             renders each view twice: with a single control changed, and with all of
             them.
-        shares_texture: whether the views have one adversarial texture.
+        shares_texture: whether one adversarial texture is optimized for all views, in
+            place of one for each view.
     """
+    # With a matrix of light transport an image is a linear function of the texture, so
+    # the texture can be optimized in each training step without a render.
     has_matrix = bool(n_views) and problem.is_linear
     lessons = list[Lesson]()
     with torch.no_grad(), problem.renderer.scene.limit_depth(MAX_DEPTH):
@@ -196,13 +202,20 @@ def _make_texture_lessons(
 ) -> list[TextureLesson]:
     """Make a lesson with a matrix of light transport for each view of a scene.
 
-    Each view has conditions of its own. Its texture begins at a random extreme
-    configuration. With `shares_texture` that is one tensor for all views, which a step
-    of one of them changes for all.
+    Each view has sampled conditions of its own. Its texture starts at a random
+    configuration whose values are all at a bound. With `shares_texture` all lessons
+    hold the same tensor, so that a step of one of them changes the texture of all.
+
+    Args:
+        problem: the scene with the controls that are searched.
+        views: number of views, which is the number of lessons.
+        seed: root of the samples.
+        shares_texture: whether all views share one texture.
     """
     right_classes = _find_right_classes(problem)
     domain = problem.domain
-    # Lessons do not hold the scene, which takes much memory.
+    # The lessons stay in memory for the full training, so they do not hold the scene,
+    # which is large.
     space = replace(problem.searched_space, scene=None)
     full_space = replace(problem.space, scene=None)
     shared_texture = _sample_texture(domain, seed)
@@ -245,6 +258,12 @@ def _make_rendered_lessons(
     With `n_tries` the plain image is that of the start, and there are as many others.
     Without it, the plain image has one random control changed, and the only other image
     has all of them changed.
+
+    Args:
+        problem: the scene with the controls that are varied.
+        views: number of views, which is the number of lessons.
+        seed: root of the samples.
+        n_tries: number of random configurations of each view, or None.
     """
     right_classes = _find_right_classes(problem)
     render = problem.renderer.copy_with(quick=True)
@@ -399,8 +418,9 @@ def search_worse_images(
 def _update_losses(batch: Sequence[Lesson], model: Model) -> None:
     """Compute the losses of all images of the lessons that have several rendered ones.
 
-    The images of all these lessons are evaluated as one batch, and their losses divided
-    among the lessons again.
+    The images of all these lessons are evaluated as one batch, which is faster. Each
+    lesson then gets the losses of its own images (K,), so that the worst of them can be
+    selected. A lesson with a single image has nothing to select.
     """
     rendered_lessons = [
         lesson
@@ -419,6 +439,8 @@ def _update_losses(batch: Sequence[Lesson], model: Model) -> None:
     for lesson, lesson_losses in zip(
         rendered_lessons, losses.split(n_images), strict=True
     ):
+        # `clone`, as `split` returns views that keep the losses of all lessons in
+        # memory.
         lesson.losses = lesson_losses.clone()
 
 
@@ -429,7 +451,8 @@ def ascend_textures(
 ) -> None:
     """Take steps of steepest ascent with the textures of lessons, in place.
 
-    Views that share a texture sum up their gradients. Other lessons are unchanged.
+    Gradients of views that share a texture are summed, and the texture takes one step.
+    Lessons without a texture do not change.
 
     Args:
         selected: the lessons.
@@ -451,6 +474,7 @@ def ascend_textures(
             texture_id = id(lesson.texture)
             gradient_sums[texture_id] = gradient + gradient_sums.get(texture_id, 0.0)
         for texture_id, lesson in lesson_of_texture.items():
+            # one unit step uphill, in the norm of the domain
             direction = lesson.domain.steepest(
                 lesson.texture, gradient_sums[texture_id]
             )

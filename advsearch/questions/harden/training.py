@@ -109,9 +109,10 @@ class ClassifierTrainer(Trainer):
     ) -> list[Lesson]:
         """Make lessons of scenes.
 
-        A scene has lessons for each control with a matrix of light transport, and
-        lessons for all other controls together, which are rendered. In the training
-        there are more, of further scenes: a new scene teaches more than one more view.
+        Controls of textures have a matrix of light transport: a scene has lessons for
+        each of them. All other controls together have lessons of rendered images. In
+        the training split there are also lessons of further scenes, as a new scene
+        teaches more than one more view of the same scene.
 
         Args:
             title: title of the stage that the progress reports.
@@ -132,13 +133,15 @@ class ClassifierTrainer(Trainer):
     def _matrix_jobs(self, split: str, scene_numbers: range) -> list[Job]:
         """Return the jobs that make lessons with a matrix of light transport.
 
-        There is one for each control that has such a matrix, and each scene. Only
-        scenes of the training may share a texture, or have other controls vary.
+        There is a job for each scene and each control that has such a matrix. Only in
+        scenes of the training split may views share a texture, or other controls vary.
 
         Args:
             split: name of the split.
             scene_numbers: numbers of its scenes.
         """
+        # numbers of views of each scene: in the training split, and in the validation
+        # split
         training_views, validation_views = self.n_views
         jobs = list[Job]()
         for control, number in itertools.product(
@@ -158,6 +161,7 @@ class ClassifierTrainer(Trainer):
                     number,
                     (control,),
                     views=n_views,
+                    # one view without a worst image, to keep the clean accuracy
                     plain=1,
                     shared=shares_texture,
                     varying_controls=(
@@ -360,17 +364,22 @@ class GradientComputer:
     ) -> None:
         """Make the worst images of lessons worse, and compute the gradient of the loss.
 
-        The gradient is left with the parameters. A further batch adds its mean loss.
+        The gradient is stored in `grad` of each parameter. A further batch adds its
+        mean loss. The batch is divided into parts, which are computed at the same time
+        on threads.
 
         Args:
             batch: the lessons.
-            further_batch: further images (N, H, W, 3) and class indices (N,).
+            further_batch: the user's own images (N, H, W, 3) and class indices (N,), or
+                None.
             seed: seed of the augmentation.
         """
         # Textures come first, so that both passes have the same parts.
         batch = sorted(batch, key=lambda lesson: not isinstance(lesson, TextureLesson))
         self._ascend_textures(batch, seed)
 
+        # Each part adds its sum, weighted with the counts of the full batch, so that
+        # the sum of the parts' gradients is the gradient of the means.
         # The loss is a mean over plain images plus one over worst images.
         plain_weight = 1.0 / len(batch)
         worst_weight = 1.0 / max(1, len(select_hard_lessons(batch)))
@@ -460,12 +469,13 @@ class GradientComputer:
     ) -> Tensor:
         """Return the loss of a part of a batch.
 
-        At times all rendered images are mixed with each other (mixup, Zhang et al.
-        2018, arXiv 1710.09412), since they stay the same; a texture is another one each
-        time.
+        In some steps all rendered images are mixed with each other (mixup, Zhang et al.
+        2018, arXiv 1710.09412). Rendered images stay the same in all epochs, so the
+        network could learn them by heart. Textures need no mixing, as they change in
+        each step.
 
         Args:
-            student: the network.
+            student: the network that is trained.
             part: the lessons, textures first.
             plain_weight: weight of each plain image.
             worst_weight: weight of each worst image.
@@ -488,8 +498,9 @@ class GradientComputer:
             plain_weight * losses[: len(part)].sum()
             + worst_weight * losses[len(part) :].sum()
         )
-        # Plain images of scenes that are not rendered twice: where a control changed,
-        # the original model is right without being sure.
+        # The student stays near the original model's predictions on plain images.
+        # Lessons that are rendered twice are left out: even their plain image has a
+        # changed control, on which the original model may be right but unsure.
         unchanged = _find_unrendered(part)
         if unchanged:
             divergence = self._divergence_from_original(
@@ -528,7 +539,7 @@ def _mix_images(
 
     Args:
         images: (N, H, W, 3), which are changed.
-        lesson_of_image: N of them.
+        lesson_of_image: the lesson that each image belongs to (N,).
         seed: seed of the choice whether they are mixed, of the partners and of the
             weight.
 
@@ -544,8 +555,10 @@ def _mix_images(
             for index, lesson in enumerate(lesson_of_image)
             if isinstance(lesson, RenderedLesson)
         ]
+    # All random numbers are drawn, whether images are mixed or not.
     partners = rng.permutation(mixed).astype(int).tolist()
     sampled_weight = float(rng.beta(MIXUP_BETA, MIXUP_BETA))
+    # At most 1/2, so that the image itself always has the larger weight.
     partner_weight = min(sampled_weight, 1.0 - sampled_weight)
     if mixed:
         images[mixed] = torch.lerp(images[mixed], images[partners], partner_weight)
@@ -564,9 +577,9 @@ def _find_unrendered(part: Sequence[Lesson]) -> list[int]:
 def _augment_images(part: Sequence[Lesson], seed: int) -> Tensor:
     """Return the plain images of lessons, then the worst ones, augmented (N, H, W, 3).
 
-    Plain images, worst textures and worst renders are augmented separately: so worst
-    textures change as they did in the search, without which they would no longer be
-    the worst.
+    The three groups are augmented separately, each with the same seed. So a worst
+    texture gets the same crop and colors as in the search that found it. Under another
+    augmentation it might no longer be the worst.
 
     Args:
         part: the lessons, textures first.

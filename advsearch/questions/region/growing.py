@@ -63,9 +63,10 @@ class VariedParameters:
 
 
 def find_region(context: RunContext[RegionConfig]) -> RegionResult:
-    """Load the problem, grow and check the box, and draw the map.
+    """Find the region around a configuration in which the prediction stays the same.
 
-    After an interrupt the result has no box.
+    That is to load the problem, to grow and check the box, and to draw the map. After
+    an interrupt the result has no box.
     """
     config = context.config
     stages = context.stages
@@ -136,7 +137,8 @@ def count_renders(verifier: workbench.Verifier) -> dict[str, int]:
 def find_varied(problem: Problem, config: RegionConfig) -> VariedParameters:
     """Find the parameters in which the box grows, and its center.
 
-    They are those of `vary`, or all that are searched but discrete choices.
+    They are the parameters that the setting `vary` names, or else all searched
+    parameters. A discrete choice has no interval and is left out.
 
     Raises:
         UnknownNameError: `vary` names a parameter that the controls do not search.
@@ -162,6 +164,7 @@ def find_varied(problem: Problem, config: RegionConfig) -> VariedParameters:
             f"map: expected two parameters in `vary`, got {len(names)}: "
             f"{', '.join(names)}"
         )
+    # their indices among the coordinates of a configuration
     coordinates = torch.tensor([coordinate_by_name[name] for name in names])
     return VariedParameters(names, coordinates, read_center(problem, config))
 
@@ -222,13 +225,21 @@ class RegionSearch:
         self._is_wrong_at_center = False
 
     def run(self) -> GrownRegion:
-        """Find the verdict at the center, grow the box, and draw the map."""
+        """Find the verdict at the center, grow the box, and draw the map.
+
+        The verdict is whether the model is right or wrong at the center; the box is
+        where it stays so.
+        """
         config = self._config
         verifier = self._verifier
         varied = self._varied
+        # enough samples per pixel that noise does not decide the prediction at the
+        # center
         verifier.choose_spp({"centre": varied.center})
         self._is_wrong_at_center = find_verdict(verifier, varied.center)
         if config.specialise:
+            # the number of images that may be rendered faster if the light is prepared
+            # once
             n_images = boxes.USUAL_PROBED * len(varied.names) + config.map**2
             workbench.prepare_surface_light(
                 verifier, varied.center, varied.coordinates, n_images
@@ -307,10 +318,10 @@ class RegionSearch:
 
 
 def find_verdict(verifier: workbench.Verifier, center: Tensor) -> bool:
-    """Return whether the model is wrong at the center.
+    """Return whether the model is wrong at the center, tried with several seeds.
 
     Raises:
-        InputError: that depends on the noise, or predictions are not numbers, or the
+        InputError: the prediction depends on the noise, or is not a number, or the
             object is not in the image.
     """
     verifier.stages.begin("verification", "looking at the centre", CENTER_TRIALS)
@@ -348,13 +359,14 @@ def describe_box(
 ) -> list[BoxSide]:
     """Return the range of each varied parameter inside the box, in its unit.
 
-    If no control describes a number, it is a fraction of the parameter's range. A
-    component of a vector is named ``NAME.INDEX``.
+    A range is in the unit that the parameter's control describes, such as degrees. If
+    no control describes it, it is a fraction of the parameter's range. A component of a
+    vector is named ``NAME.INDEX``, for example "camera.target.0".
 
     Args:
         problem: problem of the scene.
         grown: the box.
-        varied: its parameters.
+        varied: the parameters that the box has sides for.
     """
     low_values = problem.describe(varied.with_values(grown.low))
     high_values = problem.describe(varied.with_values(grown.high))
@@ -408,8 +420,8 @@ def draw_map(
     Args:
         verifier: verifier that evaluates the points.
         size: points along each axis.
-        varied: the parameters.
-        box: its sides.
+        varied: the two parameters that are the axes of the map.
+        box: the two sides of the box, in the same order.
         run: where the figure is saved.
     """
     rows = _measure_margins(verifier, size, varied)
@@ -439,6 +451,7 @@ def _measure_margins(
         "or `verify_spp` shorten it"
     )
     verifier.stages.begin("map", "drawing the map", size * size, hint=hint)
+    # A single point lies in the middle of the range.
     grid = torch.linspace(0.0, 1.0, size) if size > 1 else torch.tensor([0.5])
 
     def find_configuration(number: int) -> Tensor:

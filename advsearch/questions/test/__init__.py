@@ -47,14 +47,17 @@ def test(
 ) -> SuiteResult:
     """Test the claims of a suite, counterexamples first (docs/testing.md).
 
-    Files for other programs are written at the end.
+    The run stops at the first counterexample that fails, unless `all` is set. Reports
+    for other programs, such as JUnit XML and SARIF, are written at the end.
 
     Args:
-        suite: a YAML file.
+        context: the settings, which name the suite's file, and the run.
+        suite: content of a suite as Python mappings, in place of the file.
     """
     from advsearch.questions.test.carry_out import try_suite  # imports torch
 
     config = context.config
+    # checked before the test, which may take hours
     files: dict[str, Path] = {}
     for name in FILE_FORMATS:
         file = getattr(config, name)

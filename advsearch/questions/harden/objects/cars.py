@@ -59,13 +59,14 @@ def _outline(
 
     Args:
         angle: parameters of the points (N,), from -pi to pi; 0 is the front end.
-        front, rear: x of its ends.
+        front, rear: x of its front and its rear end.
         half_width: its extent along y and -y.
         power: power of the superellipse.
         center_x: x of its center.
     """
     cosine = np.cos(angle)
     sine = np.sin(angle)
+    # Points with a positive cosine are on the front half.
     half_length = np.where(cosine >= 0.0, front - center_x, center_x - rear)
     # x = a |cos|^(2/power) fulfils |x/a|^power + |y/b|^power = 1 with y likewise
     exponent = 2 / power
@@ -77,7 +78,10 @@ def _outline(
 def _shell(
     levels: Array, power: float, center_x: float, height: Height, corner: float
 ) -> list[Patch]:
-    """Create the painted patches of a stack of superellipses.
+    """Create the painted patches of a shell that follows a stack of superellipses.
+
+    The shell is cut into five charts, so that each is nearly flat and its texture is
+    hardly distorted.
 
     Args:
         levels: (R, 4), a row for each superellipse: its fraction of the height, half
@@ -360,7 +364,11 @@ def _opening(name: str) -> shapes.Field:
 
 
 def _body_and_cabin() -> list[Patch]:
-    """Create the body and the cabin with their openings."""
+    """Create the body and the cabin with their openings.
+
+    A row of levels is (fraction of the height, half the width, x of the front end, x of
+    the rear end), in metres.
+    """
     # levels of smaller and smaller outlines at the full height: they close body and
     # cabin at the top, but for a hole in the body under the cabin
     deck = [
@@ -719,7 +727,11 @@ FINISHES = {
 
 @family(metres=1.0, texels=384)
 def car(sampler: ParameterSampler) -> Instance:
-    """Make a car of random proportions and paint."""
+    """Make a car of random proportions and paint.
+
+    Lengths are in metres. `sampler(x, low=..., high=...)` returns x for the canonical
+    car and a uniform sample for a random one.
+    """
     color = sampler.sample_color(
         "2a5fa8", "b3202a", "d9dadb", "2f6f4f", "e0a02c", "3a3f45", p_random=0.2
     )
@@ -747,6 +759,8 @@ def car(sampler: ParameterSampler) -> Instance:
         shapes.stretch_patches(patches, stretch),
         paints,
         material=FINISHES["paint"],
+        # Fewer texels per length than for the paint where little is seen; more for the
+        # words on the plate.
         texel_density={
             "rubber": 0.3,
             "well": 0.15,
