@@ -88,7 +88,7 @@ class PairImages:
         """Store the images of rows: thumbnails of the sweeps, or else renderings.
 
         Args:
-            rows: indices of the pairs.
+            rows: indices of the pairs whose images are stored.
             sides: those with images of their own, by the letter in the file's name.
             files: files of each row, one for each of these sides.
             run: the run directory.

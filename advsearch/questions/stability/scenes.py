@@ -201,15 +201,17 @@ for word, value in (("negative", -1.0), ("infinite", math.inf), ("nan", math.nan
 
 
 def leave_plateau(low: float, high: float) -> CaseOutcome:
-    """Search for a darker picture from a white one, where no gradient points the way.
+    """Search for a darker picture from a white one, where the gradient is zero.
 
-    The way out is a lower exposure.
+    All pixels are clipped at white, so the loss is constant near the start. Policies
+    have to find a lower exposure without a gradient.
 
     Args:
-        low, high: range of the exposure, stops. Up to about 4 something in the picture
-            is not white.
+        low, high: range of the exposure in stops. Below about 4 stops some pixels are
+            not white.
     """
     renderer = make_renderer({"camera": {"exposure": [low, high]}})
+    # the highest exposure, as 1 is the upper bound of each range
     start = torch.ones_like(renderer.start)
     start_query = workbench.Query(start, 0, gradient=True)
     checks = []
@@ -337,8 +339,9 @@ def look_through_glass() -> CaseOutcome:
 
 @register_case("materials", "texels-0-and-1")
 def texels_at_the_ends() -> CaseOutcome:
-    """Texels at the ends of the range have a gradient, and the search moves them
-    inwards only.
+    """Check that texels at the bounds of their range have a gradient.
+
+    The search has to move them inwards only. The texture is a checkerboard of 0 and 1.
     """
     controls = {"texture": {"resolution": 8, "epsilon": 0.2}}
     renderer = make_renderer(controls, make_checkered_mug)
@@ -681,7 +684,12 @@ register_cases(
 
 @register_case("geometry", "million-triangles", slow=True)
 def million() -> CaseOutcome:
-    """Finite, right, and like the coarse mesh of the same shape."""
+    """Check a mesh of a million triangles.
+
+    Its gradient has to be finite and right, and its image like that of a coarse mesh of
+    the same shape.
+    """
+    # 1000 columns and 501 rows give about 2 * 1000 * 500 triangles.
     fine_mesh = assets.normalise_mesh(workbench.make_sphere(501, 1000))
     coarse_mesh = assets.normalise_mesh(workbench.make_sphere(64, 128))
     coarse = make_renderer(SHIFT, make_checkered_object(coarse_mesh))
@@ -708,8 +716,10 @@ def million() -> CaseOutcome:
 
 @register_case("geometry", "gimbal-angles", slow=True)
 def gimbal() -> CaseOutcome:
-    """At a pitch of 90 degrees the gradients by angles and by the rotation vector are
-    right.
+    """Check gradients at a pitch of 90 degrees, the gimbal lock of Euler angles.
+
+    There, yaw and roll rotate about the same axis. The gradients by angles and by the
+    rotation vector both have to be right.
     """
     angles = {
         "pose": {
@@ -748,7 +758,10 @@ def gimbal() -> CaseOutcome:
 
 
 def full_turn(controls: ControlSettings) -> CaseOutcome:
-    """Check that 0 and 360 degrees are the same, in picture, gradient and steps.
+    """Check that 0 and 360 degrees are the same angle.
+
+    Image and gradient have to be equal, and a step past 360 degrees has to continue at
+    0.
 
     Args:
         controls: a control with one angle, whose range is 0 to 360 degrees.
@@ -773,7 +786,7 @@ def full_turn(controls: ControlSettings) -> CaseOutcome:
             slope_difference / float(zero_slope.abs().max()),
             most=0.05,
         ),
-        # to 0.01, but for rounding
+        # A step of 0.01 past the end goes to 0.01, except for rounding.
         check_range(
             "where a step of 0.01 past the end goes",
             float(past_end.max()),
@@ -805,7 +818,9 @@ for control, name in (
 
 
 def run_cases(context: RunContext[StabilityConfig]) -> StabilityResult:
-    """Run cases of the suite in order, until the end, the time is over, or Ctrl-C.
+    """Run cases of the suite in order.
+
+    The run ends with the last case, when its time is over, or with Ctrl-C.
 
     The result of a case is stored at once: a resumed run continues with the next.
     """
@@ -880,8 +895,9 @@ def estimate_hessian(
 ) -> Tensor:
     """Estimate second derivatives (k, k), float64, of an objective f by differences.
 
-    They are central, of steps h: (f(+) - 2 f + f(-)) / h^2 on the diagonal, and (f(++)
-    - f(+-) - f(-+) + f(--)) / (4 h_i h_j) elsewhere.
+    These are central differences with steps h. On the diagonal they are (f(+) - 2 f +
+    f(-)) / h^2, elsewhere (f(++) - f(+-) - f(-+) + f(--)) / (4 h_i h_j), where + and -
+    are steps forwards and backwards along the directions i and j.
 
     Args:
         value: the objective f.
@@ -947,8 +963,10 @@ def _measure_shift_slope(half_width: float) -> float:
 
 @register_case("stiff", "light-rotation-texel", slow=True)
 def light_rotation_texel() -> CaseOutcome:
-    """All three move, the condition number is printed, and the objective's unit does
-    not matter.
+    """Search over a light, a rotation and texels, whose units and curvatures differ.
+
+    All three have to move, and the path must not depend on the unit of the objective.
+    The condition number of the Hessian is reported.
     """
     controls: ControlSettings = {
         "light": {"type": "point", "power": [0.0, 12.0], "x": 1.0, "y": -1.0, "z": 2.0},
@@ -959,6 +977,7 @@ def light_rotation_texel() -> CaseOutcome:
     u = renderer.start.clone()
     u[:2] = torch.tensor([0.5, 0.1])  # power and rotation; texels follow
     hessian = _estimate_three_curvatures(renderer, u)
+    # Derivatives by u become derivatives by watts: one watt is 1/12 of the range.
     # from the unit box to watts, degrees and sRGB
     from_unit_box = torch.diag(torch.tensor([1.0 / 12.0, 1.0 / 360.0, 1.0]).double())
     path, _ = _record_path(renderer, u, 1.0)
@@ -1050,11 +1069,11 @@ register_cases(
 
 @register_case("noise", "heavy-tails-of-a-moving-mesh", slow=True)
 def heavy_render(count: int = 24) -> CaseOutcome:
-    """The plan takes differences of the loss for what moves a mesh, which have no heavy
-    tail.
+    """Check that the derivatives by a moving mesh have no heavy tail.
 
-    Of so many Gaussian numbers fewer than one lot in 1,000 has one farther from the
-    median than 12 median distances.
+    The plan takes secants, that is differences of the loss. The farthest sample may be
+    at most 12 median distances from the median. For 24 Gaussian samples, that is
+    exceeded less than once in 1,000 trials.
     """
     controls = {"pose": {"x": [-0.3, 0.3]}}
     renderer = make_renderer(controls).copy_with(transfer="linear")

@@ -34,7 +34,17 @@ def make_table(
 def _make_model_table(
     rows: Sequence[TwinRow], surroundings: Sequence[str], model: str, task: str
 ) -> list[results.TwinAgreement]:
-    """Return the part of a table that is about one model."""
+    """Return the rows of a table that are about one model.
+
+    There is a row over all objects, one for each object if there are several, and one
+    for each condition, such as "night".
+
+    Args:
+        rows: rows of the model.
+        surroundings: names of the surroundings of twins, such as environments.
+        model: name of the model.
+        task: title of the task.
+    """
     objects = sorted({row.object for row in rows})
     conditions = sorted({row.condition for row in rows if row.condition})
     groups: list[tuple[str, str, Sequence[TwinRow]]] = [("", "", rows)]
@@ -67,11 +77,14 @@ def count_agreement(
     object_name: str = "",
     condition: str = "",
 ) -> results.TwinAgreement:
-    """Return how far photographs and twins agree, with intervals over frames.
+    """Count how often a model is right in both photograph and twin, or in neither.
+
+    Intervals are over frames, as objects in one frame are not independent. `kappa` of
+    the result is Cohen's kappa: agreement beyond chance.
 
     Args:
         rows: at least one, of one model.
-        surroundings: surroundings of the twins.
+        surroundings: name of the twins' surroundings, such as an environment.
         model: name of the model, for the result.
         task: title of the task, for the result.
         object_name: name that all rows share; empty where they have several.
@@ -268,8 +281,15 @@ def _cut_factor(
 ) -> Iterator[FactorPart]:
     """Yield the parts of a factor with values (n,) of its rows.
 
-    A part is the rows between two quantiles of the values. There is none if quantiles
-    coincide, as those of a constant do.
+    A factor is a property of the photographs, such as the object's size. A part has the
+    rows between two quantiles of its values. There are no parts if quantiles coincide,
+    as those of a constant do.
+
+    Args:
+        name, unit: name and unit of the factor.
+        values: value of the factor in each row (n,).
+        rows: the rows.
+        surroundings: name of the twins that are compared with the photographs.
     """
     edges = np.quantile(values, np.linspace(0.0, 1.0, N_PARTS + 1))
     if len(np.unique(edges)) <= N_PARTS:
