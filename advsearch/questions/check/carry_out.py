@@ -281,7 +281,14 @@ class GradientCheck:
     def _measure_cosines(
         self, problem: Problem, bench: gradients.Bench, seed: int, title: str
     ) -> Iterator[results.Measured]:
-        """Yield the cosines of gradients with converged ones, by samples per pixel."""
+        """Yield the cosines of gradients with converged ones, by samples per pixel.
+
+        Args:
+            problem: problem of the search.
+            bench: measures gradients, and stores them.
+            seed: seed of the renders.
+            title: title of the progress.
+        """
         plan = problem.renderer.plan
         # not fewer samples than the search has
         larger_counts = tuple(

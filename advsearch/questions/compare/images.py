@@ -150,10 +150,10 @@ def _round_values(side: Side, row: int) -> dict[str, str | float]:
 
 
 def select_examples(first: Side, second: Side, limit: int) -> list[int]:
-    """Return the indices of the pairs in which one side alone is right.
+    """Return the indices of the pairs in which only one side is right.
 
-    At most `limit` are those of the first side, and as many those of the second. The
-    largest differences of the margins come first; unknown ones count as 0.
+    There are at most `limit` pairs for each side. The largest differences of the
+    margins come first; an unknown difference counts as 0.
     """
     margin_gap = (first.rows["margin"] - second.rows["margin"]).fillna(0.0)
     only_first = first.is_right & ~second.is_right

@@ -517,7 +517,14 @@ class DetectorTrainer(Trainer):
 def _annotate(
     annotation_id: int, image_id: int, box: Sequence[float], label: int
 ) -> dict[str, Any]:
-    """Return COCO's annotation of a box (x0, y0, x1, y1)."""
+    """Return the annotation of a box in COCO's format: corner, width and height.
+
+    Args:
+        annotation_id: number of the annotation in the file.
+        image_id: number of the image in the file.
+        box: x0, y0, x1, y1 in pixels.
+        label: index of the class.
+    """
     left, top, right, bottom = box
     width = right - left
     height = bottom - top
@@ -538,6 +545,11 @@ def write_images(
 
     Yields:
         Each item with the name of its image, without ".png".
+
+    Args:
+        run: run directory.
+        directory: directory of the images inside the run.
+        items: items with their images.
     """
     for number, item in enumerate(items, 1):
         (run.path / directory).mkdir(parents=True, exist_ok=True)

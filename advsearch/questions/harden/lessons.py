@@ -325,10 +325,16 @@ def sample_configurations(
 ) -> Tensor:
     """Sample configurations (count, d) at random.
 
-    In half of them each value is moved by chance to the nearer bound of its range, as
-    searches end where several values are at bounds. Choices and periodic values have no
-    bounds. The controls change each by itself in turn, then all together, then the
-    first by itself again; a control that does not change is at its start.
+    In about half of the configurations, each value is moved with probability 1/2 to the
+    nearer bound of its range, since searches often end with values at bounds. Choices
+    and periodic values have no bounds. Sample by sample, the first control changes
+    alone, then the second, and so on, then all together, and then the first again. A
+    control that does not change has its start values.
+
+    Args:
+        domain: the searched space with its bounds.
+        generator: source of randomness.
+        count: number of configurations.
     """
     samples = domain.sample(generator, count)  # (count, d)
     is_at_bound = torch.rand(samples.shape, generator=generator) < 0.5
@@ -514,6 +520,12 @@ def save_lesson_images(
     ``.png`` of each image, a ``.cls`` with the index of its class, and a ``.json`` with
     that and the kind of image. Members have no time and no owner, so that equal images
     make equal files.
+
+    Args:
+        run: run directory.
+        number: number of the round.
+        selected: lessons of the round.
+        labels: names of the model's classes.
     """
     for index, lesson in enumerate(selected):
         class_index = lesson.right_classes[0]

@@ -84,7 +84,15 @@ class Trainer(ABC):
         optimiser: MakeOptimizer | None = None,
         custom_items: Sequence[Any] = (),
     ) -> None:
-        """Set up the trainer, of which the class describes the arguments."""
+        """Set up the trainer.
+
+        Args:
+            work: samples scenes and items of the run.
+            student: the copy of the network that is trained.
+            optimiser: function from a list of parameters to an optimizer; None for
+                AdamW.
+            custom_items: the user's own items, which each round trains on.
+        """
         self.work = work
         self.config = work.config
         self.student = student
@@ -241,7 +249,8 @@ def _interpolate(
 ) -> dict[str, Tensor]:
     """Return weights between the original (0) and the trained ones (1).
 
-    Those that are no floats, such as counters, are the trained ones.
+    Tensors that are not floating point, such as counters of batches, are the trained
+    ones.
     """
     interpolated = {
         name: torch.lerp(original[name], weight, interpolation)

@@ -414,10 +414,11 @@ def load_scene_work(config_fields: Mapping[str, Any]) -> SceneJobs:
 
 
 def attack_scene(config: AttackConfig, scene: workbench.Scene, model: Model) -> str:
-    """Attack a scene, and return the status; see `SceneJobs.attack_held_out`.
+    """Attack a scene, and return the status of the model there.
 
-    That is how the attack ended, if it found something or the scene is wrong already;
-    "unsteady" if the clean scene is right in too few trials to be called robust.
+    It is "found" if the attack found an adversarial scene, and "already wrong" if the
+    model is wrong on the clean scene. Otherwise it is `ROBUST`, or "unsteady" if the
+    model is right in too few trials of the clean scene.
     """
     summary = workbench.attack_on(config, scene, model).summary
     if summary.ending == results.INTERRUPTED:

@@ -94,7 +94,18 @@ class ClassifierTrainer(Trainer):
         optimiser: MakeOptimizer | None = None,
         beside: Examples | None = None,
     ) -> None:
-        """Set up the trainer, of which the class describes the arguments."""
+        """Set up the trainer.
+
+        Args:
+            work: samples lessons from scenes.
+            student: the copy of the network that is trained.
+            optimiser: function from a list of parameters to an optimizer; None for
+                AdamW.
+            beside: batches of the user's own images and class indices. Each step also
+                trains with one of them.
+        """
+        # numbers of views of a scene: the setting in training, and 2 in the validation,
+        # which only compares weights
         super().__init__(work, student, optimiser)
         self.n_views = (self.config.views, 2)
         self.beside = beside
@@ -298,7 +309,15 @@ def _make_job(
 ) -> Job:
     """Return the job that makes lessons of a scene.
 
-    The arguments are those of `SceneJobs.sample_lessons`.
+    A job is called by a worker, which has the scenes.
+
+    Args:
+        split: name of the split of scenes.
+        number: number of the scene.
+        controls: controls that make the views harder together.
+        views: number of views with worst images.
+        plain: number of further views of the plain scene.
+        **options: further arguments of `SceneJobs.sample_lessons`.
     """
     return partial(
         SceneJobs.sample_lessons,
@@ -517,6 +536,11 @@ class GradientComputer:
         """Return the Kullback-Leibler divergence from the original model's predictions.
 
         It is summed over the images (N, H, W, 3) that the original model gets right.
+
+        Args:
+            images: images (N, H, W, 3).
+            logits: the student's logits for them (N, classes).
+            right: right classes of each image.
         """
         with torch.no_grad():
             original_logits = self._original_model(images)

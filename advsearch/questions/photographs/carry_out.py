@@ -297,7 +297,12 @@ class Photographs:
     def _add_loose(self, run: Path, data: bytes, source: str) -> None:
         """Evaluate a photograph without a rendering; only predictions are stored.
 
-        It is cut to the size of each model's images. Arguments as for `_add`.
+        It is cut to the size of each model's images.
+
+        Args:
+            run: directory of the run.
+            data: the image file as bytes.
+            source: where the photograph comes from, which is stored with it.
         """
         with RunDirectory.resume(run) as resumed_run:
             number = resumed_run.store.get_last_step(LOOSE_PHOTO) + 1
@@ -404,7 +409,8 @@ class _PhotoEvaluator:
         It is resized in 8 bits with Lanczos' filter, which averages where it shrinks.
 
         Args:
-            rendering, object_name: as for `find_truth`.
+            rendering: name of the rendering that the image belongs to; None without.
+            object_name: name of the object; None for the first one.
             data: the image file.
         """
         with Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "WEBP")) as image:

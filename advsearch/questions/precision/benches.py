@@ -187,8 +187,14 @@ def take_reference_parts(
 ) -> list[Part]:
     """Return as many independent parts of a reference as fit into a budget.
 
-    Each has its own seed. There are at least two, whatever they take: without these,
-    nothing is known about the error. At most there are `MAX_REFERENCE_PARTS`.
+    Each has its own seed. There are at least two, however long they take, as the error
+    is estimated from their difference. There are at most `MAX_REFERENCE_PARTS`.
+
+    Args:
+        take_part: computes a part with a seed.
+        budget: time of all parts.
+        on_done: called after each part.
+        seed: root of the seeds.
     """
     parts: list[Part] = []
     expected_seconds = 0.0  # of the next part
@@ -629,6 +635,11 @@ class GradientBench:
     ) -> tuple[ReferenceValue, int]:
         """Compute the reference by differences at two steps along each coordinate.
 
+        Args:
+            budget: time of the reference.
+            seed: seed of the renders.
+            on_done: called after each part.
+
         Returns:
             The reference, and the samples per pixel of each of its parts.
         """
@@ -769,7 +780,15 @@ class GradientBench:
 def _make_row(
     quantity: str, name: str, value: ReferenceValue, spp: int, control: str = ""
 ) -> PrecisionReference:
-    """Make the row of a reference in the result."""
+    """Make the row of a reference in the result.
+
+    Args:
+        quantity: "picture", "margin" or "gradient".
+        name: name of the sampler or the estimator.
+        value: the reference and its error.
+        spp: samples per pixel of each part.
+        control: name of the control; empty for images.
+    """
     return PrecisionReference(
         quantity=quantity,
         control=control,

@@ -204,6 +204,13 @@ class QuantityMeasurer:
     def __init__(
         self, config: PrecisionConfig, problem: Problem, progress: Progress
     ) -> None:
+        """Choose renderer and loss, and plan what is measured.
+
+        Args:
+            config: the settings.
+            problem: problem of an attack, whose scene, controls and model are measured.
+            progress: gets the stages.
+        """
         self._config = config
         self.problem = problem
         self._progress = progress

@@ -472,8 +472,14 @@ def _solve_line(
 ) -> tuple[float | None, str]:
     """Return the samples at which a fitted line reaches a goal, and their basis.
 
-    The line is log error = offset + slope * log samples. The samples are at least the
-    smallest measured number, and None beyond `MAX_EXTRAPOLATION` times the largest.
+    The line is log(error) = offset + slope * log(samples), which is solved for the
+    samples. They are at least the smallest number that was measured, and None if they
+    exceed `MAX_EXTRAPOLATION` times the largest.
+
+    Args:
+        line: the fitted line.
+        ordered: its points, by ascending samples.
+        goal: relative error that has to be reached.
     """
     samples = math.exp((math.log(goal) - line.offset) / line.slope)
     smallest = float(ordered[0].spp)

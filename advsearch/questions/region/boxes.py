@@ -136,6 +136,13 @@ class GrowingBox:
     """
 
     def __init__(self, is_same: IsSame, center: Tensor, seed: int) -> None:
+        """Start with a box that is only the center.
+
+        Args:
+            is_same: function that tells whether a point has the center's prediction.
+            center: center in [0, 1] (d,).
+            seed: seed of the random points.
+        """
         self._is_same = is_same
         self._center = center
         self._seed = seed

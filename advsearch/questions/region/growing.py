@@ -217,6 +217,13 @@ class RegionSearch:
         verifier: workbench.Verifier,
         varied: VariedParameters,
     ) -> None:
+        """Prepare the search for the box.
+
+        Args:
+            context: the settings and the run.
+            verifier: renders and evaluates points.
+            varied: the parameters that the box has sides for.
+        """
         self._config = context.config
         self._run = context.run
         self._verifier = verifier
@@ -473,7 +480,13 @@ def _measure_margins(
 def find_ranges(
     problem: Problem, varied: VariedParameters, box: Sequence[BoxSide]
 ) -> list[AxisRange]:
-    """Return the full range of each of two parameters, in its unit if it has one."""
+    """Return the full range of each of two parameters, in its unit if it has one.
+
+    Args:
+        problem: problem of the scene.
+        varied: the two parameters.
+        box: the sides of the box, whose names and units are used.
+    """
     low_values = problem.describe(varied.with_values(torch.full((2,), 0.0)))
     high_values = problem.describe(varied.with_values(torch.full((2,), 1.0)))
     ranges = []
@@ -491,7 +504,13 @@ def find_ranges(
 def draw_margins(
     axes: Any, rows: list[list[float]], x_range: AxisRange, y_range: AxisRange
 ) -> None:
-    """Draw margins and the line at which the verdict changes on matplotlib axes."""
+    """Draw margins and the line at which the verdict changes on matplotlib axes.
+
+    Args:
+        axes: axes of matplotlib.
+        rows: margins on the grid, row by row from the lowest.
+        x_range, y_range: ranges of both parameters.
+    """
     extent = (x_range.low, x_range.high, y_range.low, y_range.high)
     x_title = figures.format_axis_title(x_range.name, x_range.unit)
     y_title = figures.format_axis_title(y_range.name, y_range.unit)

@@ -158,8 +158,8 @@ def same_render(
 ) -> ReplayCondition:
     """Return a condition that uses the run's images as they are, or changes them.
 
-    With the samples of the run's verification they are not rendered again for it: all
-    such conditions have the same `light` and `source`.
+    All such conditions have the same `light` and `source`, so they share their renders.
+    With the samples per pixel of the verification nothing is rendered again for them.
     """
     return ReplayCondition(
         name,

@@ -244,8 +244,8 @@ class Cycles:
     def radiance(self, inputs: Mapping[str, Tensor], seed: int, spp: int) -> Tensor:
         """Render linear radiance (H, W, 3), as `MitsubaScene.radiance` does.
 
-        A process of Blender goes on as long as the inputs stay the same; for others a
-        new one is started.
+        A process of Blender is used as long as the inputs stay the same. For other
+        inputs a new process is started.
 
         Raises:
             BlenderError: Blender stopped, or took too long.
@@ -479,6 +479,14 @@ class _Process:
         meshes: bytes,
         radiance: np.ndarray | None,
     ) -> None:
+        """Write the scene to a temporary directory, and start Blender.
+
+        Args:
+            program: command that starts Blender.
+            blender_settings: camera, lamps and image size for the script.
+            meshes: meshes as a glTF file.
+            radiance: environment map (H, W, 3), linear; None for none.
+        """
         self._temporary = tempfile.TemporaryDirectory(prefix="advsearch-cycles-")
         self._directory = Path(self._temporary.name)
         self._log = self._directory / "log.txt"
@@ -494,7 +502,13 @@ class _Process:
         meshes: bytes,
         radiance: np.ndarray | None,
     ) -> None:
-        """Write the files that the script reads, and the script itself."""
+        """Write the files that the script reads, and the script itself.
+
+        Args:
+            blender_settings: camera, lamps and image size.
+            meshes: meshes as a glTF file.
+            radiance: environment map (H, W, 3), linear; None for none.
+        """
         settings_text = json.dumps(blender_settings)
         (self._directory / "scene.json").write_text(settings_text, "utf-8")
         (self._directory / "scene.glb").write_bytes(meshes)

@@ -193,6 +193,7 @@ class ReplayResult(views.InNotebook, results.SceneResult):
 
     @property
     def brief(self) -> str:
+        """Where the adversarial scene holds, in a few words for lists of runs."""
         if self.transfer is not None:
             return (
                 f"holds in {self.transfer.holding} of {self.transfer.clean_right} "

@@ -261,7 +261,13 @@ def _count_verdicts(
     criterion: float,
     selected_axes: Sequence[str],
 ) -> str:
-    """Describe in how many conditions a criterion is met, not met, or open."""
+    """Describe in how many conditions a criterion is met, not met, or open.
+
+    Args:
+        verdict_of_condition: "met", "not met" or "open" for each condition.
+        criterion: minimum fraction of right predictions.
+        selected_axes: names of axes whose values the user selected.
+    """
     counts = Counter(verdict_of_condition.values())
     return (
         f"At least {wording.percent(criterion)}, each condition by its own 95 % "
@@ -275,7 +281,13 @@ def _count_verdicts(
 def _criterion_of_claims(
     claims: Sequence[views.Claim], criterion: float, selected_axes: Sequence[str]
 ) -> list[str]:
-    """Describe for each claimed fraction of right predictions if a criterion is met."""
+    """Describe for each claimed fraction of right predictions if a criterion is met.
+
+    Args:
+        claims: claims of the run.
+        criterion: minimum fraction of right predictions.
+        selected_axes: names of axes whose values the user selected.
+    """
     remark = ""
     if selected_axes:
         remark = (
@@ -1145,6 +1157,11 @@ def _describe_stored_run(
 
     The recorded settings are the run's own first, then those of its claims, then those
     of the runs.
+
+    Args:
+        folder: directory of the run.
+        result: its result.
+        claims: its claims.
     """
     read_paths = [
         *find_read_sweeps(result),
@@ -1268,7 +1285,13 @@ def _describe_limits(
     *,
     is_weighted: bool,
 ) -> list[str]:
-    """Describe what a reader must not conclude from a run."""
+    """Describe what a reader must not conclude from a run.
+
+    Args:
+        claims_of_photographs: claims that compare photographs with renderings.
+        domain: what varied and what was fixed, by the part of the domain.
+        is_weighted: whether fractions were weighted by exposure.
+    """
     n_compared = sum(
         claim.extent.total for claim in claims_of_photographs if claim.extent
     )

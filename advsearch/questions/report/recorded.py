@@ -228,6 +228,11 @@ def collect_settings(
     """Return the settings of a run, of its claims, and of the runs that it read.
 
     Claims are those of a suite that were tested, with its counterexamples.
+
+    Args:
+        folder: directory of the run.
+        result: its result.
+        read: directories of the runs that it read.
     """
     recorded = [RecordedSettings("", read_run_settings(folder))]
     for kind, settings_by_name in (read_noted_settings(folder, result) or {}).items():

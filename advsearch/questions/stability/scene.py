@@ -310,7 +310,13 @@ def _compare_images(
     other: gradients.Renderer,
     bounds: Bounds,
 ) -> Check:
-    """Check the mean difference of an image from that of another scene's start."""
+    """Check the mean difference of an image from that of another scene's start.
+
+    Args:
+        renderer, start: renderer and configuration of the first image.
+        other: renderer of the second image, at its own start.
+        bounds: lower and upper bound of the mean absolute difference.
+    """
     difference = mean_difference(
         render_image(renderer, start), render_image(other, other.start)
     )

@@ -71,10 +71,10 @@ DARKNESS = make_gray_environment(0.0)
 
 
 def exposure_case(control: str, low: float, high: float) -> dict[str, object]:
-    """Return arguments of `check_scene` at the end of a range of exposures, stops.
+    """Return arguments of `check_scene` at the extreme end of a range of exposures.
 
-    That is the upper end of positive ones, the lower end of negative ones. The exposure
-    is the first value of the configuration.
+    It is the upper end of a range of positive exposures (in stops), and the lower end
+    of a range of negative ones. The exposure is the first value of the configuration.
     """
     is_upper_end = high > 0.0
     return {
@@ -1025,7 +1025,13 @@ def _estimate_three_curvatures(renderer: gradients.Renderer, u: Tensor) -> Tenso
 def _record_path(
     renderer: gradients.Renderer, u: Tensor, scale: float
 ) -> tuple[Tensor, str]:
-    """Search with a scaled objective; return the path (steps, d) and the status."""
+    """Search with a scaled objective; return the path (steps, d) and the status.
+
+    Args:
+        renderer: renderer of the scene.
+        u: configuration at which the search starts (d,).
+        scale: factor on the objective, which must not change the path.
+    """
     loss = gradients.make_smooth_loss(renderer.formation.resolution)
     path: list[Tensor] = []
     result = run_search(

@@ -47,8 +47,8 @@ def test(
 ) -> SuiteResult:
     """Test the claims of a suite, counterexamples first (docs/testing.md).
 
-    The run stops at the first counterexample that fails, unless `all` is set. Reports
-    for other programs, such as JUnit XML and SARIF, are written at the end.
+    Claims are not tested if a counterexample fails, unless `all` is set. Reports for
+    other programs, such as JUnit XML and SARIF, are written at the end.
 
     Args:
         context: the settings, which name the suite's file, and the run.

@@ -270,7 +270,13 @@ class _SuiteRun:
     def _make_untested(
         self, claim: PlannedClaim, reason: str, cause: Cause | None = None
     ) -> ClaimResult:
-        """Make the result of a claim that is not tested, or not yet."""
+        """Make the result of a claim that is not tested, or not yet.
+
+        Args:
+            claim: the claim.
+            reason: reason why it is not tested; empty if it is about to be tested.
+            cause: kind of that reason; None without.
+        """
         text = ""
         if claim.example is None:
             text = describe_claim(self.tester.suite.claims[claim.name], claim.config)
@@ -481,7 +487,10 @@ def _select_claims(
 def _plan_example(
     example: Counterexample, suite: Suite, changes: Mapping[str, object]
 ) -> PlannedClaim:
-    """Plan the test of a counterexample, which may not suit the model."""
+    """Plan the test of a counterexample.
+
+    If it does not suit the suite's model, the reason is stored, and it is not tested.
+    """
     refusal = ""
     try:
         config = example.make_config(suite, changes)

@@ -487,7 +487,13 @@ class ClaimTester:
     def _make_change(
         self, claim: ChangeClaim, config: SceneConfig, problem: Problem
     ) -> ChangePicture:
-        """Return the function that changes the picture of a query as claimed."""
+        """Return the function that changes the picture of a query as claimed.
+
+        Args:
+            claim: a claim about predictions under a change, such as a blurred picture.
+            config: settings of the scene.
+            problem: problem of the model under test.
+        """
         if claim.when != workbench.WITHOUT_OBJECT:
             return lambda query, picture: workbench.change_image(
                 picture, claim.when, problem.model.cameras
@@ -745,7 +751,13 @@ def _evaluate_batch(
     other_side: _OtherSide,
     batch: Sequence[workbench.Query],
 ) -> tuple[Iterable[policies.Evaluation], Iterable[policies.Evaluation]]:
-    """Return the evaluations of both sides of a batch of queries."""
+    """Return the evaluations of both sides of a batch of queries.
+
+    Args:
+        journal: evaluates the model under test, and stores the rows.
+        other_side: what the model is compared with.
+        batch: the queries.
+    """
     pictures: dict[int, Tensor | None] | None = {}
     if other_side.change is None:
         pictures = None

@@ -596,7 +596,8 @@ def _write_form(
         base: path of the file without suffix.
         values: content of the file except for the blocks.
         blocks: offsets of each block from the clean scene.
-        signs, square: the form; see `FORMS`.
+        signs: whether only signs of large blocks are stored.
+        square: side of the squares of texels that share a value.
     """
     stored = [_Block.quantize(block, signs, square).model_dump() for block in blocks]
     text = json.dumps({**values, "blocks": stored}, indent=1)

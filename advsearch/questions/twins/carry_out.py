@@ -123,7 +123,13 @@ class ModelJudge:
     def predict(
         self, frame: str, twin: rendering.Twin, facts: tasks.Facts
     ) -> Iterator[TwinPrediction]:
-        """Yield the predictions about the photograph and its twins."""
+        """Yield the predictions about the photograph and its twins.
+
+        Args:
+            frame: name of the frame, which may have its own model.
+            twin: the images of the object.
+            facts: facts of the scene, from which the task finds the ground truth.
+        """
         truth = self.task.truth(facts)
         self._calibrate_once(twin, truth)
         model = self._model_of_frame.get(frame, self.model)
@@ -214,6 +220,13 @@ class Comparison:
     def __init__(
         self, context: RunContext[TwinsConfig], judges: Sequence[ModelJudge]
     ) -> None:
+        """Prepare the comparison.
+
+        Args:
+            context: context of the run.
+            judges: judges of the models, at least one; all take images of the same
+                size.
+        """
         self._context = context
         self._config = context.config
         self._judges = judges
@@ -455,7 +468,14 @@ class Comparison:
         layer: Any,
         renderer: Any,
     ) -> rendering.Twin:
-        """Render an object in the environment, and return all images of it."""
+        """Render an object in the environment, and return all images of it.
+
+        Args:
+            number: number of the object.
+            selection: all selected objects and their windows.
+            layer: the object rendered into the photograph.
+            renderer: renders it in the environment.
+        """
         item = selection.objects[number]
         window = selection.windows[number]
         environment = self._config.environment_name
@@ -607,6 +627,7 @@ def parse_frames(text: str | None) -> Callable[[str], bool]:
 
     def is_used(frame: str) -> bool:
         # "scene/000012" and "000012.png" both have the number "000012".
+        """Return whether the frame is selected by its name or its number."""
         number = frame.rpartition("/")[2].partition(".")[0]
         if frame in names or number in names:
             return True

@@ -159,7 +159,14 @@ def estimate_kappa(
 def estimate_margin_correlation(
     photos: Sequence[TwinPrediction], twins: Sequence[TwinPrediction], units: IntArray
 ) -> results.Estimate | None:
-    """Return the rank correlation of margins; None where it has no interval."""
+    """Return the rank correlation of margins in photographs and twins.
+
+    It is None if it has no interval, for example if there are too few frames.
+
+    Args:
+        photos, twins: predictions on both, in the same order.
+        units: number of the frame of each row (n,).
+    """
     first = np.array([photo.margin for photo in photos])
     second = np.array([twin.margin for twin in twins])
     is_known = np.isfinite(first) & np.isfinite(second)

@@ -256,7 +256,13 @@ def _read_bop_silhouette(
 def _read_bop_object(
     where: str, entry: Mapping[str, Any], models: Path
 ) -> dict[str, Any]:
-    """Return object, mesh and pose of an entry of the ground truth."""
+    """Return object, mesh and pose of an entry of the ground truth.
+
+    Args:
+        where: place in the file, for messages.
+        entry: entry of the object.
+        models: directory of the meshes.
+    """
     number = entry.get("obj_id")
     if not isinstance(number, int) or not 0 <= number <= MAX_OBJECT_NUMBER:
         raise errors.FileFormatError(f"{where}: expected obj_id, a whole number")
@@ -422,7 +428,16 @@ def _check_keys(row: Mapping[str, Any], where: str) -> None:
 
 
 def _get_file(row: Mapping[str, Any], key: str, path: Path, where: str) -> Path:
-    """Return a file that a row names, which lies in the list's folder or below."""
+    """Return the path of a file that a row names.
+
+    It has to be in the directory of the list or below: a list may come from others.
+
+    Args:
+        row: values of the row by name.
+        key: name of the value, such as "mask".
+        path: path of the list.
+        where: the list and the row, for messages.
+    """
     name = str(row[key])
     file = path.parent / name
     if "\0" in name or not reading.is_inside(file, path.parent):

@@ -186,6 +186,18 @@ class LayerRenderer:
         seed: int,
         is_matched: bool = True,
     ) -> None:
+        """Load the object and its environment, and make the renderer.
+
+        Args:
+            asset: the object, with z up and its front at +x.
+            unit: unit of its file, such as "mm".
+            light: name of the environment that lights it.
+            film: (height, width) of the renders in pixels.
+            spp: samples per pixel.
+            seed: seed of the noise.
+            is_matched: whether the object gets the noise and the blur of the
+                photograph.
+        """
         self._asset = asset
         self._spp = spp
         self._seed = seed
@@ -241,8 +253,8 @@ class LayerRenderer:
     ) -> dict[str, Tensor]:
         """Return the inputs by which a render becomes a window of a photograph.
 
-        They are its pixels, noise and blur, what hides the object, and the exposure in
-        stops over that of the renderer.
+        They are the photograph's pixels, noise and blur, a mask of what hides the
+        object, and the exposure in stops relative to that of the renderer.
         """
         front = read_front(item, photograph)
         in_window = replace(photograph, crop=window, front=front)
@@ -268,6 +280,16 @@ class SurroundedRenderer:
         spp: int,
         seed: int,
     ) -> None:
+        """Load the object in its environment, and make the renderer.
+
+        Args:
+            asset: the object, with z up and its front at +x.
+            unit: unit of its file, such as "mm".
+            environment: name of the environment that surrounds it.
+            film: (height, width) of the renders in pixels.
+            spp: samples per pixel.
+            seed: seed of the noise.
+        """
         self._asset = asset
         self._spp = spp
         self._seed = seed
@@ -278,8 +300,12 @@ class SurroundedRenderer:
     def render(
         self, item: PhotographedObject, window: PhotoWindow, number: int = 0
     ) -> Tensor:
-        """Render the object as a photograph shows it, sRGB (h, w, 3) of the film's
-        size; arguments as for `LayerRenderer.render`.
+        """Render the object in the environment, sRGB (h, w, 3) of the film's size.
+
+        Args:
+            item: the object, with its pose and the camera of the photograph.
+            window: window of the photograph around the object.
+            number: number of the row, from which the seed of the noise is derived.
         """
         renderer = self._renderer
         inputs = renderer.scene.assembly(make_camera_inputs(item, self._asset, window))
@@ -346,7 +372,10 @@ def _compute_visible_coverage(
     window: PhotoWindow,
     layer: Layer,
 ) -> Tensor:
-    """Return what an object covers of a window (h, w), less what hides it, in [0, 1]."""
+    """Return how much of each pixel a visible object covers (h, w), in [0, 1].
+
+    Parts that other things hide in the photograph do not count.
+    """
     front = read_front(item, photograph)
     if front is None:
         return layer.alpha
@@ -520,9 +549,10 @@ def load_mask(path: Path, window: PhotoWindow) -> Tensor:
 def measure_pose(
     item: PhotographedObject, twin: Twin, window: PhotoWindow
 ) -> float | None:
-    """Return how far a twin's silhouette agrees with the data set's, as IoU.
+    """Return how well a twin's silhouette agrees with that of the data set.
 
-    It is that of masks, or else of their boxes; None where there is neither.
+    It is the intersection over union (IoU) of the masks, or else of the boxes. It is
+    None if the data set has neither. A low value means that the pose is wrong.
     """
     covered = twin.coverage > 0.5
     if item.mask is not None:

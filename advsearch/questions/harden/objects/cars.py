@@ -120,8 +120,13 @@ def _shell(
 def _outline_angles(levels: Array, power: float, center_x: float) -> Array:
     """Return angles (C,) of columns that are evenly spaced along the widest outline.
 
-    C is `COLUMNS` + 1: the first and the last are the middle of the rear. The arguments
-    are those of `_shell`.
+    C is `COLUMNS` + 1: the first and the last column are the middle of the rear.
+
+    Args:
+        levels: (R, 4), a row for each outline: fraction of the height, half the width,
+            x of the front and of the rear end.
+        power: power of the superellipses.
+        center_x: x of their center.
     """
     widest = levels[np.argmax(levels[:, 1])]
     _, half_width, front, rear = widest
@@ -140,8 +145,15 @@ def _shell_points(
 ) -> Array:
     """Return the points (R, C, 3) of a stack of R superellipses.
 
-    `angle` (C,) has the angles of the columns; the other arguments are those of
-    `_shell`.
+    Each outline has the same angles, so that columns run from bottom to top.
+
+    Args:
+        levels: (R, 4), a row for each outline: fraction of the height, half the width,
+            x of the front and of the rear end.
+        power: power of the superellipses.
+        center_x: x of their center.
+        height: function that returns z from the fraction of the height, x and y.
+        angle: angles of the columns (C,).
     """
     points = np.empty((len(levels), COLUMNS + 1, 3))
     for index, (height_fraction, half_width, front, rear) in enumerate(levels):
@@ -278,7 +290,12 @@ def _inside(points: Array) -> dict[str, Array]:
 
 
 def _inside_grilles(abs_y: Array, x: Array, z: Array) -> dict[str, Array]:
-    """Return how far points lie inside the two grilles, whose edges are slanted."""
+    """Return how far points lie inside the two grilles, whose edges are slanted.
+
+    Args:
+        abs_y, x, z: coordinates of the points (N,); y without its sign, as a car is
+            symmetric.
+    """
     low_grille = _softest(
         0.62 - abs_y, z - 0.24 + 0.02 * abs_y, 0.37 - 0.02 * abs_y - z
     )
@@ -292,7 +309,12 @@ def _inside_grilles(abs_y: Array, x: Array, z: Array) -> dict[str, Array]:
 
 
 def _inside_windows(abs_y: Array, x: Array, z: Array) -> dict[str, Array]:
-    """Return how far points lie inside the windows of the cabin."""
+    """Return how far points lie inside the windows of the cabin.
+
+    Args:
+        abs_y, x, z: coordinates of the points (N,); y without its sign, as a car is
+            symmetric.
+    """
     # about half the cabin's width at each height
     half_width = np.interp(z, [0.93, 1.15, 1.36], [0.795, 0.735, 0.668])
     windscreen = _softest(0.85 * half_width - abs_y, 1.36 - z)

@@ -603,7 +603,8 @@ def _hollow_base(
 
     Args:
         foot: (r, z) of the outer edge of the foot ring.
-        wall, floor: as of `vessel`.
+        wall: thickness of the wall.
+        floor: height of the floor inside the container.
     """
     # how far the middle of the base lies above the foot ring
     inset = min(0.35 * wall, 0.3 * floor)
@@ -1151,7 +1152,13 @@ def _outline_with_cuts(
 ) -> list[tuple[int, float]]:
     """Return the vertices around a triangle, with the cuts of its edges between them.
 
-    Each is its index and its value; the value of a cut is 0.
+    An entry has the index of the vertex and its value, which is 0 at a cut.
+
+    Args:
+        face: indices of the triangle's vertices (3,).
+        value: value of each vertex (V,).
+        cut_of_edge: index of the vertex that cuts an edge, by the indices of the edge's
+            ends, the smaller one first.
     """
     outline: list[tuple[int, float]] = []
     for i in range(3):

@@ -206,7 +206,8 @@ def speckled(
 ) -> Paint:
     """Paint small irregular specks, `scale` wide, over another paint.
 
-    They take about the fraction `amount` of its area. `offset` (3,) is as of `mottled`.
+    They cover about the fraction `amount` of its area. `offset` (3,) is added to
+    positions, so that instances have different specks.
     """
     # The noise is seldom near 1, so that the threshold falls faster than `amount` grows.
     threshold = 1.0 - 1.1 * amount
@@ -432,7 +433,15 @@ def sample_paint(sampler: ParameterSampler, size: float) -> Paint:
 def _sample_irregular_paint(
     sampler: ParameterSampler, kind: str, a: Color, b: Color, cell: float, offset: Array
 ) -> Paint:
-    """Sample clouds or specks of two colors, or wood, which has a color of its own."""
+    """Sample clouds or specks of two colors, or wood, which has a color of its own.
+
+    Args:
+        sampler: samples the proportions.
+        kind: "mottled", "speckled" or "wood".
+        a, b: colors (3,); wood does not use them.
+        cell: width that the pattern is scaled by.
+        offset: (3,) added to positions, so that instances differ.
+    """
     if kind == "mottled":
         contrast = sampler(2.0, low=1.0, high=4.0)
         return mottled(a, b, scale=1.5 * cell, offset=offset, contrast=contrast)

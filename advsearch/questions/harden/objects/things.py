@@ -198,7 +198,10 @@ def ball(sampler: ParameterSampler) -> Instance:
 
 
 def _press_ball(sphere: list[Patch], style: str, radius: float) -> list[Patch]:
-    """Press the grooves of a football or a basketball into a sphere."""
+    """Press the grooves of a football or a basketball into a sphere.
+
+    Balls of other styles stay smooth.
+    """
     if style == "basket":
         return _press_seams(sphere, radius, 0.015, basketball_seams)
     if style == "football":
@@ -518,7 +521,11 @@ def _page_edges(t: Texels, paper: Array, offset: Array) -> Array:
 
 @painter
 def _spine_paint(t: Texels, cloth: Paint, gold: Array, size: _BookSize) -> Array:
-    """Paint two golden bands at each end of a spine, and words in its middle."""
+    """Paint two golden bands at each end of a spine, and words in its middle.
+
+    The words are bars without letters. Fractions are of the book's height, or of its
+    thickness.
+    """
     _, y, z = t.xyz.T
     end_fraction = np.abs(y) / size.height  # 0 in the middle, 1/2 at the ends
     bands = np.maximum(

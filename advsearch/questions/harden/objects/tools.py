@@ -95,7 +95,13 @@ def _peen(
 
 
 def _ball_peen(half_head: float, start: float, length: float) -> list[Patch]:
-    """Create a ball on a short neck; see `_peen`."""
+    """Create the back of a ball-peen hammer's head: a ball on a short neck, along +y.
+
+    Args:
+        half_head: half the width of the head.
+        start: y of the neck's root.
+        length: length along +y.
+    """
     neck = shapes.sweep(
         "head",
         _points_on_y(start - 0.3, start + 0.5 * length),
@@ -189,7 +195,13 @@ def _hammer_head(
 def _sledge_block(
     sampler: ParameterSampler, front: float, face_radius: float
 ) -> list[Patch]:
-    """Create the head of a sledgehammer: a block with eight or four sides along y."""
+    """Create the head of a sledgehammer: a block with eight or four sides along y.
+
+    Args:
+        sampler: chooses the number of sides.
+        front: length from the middle to each end.
+        face_radius: radius of the face.
+    """
     section = shapes.rectangle(1.8, 1.8, bevel=0.4)
     if sampler.chance(0.5):
         section = shapes.polygon(8, bevel=0.1)
