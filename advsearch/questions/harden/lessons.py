@@ -133,7 +133,9 @@ class RenderedLesson(Lesson):
     def create(
         cls, right_classes: tuple[int, ...], plain: Tensor, images: Tensor
     ) -> RenderedLesson:
-        """Create a lesson whose first image is the worst so far.
+        """Create a lesson whose images have not been evaluated yet.
+
+        Their losses are infinite until then, so the first image counts as the worst.
 
         Args:
             right_classes: indices of the right classes.

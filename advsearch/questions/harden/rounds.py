@@ -217,6 +217,9 @@ class Trainer(ABC):
     ) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler]:
         """Create the optimizer of a round, and its schedule of learning rates.
 
+        The rate rises to its maximum in the warm-up and then falls to nearly 0 (one
+        cycle, Smith and Topin 2018, arXiv 1708.07120).
+
         Args:
             parameters: parameters that are trained.
             n_steps: number of steps of the round.
@@ -232,6 +235,7 @@ class Trainer(ABC):
             [float(group["lr"]) for group in optimizer.param_groups],
             total_steps=n_rates,
             pct_start=adjust_warm_up(self.warm_up_fraction, n_rates),
+            # not every optimizer has a momentum
             cycle_momentum=False,
         )
         return optimizer, schedule

@@ -102,7 +102,7 @@ class SceneJobs:
     def run_jobs(
         self, title: str, jobs: Sequence[Job], hint: str = ""
     ) -> Iterator[tuple[int, Any]]:
-        """Run jobs, and yield the index and the result of each in any order.
+        """Run jobs, and yield the index and the result of each, as soon as it is done.
 
         Args:
             title: title of the stage that the progress reports.
@@ -110,6 +110,7 @@ class SceneJobs:
             hint: how to shorten the stage.
         """
         self.progress.stage(title, len(jobs), hint=hint)
+        # Results come in any order, and a worker's batch returns the job object itself.
         index_of_job = {id(job): index for index, job in enumerate(jobs)}
         executor = self.executor or workbench.InProcess(self)
         # each job is a batch by itself
@@ -363,7 +364,7 @@ class SceneJobs:
     ) -> dict[str, Any]:
         """Return the settings of the run that the searched controls take.
 
-        A setting that none of them takes is None.
+        Settings that none of the controls takes are None.
 
         Args:
             searched: settings of the searched controls by their names.
@@ -392,6 +393,7 @@ def _evaluate_start(
         models: models by name; all see the same image.
     """
     start = problem.domain.start
+    # a batch of one image (1, H, W, 3)
     image = problem.picture(start, seed, CLEAN_SPP)[None]
     truth = problem.find_truth(problem.add_conditions(start, seed))
     with torch.no_grad():
@@ -582,7 +584,8 @@ def make_splits(config: HardenConfig, model: Model) -> dict[str, SceneSplit]:
 def _select_objects(config: HardenConfig, model: Model) -> tuple[str, ...]:
     """Return the objects of the training that the model has a class for.
 
-    Of objects in files that is not known here.
+    The class of an object in a file is not known before it is loaded, so these objects
+    are always included.
 
     Raises:
         InputError: there are none.

@@ -186,8 +186,8 @@ class ClassifierTrainer(Trainer):
         """Return the jobs that make lessons by rendering, one for each scene.
 
         All controls without a matrix of light transport change together. In the
-        training a scene has one such view, and a plain one in which the predictions of
-        the original model count.
+        training split a scene has one such view, and one plain view on which the
+        student should predict as the original model does.
         """
         controls = self.work.rendered_controls
         if not controls:
@@ -203,10 +203,16 @@ class ClassifierTrainer(Trainer):
         ]
 
     def _further_jobs(self, scene_numbers: range) -> list[Job]:
-        """Return the jobs of the further scenes of the training, of one view each.
+        """Return the jobs of the further scenes of the training, with one view each.
 
-        The view is rendered with the rendered controls if there are any, else plain.
+        If there are controls without a matrix of light transport, they change in that
+        view; otherwise it is a plain view.
+
+        Args:
+            scene_numbers: numbers of the scenes of the round, which follow each other.
         """
+        # Each scene of the round has `n_further_scenes` further ones, with numbers of
+        # their own.
         first = self.n_further_scenes * scene_numbers[0]
         end = self.n_further_scenes * (scene_numbers[-1] + 1)
         if self.work.rendered_controls:
@@ -336,7 +342,7 @@ def _accuracy(
     """Return the fraction of lessons whose images a model gets right.
 
     Args:
-        model: returns logits.
+        model: model that returns logits.
         selected: lessons, at least one.
         get_image: returns the image (H, W, 3) of a lesson.
     """
@@ -421,7 +427,11 @@ class GradientComputer:
             parameter.grad = torch.stack(used).sum(dim=0) if used else None
 
     def _ascend_textures(self, batch: Sequence[Lesson], seed: int) -> None:
-        """Take a step of the search for worse textures, on augmented images."""
+        """Take a step of the search for worse textures, on augmented images.
+
+        The textures are changed in place. Gradients are computed in parts on threads,
+        each with its own copy of the network (`twin`).
+        """
 
         def compute_part_gradients(
             part: Sequence[TextureLesson], twin: Trainable, seed: int
@@ -460,19 +470,20 @@ class GradientComputer:
         selected: Sequence[Lesson],
         seed: int,
     ) -> list[Sequence[Any]]:
-        """Apply a function to parts of lessons on the threads; return its results in
-        order.
+        """Apply a function to parts of lessons on threads; return its results in order.
 
         Args:
             function: is called with the part, a copy of the network for this part
                 alone, and a seed that depends on the index of the part.
             selected: the lessons.
-            seed: seed of the first part.
+            seed: seed of the first part; each next part has the next number.
         """
         parts = [
             selected[start : start + LESSONS_PER_PART]
             for start in range(0, len(selected), LESSONS_PER_PART)
         ]
+        # Threads cannot share a network whose gradients are computed, so each part has
+        # a copy.
         n_missing = len(parts) - len(self._twins)
         self._twins += [self._student.make_twin() for _ in range(n_missing)]
         part_seeds = itertools.count(seed)

@@ -317,7 +317,7 @@ def fit_line(
 def _agrees_with_theory(
     slope: float, half_width: float, or_steeper: bool | None
 ) -> bool | None:
-    """Return whether a slope is that of theory; None if that is not known.
+    """Return whether a slope agrees with theory; None if that is not known.
 
     Args:
         slope: slope of log error against log samples.
@@ -360,9 +360,10 @@ def describe_disagreement(
 
 
 def has_leveled_off(points: Sequence[PrecisionPoint]) -> bool:
-    """Return whether the last step between known points is much flatter than before.
+    """Return whether the error has stopped falling, as it does if there is a bias.
 
-    That is less than half as steep as the steepest one before it.
+    That is so if the slope between the last two known points is less than half as steep
+    as the steepest slope before.
     """
     known = sorted(
         (point for point in points if point.is_known), key=lambda point: point.spp
@@ -449,8 +450,9 @@ def _error_on_line(line: PrecisionSlope, spp: float) -> float:
 def _explains_points(line: PrecisionSlope, ordered: Sequence[PrecisionPoint]) -> bool:
     """Return whether a falling line passes through the interval of every known point.
 
-    A line of `MIN_FIT_POINTS` points nearly always does, and so explains nothing. A
-    known point without an interval is not explained.
+    A line through only `MIN_FIT_POINTS` points nearly always does, so this is no
+    evidence, and the result is False. It is False, too, if a known point has no
+    interval.
     """
     has_spare_points = line.points > MIN_FIT_POINTS
     is_falling = line.slope <= MAX_FALLING_SLOPE
@@ -620,8 +622,7 @@ def _interpolate_value(
 ) -> float:
     """Interpolate a value at a sample count, on logarithmic axes.
 
-    Below the first point it is that of the first one; beyond the last it follows a
-    slope.
+    Below the first point it is constant; beyond the last point it follows a slope.
 
     Args:
         ordered: points by ascending samples.

@@ -348,8 +348,8 @@ class Comparison:
         """Yield the rows, object by object, so that each mesh is loaded once.
 
         Args:
-            selection: rows that are compared.
-            measurements: `Measurements` of the run, where finished rows are stored.
+            selection: objects that are compared, and their windows.
+            measurements: stored rows of the run, by name; finished rows are added.
         """
         self._context.progress.stage("twins", len(selection.windows))
         # Objects of one mesh and one camera's pixels share a renderer.
@@ -412,7 +412,12 @@ class Comparison:
     def _render_layers(
         self, selection: Selection, numbers: Sequence[int]
     ) -> dict[int, rendering.Layer]:
-        """Render the objects of some rows, which have one mesh, alone."""
+        """Render objects that have the same mesh, to be put into their photographs.
+
+        Args:
+            selection: all selected objects and their windows.
+            numbers: numbers of the objects that are rendered.
+        """
         if not numbers:
             return {}
         renderer = self._make_renderer(

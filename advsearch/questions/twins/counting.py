@@ -181,10 +181,15 @@ def estimate_margin_correlation(
 def estimate_box_agreement(
     rows: Sequence[TwinRow], surroundings: str
 ) -> results.Estimate | None:
-    """Return how often boxes of a detector agree; None where there are no pairs.
+    """Return how often a detector's boxes agree in photograph and twin.
 
-    Of photograph and twin the best box of the right class counts, where both have one;
-    they agree if their overlap over their union reaches `MIN_BOX_OVERLAP`.
+    The best box of the right class is used in each. Rows in which one of both has no
+    such box are left out. Boxes agree if their intersection over union is at least
+    `MIN_BOX_OVERLAP`. The result is None without rows.
+
+    Args:
+        rows: rows of one model.
+        surroundings: name of the twins' surroundings.
     """
     agrees = []
     used_rows = []
@@ -260,10 +265,15 @@ FACTORS: dict[str, tuple[str, Callable[[TwinRow], float | None]]] = {
 def explain_disagreement(
     rows: Sequence[TwinRow], surroundings: str
 ) -> list[FactorPart]:
-    """Return how often photograph and twin disagree by parts of each factor.
+    """Return how often photograph and twin disagree, by parts of each factor.
 
-    Each has `N_PARTS` parts with about as many rows; a factor that is constant, or of
-    which too few rows are known, is left out.
+    A factor is a property such as the object's size. It is divided into `N_PARTS` parts
+    with equally many rows. A factor is left out if it is constant, or known for too few
+    rows.
+
+    Args:
+        rows: rows of all models.
+        surroundings: name of the twins' surroundings.
     """
     parts: list[FactorPart] = []
     for name, (unit, get_value) in FACTORS.items():

@@ -74,7 +74,13 @@ class Twin:
 
 
 def project_object(item: PhotographedObject, asset: assets.ObjectAsset) -> Float64Array:
-    """Return the positions (V, 2) of an object's vertices in its photograph, pixels.
+    """Return the pixel coordinates (x, y) of an object's vertices (V, 2).
+
+    They are projected into the photograph by its pinhole camera.
+
+    Args:
+        item: the object, with its pose and the camera of the photograph.
+        asset: the object's mesh.
 
     Raises:
         InputError: a part of the object is behind the camera.
@@ -523,8 +529,8 @@ def read_front(
 ) -> npt.NDArray[np.uint8] | None:
     """Return levels (H, W), 255 where another thing hides the object; None if unknown.
 
-    The mask of what is visible is widened by a pixel, since the edges of masks are not
-    smooth.
+    The mask of the object's visible part is widened by a pixel: its edge is jagged, and
+    would otherwise cut into the object.
     """
     if item.visible_mask is None:
         return None

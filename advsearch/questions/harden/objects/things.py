@@ -435,8 +435,8 @@ def book(sampler: ParameterSampler) -> Instance:
         )
     patches += shapes.box(
         "pages",
-        # The pages end `overhang` before the cover's free edge, and reach into the
-        # spine at -x.
+        # Along x the pages end 0.2 + `overhang` before the covers' free edge, and at -x
+        # they begin near the inner side of the spine.
         (0.3 - overhang / 2, 0.0, size.thickness / 2),
         (
             width - overhang - 0.5,
