@@ -94,7 +94,10 @@ def list_parts(config: CheckConfig) -> list[CheckedPart]:
 
 
 def list_bundled(config: CheckConfig) -> Iterator[CheckConfig]:
-    """Yield the settings of a check of each control, on each bundled scene."""
+    """Yield the settings of a check of each control, on each bundled scene.
+
+    Controls that make no sense on a scene are left out.
+    """
     for object_name, environment in SCENES:
         skipped = set()
         if object_name == "bottle":

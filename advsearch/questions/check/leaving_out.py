@@ -237,15 +237,15 @@ def measure_texels(
 
 
 def _find_sufficient_side(side: int, n_visible: int, n_pixels: int) -> int:
-    """Return the side of a texture, halved as often as the pixels resolve as much.
+    """Return the smallest sufficient side of a texture.
 
-    After each halving there have to be `TEXELS_PER_PIXEL` visible texels for each
-    pixel.
+    The side is halved as long as there remain at least `TEXELS_PER_PIXEL` visible
+    texels for each pixel that shows the texture.
 
     Args:
         side: side of the texture, in texels.
-        n_visible: its visible texels.
-        n_pixels: pixels that show it.
+        n_visible: number of its visible texels.
+        n_pixels: number of pixels that show it.
     """
     sufficient = side
     while sufficient > 2:
@@ -264,7 +264,10 @@ def _count_pixels(
     seed: int,
     spp: int,
 ) -> int:
-    """Count the pixels that show a texture: they differ if it is white or black.
+    """Count the pixels that show a texture.
+
+    The albedo of the scene is rendered with a white and with a black texture. The
+    pixels that differ show the texture.
 
     Args:
         renderer: renderer of the scene.

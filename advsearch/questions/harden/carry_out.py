@@ -118,7 +118,6 @@ def run_hardening(
     # A run that continues has to get the same Python arguments as before. Only those
     # that the task uses are compared: `beside` is for classifiers, `loss` for the other
     # tasks.
-    # `beside` is of classifiers only, `loss` of the others.
     arguments: dict[str, Any] = {"optimiser": optimiser, "loss": loss}
     if config.task_name == "classification":
         arguments = {"optimiser": optimiser, "beside": beside}

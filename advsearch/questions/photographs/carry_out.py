@@ -181,7 +181,9 @@ def _summarize_rendering(
 
 
 def find_photographs(path: Path, task: workbench.AnyTask) -> list[Path]:
-    """Return the photographs in a directory by their suffixes; empty without it.
+    """Return the paths of the photographs in a directory.
+
+    They are found by their suffixes. The list is empty if there is no such directory.
 
     Raises:
         InputError: the task needs the object's position, and a photograph was aligned
@@ -250,9 +252,9 @@ class Photographs:
     def add_files(self, run: Path, files: Sequence[Path]) -> None:
         """Evaluate and store the photographs that a sweep of one object does not have.
 
-        A file ``rendering-12.jpg``, or ``rendering-12-`` and anything, was aligned with
-        the rendering 12. All others show the object as it stood by chance: they are
-        evaluated, but are compared with no single rendering.
+        A file ``rendering-12.jpg``, or a name that begins with ``rendering-12-``, was
+        aligned with the rendering 12. All other files show the object in any position.
+        They are evaluated, but not compared with a rendering.
         """
         with Store.open_to_read(run) as store:
             stored_names = {
@@ -406,7 +408,8 @@ class _PhotoEvaluator:
     ) -> tasks.Judgement:
         """Evaluate an image file at the size of the run's renderings.
 
-        It is resized in 8 bits with Lanczos' filter, which averages where it shrinks.
+        It is resized in 8 bits with Lanczos' filter, which averages pixels when it
+        shrinks an image.
 
         Args:
             rendering: name of the rendering that the image belongs to; None without.
@@ -531,7 +534,10 @@ def _find_sweep_truth(
 
 
 def _load_attack_evaluators(run: Path, config: AttackConfig) -> list[_PhotoEvaluator]:
-    """Load the models of an attack, with the ground truth of its images."""
+    """Load the models of an attack, with the ground truth of its images.
+
+    An attack on an ensemble has several models; each gets an evaluator.
+    """
     problem, _ = workbench.problem_from_config(workbench.with_evaluation_only(config))
     models: list[tuple[Model, Task]] = [(problem.model, problem.task)]
     if isinstance(problem.task, workbench.EnsembleTask):

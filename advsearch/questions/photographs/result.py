@@ -92,7 +92,9 @@ _PHOTO = re.compile(rf"(?:{_NAME.pattern})-[0-9]{{4,9}}\.jpg")
 
 
 def find_rendering(run: Path, name: str) -> Path:
-    """Return the file of a rendering.
+    """Return the path of the image of a rendering.
+
+    A name comes from a web request, so only names of a fixed pattern are looked up.
 
     Raises:
         InputError: the run has none of that name.

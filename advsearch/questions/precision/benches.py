@@ -72,8 +72,9 @@ class MeasuredRounds:
     def estimate_call_seconds(self, setting: SampleSetting) -> float:
         """Estimate the seconds of a call other than the first ones.
 
-        The estimate is the setting's own; else in proportion to the most expensive
-        setting of its line; else at the highest rate of any line; 0 without any.
+        If the setting has been called, it is the median of its last calls. Otherwise
+        the time is proportional to the cost, as for the most expensive setting of its
+        line, or else as for the slowest line. It is 0 if nothing has been called.
         """
         if setting in self.wall_seconds:
             call_seconds = self.wall_seconds[setting]
@@ -410,7 +411,7 @@ class PictureBench:
     def measure(self, setting: SampleSetting, seed: int) -> dict[str, Numbers]:
         """Render an image; return the errors of the image and of the margin.
 
-        Both have the times of the render.
+        Both errors come with the times of the render.
         """
         radiance, times = run_timed(
             lambda: self._render_radiance(setting.estimator, seed, setting.spp)

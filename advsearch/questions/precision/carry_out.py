@@ -262,7 +262,10 @@ class QuantityMeasurer:
     def measure_sittings(
         self, read_or_measure: Callable[[str, Callable[[], Sitting]], Sitting]
     ) -> Iterator[Sitting]:
-        """Yield each sitting; time that one leaves is shared among those after it.
+        """Yield each sitting, within the time of the settings.
+
+        A sitting measures one quantity without a break. Time that it does not use is
+        shared among the later ones.
 
         Args:
             read_or_measure: returns the stored sitting of a name, or calls the function

@@ -188,7 +188,8 @@ def _list_coordinates(problem: Problem) -> dict[str, int]:
 def read_center(problem: Problem, config: RegionConfig) -> Tensor:
     """Return the configuration (d,) around which the box grows.
 
-    It is the scene's own, or the adversarial one of a run.
+    It is the scene's own configuration or, with the setting `around`, the adversarial
+    configuration of a run.
 
     Raises:
         InputError: that run is over other controls.
@@ -304,16 +305,17 @@ class RegionSearch:
         self._verifier.stages.begin("search", title, limit, hint=hint, at_most=True)
 
     def _is_same(self, values: Tensor, number: int) -> bool:
-        """Return whether the verdict at coordinates (k,) is that of the center.
+        """Return whether the verdict at a point is that of the center.
 
         An image without the object, or with a prediction that is not a number, has no
-        verdict, and so not that of the center.
+        verdict, so the result is False.
 
         Args:
-            values: values of the parameters that vary.
+            values: values of the k parameters that vary, in [0, 1] (k,).
             number: number of the point, which seeds its noise.
         """
-        # Images of the check are rendered, never predicted.
+        # While the box grows, images may be predicted from the prepared light. Those of
+        # the check are rendered, as its result is reported.
         predictor = None if self._is_checking else self._verifier.state.predictor
         u = self._varied.with_values(values)
         (trial,) = self._verifier.try_configurations(

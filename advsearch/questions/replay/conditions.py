@@ -128,7 +128,9 @@ class ReplayCondition:
 def list_conditions(
     problem: Problem, spp: int, resize: Callable[[tuple[int, int]], Problem]
 ) -> Iterator[ReplayCondition]:
-    """Yield every condition of a problem except other models, unchanged first.
+    """Yield every condition of a problem except other models.
+
+    The first one is the unchanged condition, as the run verified it.
 
     Args:
         problem: the problem of the run.
@@ -259,7 +261,8 @@ def apply_sensor(
     """Return an image (H, W, 3) as a camera's sensor records it.
 
     Args:
-        sensor_values: values of parameters of the control `sensor`; all others are 0.
+        sensor_values: values of the parameters of the control `sensor`, by name;
+            parameters that are missing are 0.
         image: sRGB in [0, 1].
         seed: seed of the sensor's noise.
     """
@@ -274,7 +277,11 @@ def apply_sensor(
 
 
 def blender_condition(problem: Problem, spp: int) -> ReplayCondition:
-    """Return the condition that renders with Cycles, available or not."""
+    """Return the condition that renders with Cycles.
+
+    If Blender is not installed, or the scene cannot be exported, the condition holds
+    the reason, which the result reports.
+    """
     renderer = problem.renderer
     description, _ = renderer.scene.definition
     condition = ReplayCondition(
@@ -550,9 +557,10 @@ def select_conditions(
 def batch_by_light(
     conditions: Sequence[ReplayCondition], spp: int
 ) -> list[list[ReplayCondition]]:
-    """Put the conditions that share the run's renders into the first batch.
+    """Divide conditions into batches that share their renders.
 
-    Every other condition is a batch by itself.
+    The first batch has all conditions that share the renders of the run; it is empty if
+    there are none. Every other condition is a batch by itself.
 
     Args:
         conditions: the conditions.
@@ -594,8 +602,11 @@ class _Table:
     def fill(self, conditions: Sequence[ReplayCondition]) -> None:
         """Add the rows of conditions that share their renders.
 
-        A condition that is not available, or that Blender fails at, gets a row with the
-        reason.
+        A condition that is not available, or in which Blender fails, gets a row with
+        the reason.
+
+        Args:
+            conditions: conditions that share their renders.
         """
         reasons = [
             condition.unavailable_reason

@@ -146,7 +146,13 @@ def _read_suite(config: SuiteConfig) -> Suite:
 def _note_settings(
     context: RunContext[SuiteConfig], suite: Suite, planned: Sequence[PlannedClaim]
 ) -> None:
-    """Note the settings of claims, so that a resumed run tests with the same."""
+    """Store the settings of claims, so that a resumed run tests with the same ones.
+
+    Args:
+        context: the settings and the run.
+        suite: the suite that is tested.
+        planned: its claims and counterexamples.
+    """
     run = context.run
     run.store.write_note(SUITE_NOTE, json.dumps(suite.model_dump(mode="json")))
     settings_of_examples = {
@@ -155,7 +161,8 @@ def _note_settings(
         if claim.example is not None
     }
     run.store.write_note(SETTINGS_NOTE, json.dumps(settings_of_examples))
-    # settings whose files must not change until the run is resumed
+    # The digests of files that these settings name are stored: they must not change
+    # before the run is resumed.
     used_settings = list[dict[str, Any]]()
     for planned_claim in planned:
         used_settings.append(planned_claim.config.to_json())
@@ -248,8 +255,9 @@ class _SuiteRun:
     def _refuse_claim(self, claim: PlannedClaim) -> ClaimResult | None:
         """Return the result of a claim that is not tested; None for one that is.
 
-        It is not tested if an unexpected counterexample failed (unless the settings ask
-        for all), the time is over, or a counterexample does not suit the model.
+        There are three reasons. A counterexample failed unexpectedly, then claims are
+        not tested unless the setting `all` is set. The time is over. Or a
+        counterexample does not suit the model.
         """
         counterexample_failed = any(
             result.kind == "counterexample" and not result.accepted
@@ -384,10 +392,10 @@ class _SuiteRun:
         return updated, changes
 
     def _find_twins(self, configs: Sequence[SceneConfig]) -> Any:
-        """Return what a run of twins shows about renders of these claims.
+        """Return how far renders agree with photographs, by a run of twins.
 
-        Twins are renders of photographed objects, which are compared with their
-        photographs. None if no run of them is named.
+        Twins are renders of photographed objects, which are compared with the
+        photographs. The result is None if the settings name no run of twins.
 
         Args:
             configs: settings of each claim.

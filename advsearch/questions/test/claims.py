@@ -468,11 +468,13 @@ class ClaimTester:
     ) -> tuple[Problem, ChangePicture | None]:
         """Return the problem of the other side, and what makes its pictures.
 
-        None makes no picture: then the other side has a rendering of its own.
+        The other side is what the model is compared with. The function changes a
+        picture of the model under test. It is None if the other side needs renders of
+        its own.
 
         Args:
             claim: the claim.
-            config: settings of its pictures.
+            config: settings of the pictures.
             problem: problem of the model under test.
         """
         if isinstance(claim, NoWorseClaim):
@@ -480,7 +482,7 @@ class ClaimTester:
             takes_same_images = other.renderer.formation == problem.renderer.formation
             return other, _same_picture if takes_same_images else None
         if isinstance(claim, ChangeClaim):
-            # evaluated by what is true of the picture before the change
+            # The ground truth is that of the picture before the change.
             return problem, self._make_change(claim, config, problem)
         return problem, None
 
@@ -733,7 +735,7 @@ def _evaluate_with_pictures(
 
     Args:
         journal: its evaluator renders and predicts them.
-        pictures: gets the pictures; None if they are not needed.
+        pictures: mapping to which the pictures are added; None if they are not needed.
         queries: what to evaluate.
     """
     with_image = pictures is not None
@@ -808,9 +810,9 @@ def _evaluate_other_side(
 
 
 def claim_worker(values: dict[str, Any]) -> Callable[[Any], Any]:
-    """Return what a worker process calls for a claim about two models.
+    """Return the function that a worker process calls for a claim about two models.
 
-    A model is loaded at its first use; requests name it by its index.
+    A request names its model by index, "0" or "1". A model is loaded at its first use.
 
     Args:
         values: settings of the claim's pictures, with both models.

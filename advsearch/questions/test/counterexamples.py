@@ -204,7 +204,7 @@ class _Block(BaseModel):
         return offsets
 
     def _decompress_steps(self) -> np.ndarray[Any, Any]:
-        """Return the steps of the stored values as integers (n / square^2,).
+        """Return the stored values as integer multiples of the step (n / square^2,).
 
         Raises:
             ValueError, LZMAError: if they are corrupt.
@@ -214,7 +214,8 @@ class _Block(BaseModel):
         if self.signs:
             n_bytes = math.ceil(n_steps / 3)  # three in a byte
         decompressor = lzma.LZMADecompressor(memlimit=MAX_MEMORY)
-        # more than what is expected shows that it is another block
+        # The file is not trusted: memory and size are limited. One byte more than
+        # expected is read, which shows that the data is another block's.
         max_bytes = 2 * n_steps + 1
         data = decompressor.decompress(base64.b85decode(self.offsets), max_bytes)
         if len(data) != n_bytes:
@@ -659,7 +660,7 @@ def _read(path: Path) -> Counterexample:
     """Read a counterexample.
 
     Raises:
-        FileFormatError: if the file is none, or corrupt.
+        FileFormatError: if the file is missing or corrupt.
     """
     content, offsets = _read_content(path)
     try:
@@ -682,7 +683,7 @@ def _read_content(path: Path) -> tuple[_File, Floats]:
     """Read the content of a counterexample's file, and its offsets (d,).
 
     Raises:
-        FileFormatError: if the file is none, or corrupt.
+        FileFormatError: if the file is missing or corrupt.
     """
     try:
         text = stored_files.read_text(path, "a counterexample", MAX_SIZE)
