@@ -339,9 +339,10 @@ def look_through_glass() -> CaseOutcome:
 
 @register_case("materials", "texels-0-and-1")
 def texels_at_the_ends() -> CaseOutcome:
-    """Check that texels at the bounds of their range have a gradient.
+    """Texels at the ends of the range have a gradient, and the search moves them
+    inwards only.
 
-    The search has to move them inwards only. The texture is a checkerboard of 0 and 1.
+    The texture is a checkerboard of 0 and 1, which are the bounds.
     """
     controls = {"texture": {"resolution": 8, "epsilon": 0.2}}
     renderer = make_renderer(controls, make_checkered_mug)
@@ -684,10 +685,10 @@ register_cases(
 
 @register_case("geometry", "million-triangles", slow=True)
 def million() -> CaseOutcome:
-    """Check a mesh of a million triangles.
+    """Finite, right, and like the coarse mesh of the same shape.
 
-    Its gradient has to be finite and right, and its image like that of a coarse mesh of
-    the same shape.
+    The mesh is a sphere of a million triangles. The gradients are those by its texture
+    and by a shift.
     """
     # 1000 columns and 501 rows give about 2 * 1000 * 500 triangles.
     fine_mesh = assets.normalise_mesh(workbench.make_sphere(501, 1000))
@@ -716,10 +717,10 @@ def million() -> CaseOutcome:
 
 @register_case("geometry", "gimbal-angles", slow=True)
 def gimbal() -> CaseOutcome:
-    """Check gradients at a pitch of 90 degrees, the gimbal lock of Euler angles.
+    """At a pitch of 90 degrees the gradients by angles and by the rotation vector are
+    right.
 
-    There, yaw and roll rotate about the same axis. The gradients by angles and by the
-    rotation vector both have to be right.
+    At this pitch, yaw and roll rotate about the same axis (gimbal lock).
     """
     angles = {
         "pose": {
@@ -963,10 +964,11 @@ def _measure_shift_slope(half_width: float) -> float:
 
 @register_case("stiff", "light-rotation-texel", slow=True)
 def light_rotation_texel() -> CaseOutcome:
-    """Search over a light, a rotation and texels, whose units and curvatures differ.
+    """All three move, the condition number is printed, and the objective's unit does
+    not matter.
 
-    All three have to move, and the path must not depend on the unit of the objective.
-    The condition number of the Hessian is reported.
+    The search is over the power of a light, a rotation and texels, whose units and
+    curvatures differ. The condition number is that of the Hessian.
     """
     controls: ControlSettings = {
         "light": {"type": "point", "power": [0.0, 12.0], "x": 1.0, "y": -1.0, "z": 2.0},
@@ -1075,11 +1077,11 @@ register_cases(
 
 @register_case("noise", "heavy-tails-of-a-moving-mesh", slow=True)
 def heavy_render(count: int = 24) -> CaseOutcome:
-    """Check that the derivatives by a moving mesh have no heavy tail.
+    """The plan takes differences of the loss for what moves a mesh, which have no heavy
+    tail.
 
-    The plan takes secants, that is differences of the loss. The farthest sample may be
-    at most 12 median distances from the median. For 24 Gaussian samples, that is
-    exceeded less than once in 1,000 trials.
+    The farthest sample may be at most 12 median distances from the median. For 24
+    Gaussian samples, that is exceeded less than once in 1,000 trials.
     """
     controls = {"pose": {"x": [-0.3, 0.3]}}
     renderer = make_renderer(controls).copy_with(transfer="linear")

@@ -120,8 +120,9 @@ def pack_charts(
     charts.
 
     Args:
-    sizes: (width, height) of each chart, in object units.
-    side: side of the atlas in texels.
+        sizes: (width, height) of each chart, in object units.
+        side: side of the atlas in texels.
+
     Raises:
         ValueError: there are too many charts for their gutters alone.
     """
