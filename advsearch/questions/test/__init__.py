@@ -51,8 +51,7 @@ def test(
     other programs, such as JUnit XML and SARIF, are written at the end.
 
     Args:
-        context: the settings, which name the suite's file, and the run.
-        suite: content of a suite as Python mappings, in place of the file.
+        suite: path of the suite's YAML file, or its content as Python mappings.
     """
     from advsearch.questions.test.carry_out import try_suite  # imports torch
 
