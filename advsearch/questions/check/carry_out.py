@@ -94,7 +94,10 @@ def list_parts(config: CheckConfig) -> list[CheckedPart]:
 
 
 def list_bundled(config: CheckConfig) -> Iterator[CheckConfig]:
-    """Yield the settings of a check of each control, on each bundled scene."""
+    """Yield the settings of a check of each control, on each bundled scene.
+
+    Controls that make no sense on a scene are left out.
+    """
     for object_name, environment in SCENES:
         skipped = set()
         if object_name == "bottle":
@@ -198,11 +201,15 @@ class GradientCheck:
     def _measure_linear(self, part: CheckedPart, title: str) -> Iterator[Finding]:
         """Measure derivatives of a smooth linear loss of the raw image.
 
+        That loss has little noise and no model, so that errors of the renderer's
+        derivatives are visible.
+
         Args:
-            part: what is measured, by every estimator.
+            part: controls and settings that are measured.
             title: title for the progress.
         """
         config = part.config
+        # A denoiser would change the derivatives.
         problem, _ = workbench.problem_from_config(config, denoise="none")
         renderer = problem.renderer
         # The raw image has no tone curve.
@@ -224,12 +231,13 @@ class GradientCheck:
     def _measure_model(self, part: CheckedPart, title: str) -> Iterator[Finding]:
         """Plan a search by the model's own loss, and measure its derivatives as planned.
 
-        First come the cosines of gradients, by which steps and samples are chosen; then
-        the plan of the search, except in a check of all controls; then the derivatives,
+        There are three kinds of rows. First come the cosines between noisy gradients
+        and a converged one, by which steps and samples are chosen. Then comes the plan
+        of the search, except in a check of all controls. The derivatives come last,
         with the factor by which each step was changed.
 
         Args:
-            part: what is measured.
+            part: controls and settings that are measured.
             title: title for the progress.
         """
         config = part.config
@@ -276,7 +284,14 @@ class GradientCheck:
     def _measure_cosines(
         self, problem: Problem, bench: gradients.Bench, seed: int, title: str
     ) -> Iterator[results.Measured]:
-        """Yield the cosines of gradients with converged ones, by samples per pixel."""
+        """Yield the cosines of gradients with converged ones, by samples per pixel.
+
+        Args:
+            problem: problem of the search.
+            bench: measures gradients, and stores them.
+            seed: seed of the renders.
+            title: title of the progress.
+        """
         plan = problem.renderer.plan
         # not fewer samples than the search has
         larger_counts = tuple(
@@ -301,10 +316,11 @@ class GradientCheck:
         loss: gradients.Loss,
         spp: int,
     ) -> gradients.Bench:
-        """Return what measures gradients, and stores what it measures.
+        """Return a bench that measures gradients and stores each measurement.
 
         Args:
-            part: what is measured.
+            part: controls and settings that are measured; its key names the stored
+                measurements.
             renderer: renderer of the scene.
             loss: loss that is differentiated.
             spp: samples per pixel.
@@ -317,6 +333,7 @@ class GradientCheck:
         return gradients.Bench(
             renderer,
             loss,
+            # a point inside all bounds, where a parameter can move to both sides
             gradients.find_interior_point(renderer),
             seeds.stream(part.config.seed, "check"),
             spp,
@@ -333,8 +350,9 @@ class GradientCheck:
     ) -> Iterator[Finding]:
         """Yield the plan of a search, its longest light paths, and what it saves.
 
-        What it saves are the gains of each thing that is left out, and how many texels
-        are visible; nothing where nothing is left out.
+        What it saves is the gain of each item that is left out of the rendering, such
+        as bounces, and how many texels are visible. There are no such rows if nothing
+        is left out.
 
         Args:
             problem: problem of the scene.
@@ -383,7 +401,7 @@ class GradientCheck:
     def _measure_gains(
         self, problem: Problem, u: Tensor, seed: int, depth: int
     ) -> list[GainRow]:
-        """Measure what each thing that is left out saves.
+        """Measure what is saved by each item that is left out of the rendering.
 
         Args:
             problem: problem of the scene.

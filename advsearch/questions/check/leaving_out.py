@@ -57,18 +57,21 @@ def measure_gains(
 ) -> list[GainRow]:
     """Measure what a renderer saves by each item that it leaves out.
 
-    Each item is put back, and then all at once, and a gradient is timed and compared.
-    Images and gradients are compared at two seeds, so that it is known what noise
-    changes; then gradients are timed in rounds over all variants.
+    For each item there is a variant of the renderer that computes it, and one variant
+    computes all. Its images and gradients are compared with the search's. They are
+    rendered with two seeds, as the difference between seeds shows how much is noise.
+    Then gradients are timed in rounds over all variants, so that a slow moment of the
+    machine affects all of them alike.
 
     Args:
         renderer: renderer of a search.
         loss: loss that is differentiated.
-        u: (d,) where.
+        u: (d,) the configuration.
         seed: seed of the renders.
         spp: samples per pixel.
-        repeats: timed gradients of each.
-        depth: the longest light path of the search; None for the scene's.
+        repeats: number of timed gradients of each variant.
+        depth: maximum number of segments of the search's light paths; None for the
+            scene's.
         tick: called after each gradient.
 
     Returns:
@@ -76,7 +79,8 @@ def measure_gains(
     """
     variants = _make_variants(renderer, depth)
     measurements = {item: _Measurements() for item in variants}
-    # The first gradient of each compiles, so that these are not timed.
+    # The first gradient of a variant compiles its kernels. That is done here, and not
+    # timed.
     for noise_seed in (seed, seeds.stream(seed, "another")):
         for item, variant in variants.items():
             with torch.no_grad():
@@ -100,14 +104,15 @@ def measure_gains(
 def _make_variants(
     renderer: gradients.Renderer, depth: int | None
 ) -> dict[str, gradients.Renderer]:
-    """Return the renderer of a search, and others by the item that they compute.
+    """Return variants of a search's renderer, by the item that they compute.
 
-    That of the search (`SEARCH`) leaves out everything that it can; each of the others
-    computes one item of that, or all (`ALL`).
+    The variant `SEARCH` leaves out everything that it can. Each of the others computes
+    one of these items, and `ALL` computes all.
 
     Args:
-        renderer: whose paths have their full length.
-        depth: the longest light path of the search; None for the scene's.
+        renderer: renderer of the search, whose light paths have their full length.
+        depth: maximum number of segments of the search's light paths; None for the
+            scene's.
     """
     scene = renderer.scene
     depth = scene.max_depth if depth is None else depth
@@ -146,16 +151,18 @@ def _compare_item(
 ) -> GainRow:
     """Compare the renderer that computes an item with that of the search.
 
-    `time_gain` is how much longer the one with the item takes for an image as noisy:
-    the ratio of the seconds, times that of the variances.
+    `time_gain` is how many times longer the renderer with the item takes for an equally
+    noisy image. That is (ratio of seconds) * (ratio of variances), since the variance
+    of a Monte Carlo estimate falls as 1 / time.
 
     Args:
-        item: its name.
+        item: name of the item.
         search: measurements without any of the items.
         with_item: measurements with the item.
     """
     image_difference = _relative_difference(search.images, with_item.images)
     gradient_difference = _relative_difference(search.gradients, with_item.gradients)
+    # Two images of the same renderer differ only by noise.
     search_noise = _difference(search.images)
     variance_gain = 1.0
     if search_noise > 0.0:
@@ -198,7 +205,9 @@ def _relative_difference(without: list[Tensor], with_item: list[Tensor]) -> floa
 def measure_texels(
     renderer: gradients.Renderer, u: Tensor, *, seed: int, spp: int = 16
 ) -> list[TexelRow]:
-    """Compare the texels of every searched texture with the pixels that show them.
+    """Compare the texels of each searched texture with the pixels that show it.
+
+    A texture with many more texels than pixels is larger than necessary.
 
     Args:
         renderer: renderer of a search.
@@ -228,15 +237,15 @@ def measure_texels(
 
 
 def _find_sufficient_side(side: int, n_visible: int, n_pixels: int) -> int:
-    """Return the side of a texture, halved as often as the pixels resolve as much.
+    """Return the smallest sufficient side of a texture.
 
-    After each halving there have to be `TEXELS_PER_PIXEL` visible texels for each
-    pixel.
+    The side is halved as long as there remain at least `TEXELS_PER_PIXEL` visible
+    texels for each pixel that shows the texture.
 
     Args:
         side: side of the texture, in texels.
-        n_visible: its visible texels.
-        n_pixels: pixels that show it.
+        n_visible: number of its visible texels.
+        n_pixels: number of pixels that show it.
     """
     sufficient = side
     while sufficient > 2:
@@ -255,7 +264,10 @@ def _count_pixels(
     seed: int,
     spp: int,
 ) -> int:
-    """Count the pixels that show a texture: they differ if it is white or black.
+    """Count the pixels that show a texture.
+
+    The albedo of the scene is rendered with a white and with a black texture. The
+    pixels that differ show the texture.
 
     Args:
         renderer: renderer of the scene.
@@ -282,8 +294,9 @@ def _count_visible_texels(
 ) -> int:
     """Count the texels of a texture that reach the camera directly.
 
-    These are the ones by which the sum of all pixels has a derivative, if light paths
-    have just two segments: from the light to the surface, and on to the camera.
+    The gradient of the sum of all pixels by the texels is rendered with light paths of
+    two segments: from the light to the surface, and on to the camera. A texel is
+    visible if its derivative is not 0.
 
     Args:
         renderer: renderer of the scene.
@@ -294,6 +307,7 @@ def _count_visible_texels(
     """
     scene = renderer.scene
     with scene.limit_depth(2):
+        # gradient of the sum of all pixels
         ones = torch.ones(*scene.resolution, 3)
         gradient = scene.render_adjoint(inputs, ones, seed, spp, wrt=[name])[name]
     return int((gradient.abs().amax(dim=-1) > 0.0).sum())

@@ -237,7 +237,11 @@ LOSSES = {
 
 
 def make_check_view(result: CheckResult) -> ShownResult:
-    """Return the view of a check."""
+    """Return the view of a check.
+
+    It has tables of derivatives, of the model's gradients, of the plan of a search, and
+    of what that plan leaves out.
+    """
     sections = [ResultPart(text=[READING] if result.rows else [])]
     for loss, title in LOSSES.items():
         derivatives = [
@@ -329,11 +333,11 @@ def _left_out_texts(result: CheckResult) -> list[str]:
 
 
 def find_inadequate(rows: Sequence[CheckedRow]) -> list[str]:
-    """Return the names of what no estimator is good enough for, each once.
+    """Return the names of parameters for which no estimator is good enough, each once.
 
-    For each parameter and loss the best row decides, since a plan need not use the
-    estimators of the others. Of the model's loss only gradients of whole controls
-    count, not single derivatives: what matters is where a gradient points.
+    For each parameter and loss only the best row counts, as a plan may use that
+    estimator alone. For the model's loss, gradients of full controls count and single
+    derivatives do not: an attack needs the direction of the gradient.
     """
     order = ("ok", "reference unusable", "noisy", "biased")
     best_rows: dict[tuple[str, ...], CheckedRow] = {}

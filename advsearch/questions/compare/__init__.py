@@ -153,13 +153,15 @@ class CompareConfig(SweepConfig):
 def compare(context: RunContext[CompareConfig]) -> CompareResult:
     """Compare models, objects or adversarial scenes pair by pair (docs/compare.md).
 
-    All other arguments are the settings of `advsearch compare`. The run is kept, in
-    `run` or under runs/. Models that exist in Python alone are swept first
-    (`sweep(scene, [one, other], run=...)`), and then the run is compared.
+    All other arguments are the settings of `advsearch compare`. The run is saved in the
+    directory `run`, or in a new one under runs/. Models that exist in Python only are
+    swept first, by `sweep(scene, [first_model, second_model], run=...)`, and then that
+    run is compared.
 
     Args:
-        compared: names or folders of runs of `sweep`: one of several models, or several
-            of the same draws. With `object`, names of models, which are shown it first.
+        compared: names or directories of runs of `sweep`: one run of several models, or
+            several runs that sampled the same scenes. With `object` they are names of
+            models, which are swept over that object first.
     """
     # these import torch and pandas
     from advsearch.questions.compare.images import PairImages
@@ -174,6 +176,7 @@ def compare(context: RunContext[CompareConfig]) -> CompareResult:
     warnings = find_comparison_warnings(sides, differ)
 
     images = PairImages(context)
+    # The first side is compared with each of the others.
     pairs: list[ComparedPair] = []
     for number, side in enumerate(sides[1:], start=1):
         context.progress.stage("counting pairs")
@@ -261,12 +264,14 @@ def find_comparison_warnings(sides: Sequence[Side], differ: Sequence[str]) -> li
     """Return warnings about the sides of a comparison.
 
     Args:
-        sides: what is compared.
-        differ: the settings in which their sweeps differ.
+        sides: the predictions that are compared, such as those of two models.
+        differ: names of the settings in which their sweeps differ, for example
+            ["model"].
     """
     if not sides:
         return []
     warnings = [text for side in sides for text in side.sweep.summary.warnings]
+    # A difference in one setting is what the comparison is about.
     if len(differ) > 1:
         names = f"{', '.join(differ[:-1])} and {differ[-1]}"
         warnings.append(

@@ -45,11 +45,11 @@ class PairImages:
     def list_examples(
         self, first: Side, second: Side, pair_number: int
     ) -> Iterator[PairPicture]:
-        """Yield pairs of which one prediction is right, the largest margin gaps first.
+        """Yield pairs in which only one prediction is right, largest differences first.
 
-        There are at most as many in favor of either side as the setting `pictures`
-        says. Their images are stored in the run; a pair of which one cannot be has
-        none.
+        The difference is that of the margins. The setting `pictures` limits the number
+        of pairs in favor of each side. Their images are stored in the run. If one image
+        of a pair cannot be stored, the pair has none.
 
         Args:
             first, second: the sides, with rows in the same order.
@@ -88,7 +88,7 @@ class PairImages:
         """Store the images of rows: thumbnails of the sweeps, or else renderings.
 
         Args:
-            rows: indices of the pairs.
+            rows: indices of the pairs whose images are stored.
             sides: those with images of their own, by the letter in the file's name.
             files: files of each row, one for each of these sides.
             run: the run directory.
@@ -150,10 +150,10 @@ def _round_values(side: Side, row: int) -> dict[str, str | float]:
 
 
 def select_examples(first: Side, second: Side, limit: int) -> list[int]:
-    """Return the indices of the pairs in which one side alone is right.
+    """Return the indices of the pairs in which only one side is right.
 
-    At most `limit` are those of the first side, and as many those of the second. The
-    largest differences of the margins come first; unknown ones count as 0.
+    There are at most `limit` pairs for each side. The largest differences of the
+    margins come first; an unknown difference counts as 0.
     """
     margin_gap = (first.rows["margin"] - second.rows["margin"]).fillna(0.0)
     only_first = first.is_right & ~second.is_right

@@ -25,14 +25,16 @@ IntArray = npt.NDArray[np.int64]
 def compare_sides(
     first: Side, second: Side, seed: int, *, with_rules: bool = True
 ) -> ComparedPair:
-    """Count the pairs of two sides; `shown` has no examples yet.
+    """Count the pairs of two sides, and test whether they differ.
 
-    `worse` has rules under which only the first side is right, `better` those for the
-    second; None without rules.
+    A side is what is compared, such as the predictions of one model. `worse` of the
+    result has rules under which only the first side is right, and `better` those for
+    the second. Both are None if rules are not sought. `shown` has no examples yet.
 
     Args:
-        first, second: sides with the same draws.
-        seed: chooses which half of the pairs chooses rules, and which counts them.
+        first, second: sides with the same sampled scenes, in the same order.
+        seed: seed of the split in halves: rules are found in one half of the pairs and
+            counted in the other, so that the counts are not biased.
         with_rules: whether to look for rules.
 
     Raises:
@@ -41,6 +43,7 @@ def compare_sides(
     shared_parameters = [
         name
         for name in first.varying_parameters
+        # a parameter that both sides sampled, with the same value in each pair
         if name in second.rows.attrs["units"]
         and has_same_values(first.rows[name], second.rows[name])
     ]
@@ -100,7 +103,7 @@ def count_by_parameter(first: Side, second: Side, name: str) -> Iterator[PairPar
 def count_pairs(
     first_right: BoolArray, second_right: BoolArray, unit_of_pair: IntArray
 ) -> dict[str, Any]:
-    """Return the fields of `PairCounts`.
+    """Return the fields of `PairCounts`: counts, accuracies, and their difference.
 
     Args:
         first_right, second_right: whether each side is right (n,).
@@ -133,14 +136,15 @@ def count_pairs(
 def split_by_value(
     column: pd.Series, edges: Sequence[float] | None
 ) -> Iterator[tuple[Any, BoolArray]]:
-    """Yield each value of a parameter, or part of its range, and the mask of its rows.
+    """Yield the values of a parameter, or parts of its range, with masks of their rows.
 
-    Names and few different numbers are values; many numbers without edges yield
-    nothing. A mask is (n,).
+    Each name, or each of a few different numbers, is a value. Many different numbers
+    are divided at the edges; without edges nothing is yielded. A mask is (n,).
 
     Args:
-        column: (n,) of the parameter.
-        edges: bounds of the parts, ascending, as the sweep says; None if it does not.
+        column: value of the parameter in each row (n,).
+        edges: ascending bounds of the parts of the range, as the sweep defines them;
+            None if it defines none.
     """
     if column.dtype == "category":
         for name in column.cat.categories:
@@ -153,6 +157,7 @@ def split_by_value(
             yield bounds, bins == index
     elif column.nunique() <= MAX_VALUES:
         for value in np.unique(column):
+            # so that 0.1 is not printed as 0.10000000149, its nearest float32
             rounded_value = float(f"{value:.6g}")
             yield rounded_value, np.asarray(column == value)
 
@@ -160,12 +165,16 @@ def split_by_value(
 def find_pair_rules(
     table: pd.DataFrame, is_only_right: BoolArray, seed: int
 ) -> list[PairRule] | None:
-    """Find rules under which only one side is right more often; None for too few pairs.
+    """Find rules under which only one side is right more often than elsewhere.
+
+    A rule is a combination of conditions, such as "distance above 3 m and night". The
+    result is None if there are too few pairs, or no parameters.
 
     Args:
         table: table of pairs, as `rules.make_table` makes it.
-        is_only_right: whether that side alone is right (n,).
-        seed: seed of the halves that choose and count.
+        is_only_right: whether, in each pair, the one side is right and the other is
+            wrong (n,).
+        seed: seed of the split in halves: one finds the rules, the other counts them.
     """
     # Rules say where `correct` is rare: here where that side alone is right.
     table = table.assign(correct=~is_only_right)

@@ -206,7 +206,10 @@ MAX_PICTURES = 3
 
 
 def make_compare_view(result: CompareResult) -> ShownResult:
-    """Return the view of a comparison."""
+    """Return the view of a comparison.
+
+    It has a table of all sides, then sections for each pair.
+    """
     columns: dict[str, views.Column] = {
         "": "{0.name}",
         "right in": "{0.correct} of {0.configurations}",
@@ -214,6 +217,7 @@ def make_compare_view(result: CompareResult) -> ShownResult:
         "95 % interval": lambda side: wording.format_interval(side.interval),
         "time a prediction": lambda side: format_prediction_time(side.seconds),
     }
+    # Only detectors have outcomes, such as "missed".
     if any(side.outcomes for side in result.sides):
         columns["the others"] = lambda side: wording.format_outcomes(
             side.outcomes, result.task
@@ -276,10 +280,17 @@ def describe_exclusive_pairs(pair: ComparedPair) -> str:
 
 
 def _pair_sections(pair: ComparedPair, *, has_others: bool) -> Iterator[ResultPart]:
-    """Yield the sections about one pair of sides."""
+    """Yield the sections about one pair of sides.
+
+    Args:
+        pair: the pair.
+        has_others: whether there are further pairs. Then the difference is described
+            here; for a single pair the summary of the result describes it.
+    """
     sentences = [describe_exclusive_pairs(pair)]
     if has_others:
         sentences.insert(0, summarize_difference(pair))
+    # a table of 2 x 2: the first side right or wrong, by the second side right or wrong
     heads = ["", f"{pair.second} right", f"{pair.second} wrong"]
     rows = [
         [f"{pair.first} right", str(pair.both), str(pair.first_only)],
@@ -304,8 +315,8 @@ def _pair_sections(pair: ComparedPair, *, has_others: bool) -> Iterator[ResultPa
 def _parameter_tables(pair: ComparedPair) -> Iterator[ResultPart]:
     """Yield a table for each parameter.
 
-    A terminal shows the `MAX_TABLES` parameters over whose values the difference varies
-    most, and a sentence about the others.
+    The page has all tables. A terminal has those of the `MAX_TABLES` parameters over
+    whose values the difference varies most, and a sentence about the rest.
     """
     parts_by_title: dict[str, list[PairPart]] = {}
     for part in pair.parts:
@@ -383,7 +394,7 @@ def _worse_texts(
     Args:
         rules: rules under which only the better side is right; None if they were not
             sought.
-        n_exclusive: pairs that only the better side gets right.
+        n_exclusive: number of pairs that only the better side gets right.
         better_side, worse_side: names of the sides.
     """
     if rules is None or not n_exclusive:
@@ -422,12 +433,12 @@ def _captions(example: PairPicture, pair: ComparedPair) -> list[str]:
 def _pictures_of(name: str, pair: ComparedPair) -> Iterator[ResultPart]:
     """Yield the images of pairs that only one side gets right.
 
-    One part is for a terminal: a line with the files of the first pairs. One is for a
-    page: a group of images for each pair, all in one group if each pair has a single
-    image; and lines of pairs without images.
+    The part for a terminal has a line for each of the first pairs, with the paths of
+    its images. The part for a page has a group of images for each pair, and lines for
+    pairs without images. If each pair has a single image, all are in one group.
 
     Args:
-        name: name of the side.
+        name: name of the side that is right.
         pair: pair of both sides.
     """
     title = f"Only {name} gets right:"

@@ -82,13 +82,14 @@ class Side:
 def read_sides(paths: Sequence[Path]) -> list[Side]:
     """Read the sides that sweeps compare, each with a different name.
 
-    A sweep has a side for each of its models. The sweep of an adversarial scene has
-    these without it and with it; along with other sweeps, only with it. Images in which
-    the object is out of view of one side are left out of all.
+    A sweep has a side for each of its models. The sweep of an adversarial scene has two
+    sides for each model: the clean scene and the adversarial one. If several sweeps are
+    compared, it has only the latter. An image is left out if the object is out of view
+    in any side.
 
     Raises:
         FileFormatError: a folder has another run, or a sweep that has not ended.
-        InputError: there is nothing to compare, or sweeps are of other draws.
+        InputError: there is nothing to compare, or the sweeps sampled different scenes.
     """
     sides = [
         side
@@ -118,10 +119,11 @@ def read_sides(paths: Sequence[Path]) -> list[Side]:
 
 
 def name_sides(sides: Sequence[Side]) -> list[str]:
-    """Return a different name for each side: what it is in the columns that differ.
+    """Return a different name for each side.
 
-    If some names are still equal, the directory of the sweep precedes them; if that is
-    not enough, a number.
+    A name lists the values of the columns in which the sides differ, for example the
+    model. If some names are still equal, the directory of the sweep precedes them, and
+    if that is not enough, a number.
     """
     columns = _find_different_columns(sides)
     names = []
@@ -153,7 +155,9 @@ def _find_different_columns(sides: Sequence[Side]) -> list[str]:
 
 
 def read_sweep_sides(path: Path, *, is_only_sweep: bool) -> Iterator[Side]:
-    """Yield the sides of one sweep, without names: the rows of one model and one scene.
+    """Yield the sides of one sweep, which have no names yet.
+
+    A side has the rows of one model and one scene (clean or adversarial).
 
     If the sweep has an adversarial scene, its clean scene comes first, but only if no
     other sweep is compared.
@@ -167,6 +171,7 @@ def read_sweep_sides(path: Path, *, is_only_sweep: bool) -> Iterator[Side]:
     """
     sweep, rows = _read_finished_sweep(path)
     models = sweep.config.models
+    # Rows of one image follow each other, one for each model.
     model_index = rows["step"] % len(models)
     rows["number"] = rows["step"] // len(models)
     rows["correct"] = rows["correct"] == 1
@@ -214,13 +219,13 @@ def _read_finished_sweep(path: Path) -> tuple[workbench.StoredSweep, pd.DataFram
 
 
 def check_same_draws(first: Side, second: Side) -> None:
-    """Check that the sweeps of two sides have the same draws.
+    """Check that the sweeps of two sides sampled the same scenes.
 
-    That is the same settings of the draws, as many images, and, of one object, the same
-    values of all sampled parameters that both have.
+    Settings of the sampling and the number of images have to be equal. If both have the
+    same object, the values of all sampled parameters that both have are compared, too.
 
     Raises:
-        InputError: they have not.
+        InputError: they sampled different scenes.
     """
     if first.sweep.folder == second.sweep.folder:
         return

@@ -26,18 +26,19 @@ from advsearch.questions.harden.result import (
 def harden(context: RunContext[HardenConfig], **arguments: Any) -> HardenResult:
     """Train a copy of a model on its worst cases (docs/harden.md).
 
-    All other arguments are the settings of `advsearch harden`. The run is kept, in
-    `run` or under runs/. The model that is given stays as it is.
+    All other arguments are the settings of `advsearch harden`, such as `objects` or
+    `steps`. The run is saved in the directory `run`, or in a new one under runs/. Only
+    a copy of the model is trained: the model itself does not change.
 
     Args:
         model: a classifier, a detector or a segmenter: what `load_model` takes, and no
             exported program.
-        optimiser: makes one of the list of parameters, such as ``lambda p:
-            torch.optim.SGD(p, 0.01)``; its learning rate is then the highest, in place
-            of `rate`.
-        beside: batches of further examples, such as a `DataLoader`: images (N, H, W, 3)
-            sRGB in [0, 1], class indices (N,). One is taken with each step. Not of a
-            detector, which `data` is for.
+        optimiser: function that takes the list of parameters and returns an optimizer,
+            such as ``lambda p: torch.optim.SGD(p, 0.01)``. Its learning rate replaces
+            `rate` as the highest one.
+        beside: batches of your own training examples, such as a `DataLoader`: images
+            (N, H, W, 3) sRGB in [0, 1], class indices (N,). Each step also trains with
+            one of these batches. For classifiers only; a detector takes `data`.
         loss: loss of a detector whose network returns none in training: a function of
             the network, its input (N, 3, H, W) and, for each picture, a mapping with
             "boxes" (K, 4), x0, y0, x1, y1 in pixels of that input, and "labels" (K,),

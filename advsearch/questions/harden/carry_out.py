@@ -100,8 +100,12 @@ def run_hardening(
 
     Args:
         context: the settings and the run.
-        model: a loaded one in place of the one that the settings name.
-        optimiser, beside, loss: as for `advsearch.harden`.
+        model: loaded model that replaces the one that the settings name.
+        optimiser: function from a list of parameters to an optimizer; None for the
+            default one.
+        beside: batches of the user's own images and class indices, which a classifier
+            is trained with in addition.
+        loss: training loss of a detector or a segmenter whose network returns none.
     """
     config = context.config
     context.progress.stage(workbench.LOADING)
@@ -111,7 +115,9 @@ def run_hardening(
     splits = scenes.make_splits(config, original_model)
     work = SceneJobs(config, original_model, splits, context.progress)
     trainer = make_trainer(work, optimiser, examples=beside, loss=loss)
-    # `beside` is of classifiers only, `loss` of the others.
+    # A run that continues has to get the same Python arguments as before. Only those
+    # that the task uses are compared: `beside` is for classifiers, `loss` for the other
+    # tasks.
     arguments: dict[str, Any] = {"optimiser": optimiser, "loss": loss}
     if config.task_name == "classification":
         arguments = {"optimiser": optimiser, "beside": beside}
@@ -158,11 +164,11 @@ def check_settings(
 
     Args:
         config: the settings.
-        beside: further batches of images; for classifiers only.
+        beside: batches of the user's own images, for classifiers only.
         loss: loss for detectors and segmenters only.
 
     Raises:
-        InputError: one of them does not.
+        InputError: a setting or an argument belongs to another task.
     """
     task_name = config.task_name
     is_classifier = task_name == "classification"
@@ -264,16 +270,23 @@ class Hardening:
     def execute(self, context: RunContext[HardenConfig]) -> None:
         """Measure the model, train it, and measure it again.
 
-        Whatever an earlier session of the run has done is not done again.
+        A run that was stopped continues: what is stored of its earlier part is not
+        computed again.
         """
         splits = self.scenes.splits
+        # A scene that the model was trained on must not measure it.
         scenes.check_disjoint(
             splits[HELD_OUT], [splits[name] for name in (TRAINING, FURTHER, VALIDATION)]
         )
+        # Garbage is collected after each scene. Frozen objects are not visited then,
+        # which saves a sixth of the time.
         gc.freeze()  # for the same reason as in `load_scene_work`
         try:
             context.stages.begin("measurement", MEASUREMENTS["before"].title)
             self._measure("before", weights=None)
+            # "stronger" is a second attack with several policies and more steps. It
+            # shows whether the model resists, or only misleads the first attack's
+            # gradients.
             self._measure("stronger_before", weights=None)
 
             context.stages.begin("training", "training")
@@ -314,12 +327,15 @@ class Hardening:
 
         Args:
             name: a key of `MEASUREMENTS`.
-            weights: safetensors; None for those that the model was loaded with.
+            weights: the network's weights as bytes of a safetensors file; None for
+                those that the model was loaded with.
         """
         measurement = MEASUREMENTS[name]
         steps_factor = 1
         if measurement.weaker is not None:
             steps_factor = scenes.STRONGER_STEPS_FACTOR
+            # Where the weaker search has found a failure already, the stronger one need
+            # not run.
             self._record_weaker(name, measurement.weaker)
         to_attack = self._list_unmeasured(name)
         jobs = [
@@ -405,7 +421,10 @@ class Hardening:
     def make_result(
         self, context: RunContext[HardenConfig], warnings: list[str]
     ) -> HardenResult:
-        """Return the result of the run, as far as it is measured."""
+        """Return the result of the run, as far as it is measured.
+
+        Values that are not measured yet, because the run was stopped, are None.
+        """
         config = self.config
         is_done = context.ending == "done"
         is_unchanged = self.rounds.best == 0  # round 0 is the original network
@@ -413,6 +432,7 @@ class Hardening:
             text = (
                 "No round kept the clean accuracy, so the weights are the model's own."
             )
+            # A new list: the caller's list does not change.
             warnings = [*warnings, text]
         before = self._find_robust("before", config.controls)
         after = self._find_robust("after", config.controls)
@@ -546,7 +566,8 @@ def make_share(
         is_right: whether each image is right (scenes * views), all views of a scene
             after each other; None if they are not measured.
         views: images of each scene, which are not independent.
-        outcomes: counts of what becomes of the object in the others.
+        outcomes: counts of what happens to the object in the images that are not right,
+            for example {"missed": 3}.
     """
     if is_right is None:
         return None
@@ -554,6 +575,8 @@ def make_share(
         sum(is_right[start : start + views]) for start in range(0, len(is_right), views)
     ]
     n_views = [views] * len(right_views)
+    # The views of a scene are one cluster: the interval is computed from the number of
+    # right views of each scene.
     return Share(
         accuracy=sum(is_right) / len(is_right),
         interval=statistics.clustered.rate_interval(right_views, n_views),

@@ -51,8 +51,12 @@ def sample_lobe(
 ) -> npt.NDArray[np.float64]:
     """Sample a broad light from above the horizon, as an environment map (H, W).
 
-    It falls off as exp(sharpness * (cosine - 1)), with the cosine of the angle from its
-    middle. Values are relative to the mean of the environment that it is added to.
+    It falls off as exp(sharpness * (cosine - 1)), where `cosine` is that of the angle
+    between a texel's direction and the light's. Values are relative to the mean of the
+    environment that it is added to.
+
+    The color is not part of it. Values decrease from the center of the light in all
+    directions, as those of a von Mises-Fisher density do.
 
     Args:
         height, width: height and width of the map, which has the zenith at the top and
@@ -62,12 +66,15 @@ def sample_lobe(
     # zenith angle and azimuth of each texel, and of the light
     theta = (np.arange(height) + 0.5)[:, None] * math.pi / height
     phi = (np.arange(width) + 0.5)[None, :] * 2.0 * math.pi / width
+    # Zenith angles up to 1.3 rad (74 degrees) are above the horizon.
     light_theta = rng.uniform(0.1, 1.3)
     light_phi = rng.uniform(0.0, 2.0 * math.pi)
-    # of the angle between both directions
+    # Spherical law of cosines: cos(angle) = cos(a) cos(b) + sin(a) sin(b) cos(phi -
+    # phi').
     vertical = np.cos(theta) * math.cos(light_theta)
     horizontal = np.sin(theta) * math.sin(light_theta)
     cosine = vertical + horizontal * np.cos(phi - light_phi)
+    # Sharpness 20 is a light of about 15 degrees to half its strength, 150 one of 5.5.
     sharpness = rng.uniform(20.0, 150.0)
     strength = rng.uniform(2.0, 12.0)
     return np.asarray(strength * np.exp(sharpness * (cosine - 1.0)))

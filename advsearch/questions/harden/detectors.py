@@ -101,6 +101,7 @@ class Example(NamedTuple):
         boxes = torch.zeros(0, 4, dtype=torch.float32)
         if box:
             boxes = torch.tensor([box], dtype=torch.float32)
+        # The first label is the one that training uses where several are right.
         labels = torch.tensor([truth.labels[0]] * len(boxes), dtype=torch.int64)
         return cls(
             levels=color.to_uint8(problem.picture(configuration, seed, SPP)),
@@ -125,6 +126,9 @@ def read_coco(directory: Path, model: Model) -> list[Example]:
     It has `annotations.json` and `images/`. Categories that are no label of the model
     are left out.
 
+    The file is not trusted: its size is limited, and names that lead outside of
+    `images/` are rejected.
+
     Raises:
         FileFormatError: it is something else, or names files outside of it.
         InputError: no category is a label of the model.
@@ -137,6 +141,7 @@ def read_coco(directory: Path, model: Model) -> list[Example]:
         )
         label_of_category = {
             category["id"]: model.labels.index(str(category["name"]))
+            # Predictions of the model have no index for other categories.
             for category in coco["categories"]
             if str(category["name"]) in model.labels
         }
@@ -243,13 +248,14 @@ def compute_network_loss(
 ) -> Tensor:
     """Return the loss that a network computes itself in training.
 
-    Networks of torchvision take lists of images and targets, those of transformers take
-    `labels`; any other network's `forward` takes targets after its input. A mapping of
-    losses is summed.
+    How it is called depends on the network. Networks of torchvision take lists of
+    images and targets, those of transformers take `labels`; any other network's
+    `forward` takes targets after its input. If it returns a mapping of several losses,
+    they are summed.
 
     Args:
         network: network in training mode.
-        x: the network's input.
+        x: the network's input (N, 3, H, W).
         targets: the ground truth of each image.
 
     Raises:
@@ -265,6 +271,7 @@ def compute_network_loss(
     elif len(inspect.signature(network.forward).parameters) > 1:
         loss = network(x, list(targets))
     if isinstance(loss, Mapping):
+        # `sum` makes a scalar of each loss, which may have shape () or (1,).
         loss = torch.stack([part.sum() for part in loss.values()]).sum()
     if not isinstance(loss, Tensor) or loss.numel() != 1:
         raise errors.ModelError(
@@ -273,6 +280,7 @@ def compute_network_loss(
             "mapping of losses; or give `loss`, a function of network, input and "
             "targets, in Python"
         )
+    # from one element of any shape to a scalar, which `backward` needs
     return loss.sum()
 
 
@@ -342,6 +350,8 @@ class DetectorTrainer(Trainer):
         for number in scene_numbers:
             name, scene = scene_split.load_scene(number)
             for control in controls:
+                # The seed is derived from control and scene number, so that a run that
+                # continues, or one with other controls, samples the same.
                 seed = seeds.stream(scene_split.seed, f"search {control}", number)
                 plain_image, worst_image = self._attack(scene, name, control, seed)
                 plain.append(plain_image)
@@ -385,8 +395,12 @@ class DetectorTrainer(Trainer):
     def gradient_context(self, new: Sequence[Example]) -> Iterator[ComputeGradient]:
         """Put the network into training mode while gradients are computed.
 
-        Its batch normalization and dropout stay in evaluation mode. Afterwards all of
-        it is in evaluation mode.
+        Many detectors return losses only in training mode. Batch normalization and
+        dropout stay in evaluation mode, as batches are too small for statistics.
+        Afterwards the full network is in evaluation mode again.
+
+        Args:
+            new: new items of the round; not used here.
         """
         network = self.student.network.train()
         for module in network.modules():
@@ -413,21 +427,26 @@ class DetectorTrainer(Trainer):
     def make_input(self, item: Example, is_mirrored: bool) -> tuple[Tensor, Target]:
         """Return the network's input (1, ...) for an image, and its target.
 
-        The target has "boxes" (K, 4), x0, y0, x1, y1 in pixels of the input, and
-        "labels" (K,).
+                The target has "boxes" (K, 4), x0, y0, x1, y1 in pixels of the input, and
+                "labels" (K,).
+        # The mean or sum over the batch is the matter of `loss`.
 
-        Args:
-            item: the image and its boxes.
-            is_mirrored: whether image and boxes are mirrored.
+                Args:
+                    item: the image and its boxes.
+                    is_mirrored: whether image and boxes are mirrored.
         """
         levels = item.levels
         boxes = item.boxes
         height, width = item.levels.shape[:2]
         if is_mirrored:
             levels = levels.flip(1)
+            # A mirrored point has x' = width - x, so the left edge comes from the right
+            # one.
             x0, y0, x1, y1 = boxes.unbind(dim=1)
             boxes = torch.stack([width - x1, y0, width - x0, y1], dim=1)
         input_height, input_width = self.student.model.input_size
+        # Boxes are scaled as the image is when it is resized to the network's input
+        # size.
         scale = torch.tensor([input_width / width, input_height / height] * 2)
         x = self.student.model.prepare(levels[None] / 255.0)[:1]
         return x, {
@@ -498,7 +517,14 @@ class DetectorTrainer(Trainer):
 def _annotate(
     annotation_id: int, image_id: int, box: Sequence[float], label: int
 ) -> dict[str, Any]:
-    """Return COCO's annotation of a box (x0, y0, x1, y1)."""
+    """Return the annotation of a box in COCO's format: corner, width and height.
+
+    Args:
+        annotation_id: number of the annotation in the file.
+        image_id: number of the image in the file.
+        box: x0, y0, x1, y1 in pixels.
+        label: index of the class.
+    """
     left, top, right, bottom = box
     width = right - left
     height = bottom - top
@@ -519,6 +545,11 @@ def write_images(
 
     Yields:
         Each item with the name of its image, without ".png".
+
+    Args:
+        run: run directory.
+        directory: directory of the images inside the run.
+        items: items with their images.
     """
     for number, item in enumerate(items, 1):
         (run.path / directory).mkdir(parents=True, exist_ok=True)
@@ -582,15 +613,17 @@ def compute_pixel_loss(
 ) -> Tensor:
     """Return the loss of a segmenter.
 
-    Networks of transformers compute it from `labels`. Of others it is half the sum of
-    the mean cross-entropy of the object's pixels and that of all others, over all
-    images; without such pixels that is 0.
+    Networks of transformers compute it from `labels`. For other networks the loss is
+    (mean cross-entropy of the object's pixels + mean cross-entropy of all other pixels)
+    / 2, over all images. So the object counts as much as the rest, however small it is.
+    A mean over no pixels is 0.
 
     Args:
         task: reads the network's output.
         network: network in training mode.
         x: the network's input.
-        targets: "classes" and "object" of each image.
+        targets: for each image, "classes" (h, w) int64, the right class of each pixel,
+            and "object" (h, w) bool, the object's pixels.
     """
     classes = torch.stack([target["classes"] for target in targets])
     is_object = torch.stack([target["object"] for target in targets])

@@ -133,7 +133,9 @@ class RenderedLesson(Lesson):
     def create(
         cls, right_classes: tuple[int, ...], plain: Tensor, images: Tensor
     ) -> RenderedLesson:
-        """Create a lesson whose first image is the worst so far.
+        """Create a lesson whose images have not been evaluated yet.
+
+        Their losses are infinite until then, so the first image counts as the worst.
 
         Args:
             right_classes: indices of the right classes.
@@ -164,6 +166,9 @@ def make_lessons(
 ) -> list[Lesson]:
     """Make lessons from views of one scene, each with its own sampled conditions.
 
+    A lesson holds what one training step needs of a scene: an image with its right
+    classes, and the worse images that the step chooses from.
+
     Args:
         problem: the scene with the controls that make it harder.
         n_views: number of views that have worst images.
@@ -173,8 +178,11 @@ def make_lessons(
             light transport does not give the images (see `sample_configurations`). None
             renders each view twice: with a single control changed, and with all of
             them.
-        shares_texture: whether the views have one adversarial texture.
+        shares_texture: whether one adversarial texture is optimized for all views, in
+            place of one for each view.
     """
+    # With a matrix of light transport an image is a linear function of the texture, so
+    # the texture can be optimized in each training step without a render.
     has_matrix = bool(n_views) and problem.is_linear
     lessons = list[Lesson]()
     with torch.no_grad(), problem.renderer.scene.limit_depth(MAX_DEPTH):
@@ -196,13 +204,20 @@ def _make_texture_lessons(
 ) -> list[TextureLesson]:
     """Make a lesson with a matrix of light transport for each view of a scene.
 
-    Each view has conditions of its own. Its texture begins at a random extreme
-    configuration. With `shares_texture` that is one tensor for all views, which a step
-    of one of them changes for all.
+    Each view has sampled conditions of its own. Its texture starts at a random
+    configuration whose values are all at a bound. With `shares_texture` all lessons
+    hold the same tensor, so that a step of one of them changes the texture of all.
+
+    Args:
+        problem: the scene with the controls that are searched.
+        views: number of views, which is the number of lessons.
+        seed: root of the samples.
+        shares_texture: whether all views share one texture.
     """
     right_classes = _find_right_classes(problem)
     domain = problem.domain
-    # Lessons do not hold the scene, which takes much memory.
+    # The lessons stay in memory for the full training, so they do not hold the scene,
+    # which is large.
     space = replace(problem.searched_space, scene=None)
     full_space = replace(problem.space, scene=None)
     shared_texture = _sample_texture(domain, seed)
@@ -245,6 +260,12 @@ def _make_rendered_lessons(
     With `n_tries` the plain image is that of the start, and there are as many others.
     Without it, the plain image has one random control changed, and the only other image
     has all of them changed.
+
+    Args:
+        problem: the scene with the controls that are varied.
+        views: number of views, which is the number of lessons.
+        seed: root of the samples.
+        n_tries: number of random configurations of each view, or None.
     """
     right_classes = _find_right_classes(problem)
     render = problem.renderer.copy_with(quick=True)
@@ -306,10 +327,16 @@ def sample_configurations(
 ) -> Tensor:
     """Sample configurations (count, d) at random.
 
-    In half of them each value is moved by chance to the nearer bound of its range, as
-    searches end where several values are at bounds. Choices and periodic values have no
-    bounds. The controls change each by itself in turn, then all together, then the
-    first by itself again; a control that does not change is at its start.
+    In about half of the configurations, each value is moved with probability 1/2 to the
+    nearer bound of its range, since searches often end with values at bounds. Choices
+    and periodic values have no bounds. Sample by sample, the first control changes
+    alone, then the second, and so on, then all together, and then the first again. A
+    control that does not change has its start values.
+
+    Args:
+        domain: the searched space with its bounds.
+        generator: source of randomness.
+        count: number of configurations.
     """
     samples = domain.sample(generator, count)  # (count, d)
     is_at_bound = torch.rand(samples.shape, generator=generator) < 0.5
@@ -399,8 +426,9 @@ def search_worse_images(
 def _update_losses(batch: Sequence[Lesson], model: Model) -> None:
     """Compute the losses of all images of the lessons that have several rendered ones.
 
-    The images of all these lessons are evaluated as one batch, and their losses divided
-    among the lessons again.
+    The images of all these lessons are evaluated as one batch, which is faster. Each
+    lesson then gets the losses of its own images (K,), so that the worst of them can be
+    selected. A lesson with a single image has nothing to select.
     """
     rendered_lessons = [
         lesson
@@ -419,6 +447,8 @@ def _update_losses(batch: Sequence[Lesson], model: Model) -> None:
     for lesson, lesson_losses in zip(
         rendered_lessons, losses.split(n_images), strict=True
     ):
+        # `clone`, as `split` returns views that keep the losses of all lessons in
+        # memory.
         lesson.losses = lesson_losses.clone()
 
 
@@ -429,7 +459,8 @@ def ascend_textures(
 ) -> None:
     """Take steps of steepest ascent with the textures of lessons, in place.
 
-    Views that share a texture sum up their gradients. Other lessons are unchanged.
+    Gradients of views that share a texture are summed, and the texture takes one step.
+    Lessons without a texture do not change.
 
     Args:
         selected: the lessons.
@@ -451,6 +482,7 @@ def ascend_textures(
             texture_id = id(lesson.texture)
             gradient_sums[texture_id] = gradient + gradient_sums.get(texture_id, 0.0)
         for texture_id, lesson in lesson_of_texture.items():
+            # one unit step uphill, in the norm of the domain
             direction = lesson.domain.steepest(
                 lesson.texture, gradient_sums[texture_id]
             )
@@ -490,6 +522,12 @@ def save_lesson_images(
     ``.png`` of each image, a ``.cls`` with the index of its class, and a ``.json`` with
     that and the kind of image. Members have no time and no owner, so that equal images
     make equal files.
+
+    Args:
+        run: run directory.
+        number: number of the round.
+        selected: lessons of the round.
+        labels: names of the model's classes.
     """
     for index, lesson in enumerate(selected):
         class_index = lesson.right_classes[0]

@@ -81,13 +81,14 @@ def make_trainable(
 ) -> Trainable:
     """Copy a model's network to train it further.
 
-    It stays in evaluation mode: statistics of batches stay what they were learned as,
-    and nothing is dropped.
+    The copy stays in evaluation mode: batch normalization uses the statistics that it
+    was trained with, and dropout does nothing.
 
     Args:
-        model: whose network is copied.
+        model: model whose network is copied; it does not change.
         layers: "all", or "last" for the last one that has parameters.
-        logits: whether it has to return logits.
+        logits: whether the network has to return logits, as the loss of a classifier
+            needs.
 
     Raises:
         ModelError: the network cannot be trained, has no parameters, or returns
@@ -100,7 +101,8 @@ def make_trainable(
     network = model.copy_network()
     network.eval().requires_grad_(True)
     if layers == "last":
-        # in the order of definition
+        # Layers come in the order of their definition, so the last one is usually the
+        # head.
         layers_with_parameters = [
             layer
             for layer in network.modules()
@@ -176,7 +178,10 @@ class Augmentation:
         return x
 
     def _crop(self, images: Tensor, generator: Generator) -> Tensor:
-        """Resample mirrored, rotated and scaled crops of images (N, 3, H, W)."""
+        """Resample mirrored, rotated and scaled crops of images (N, 3, H, W).
+
+        Each image gets its own random crop. The size of the images stays the same.
+        """
         count = len(images)
         scale = _uniform(
             self.smallest_crop, self.largest_crop, count, generator=generator

@@ -314,7 +314,10 @@ ShareChanges = Mapping[str, tuple[Share | None, Share | None]]
 
 
 def make_harden_view(result: HardenResult) -> ShownResult:
-    """Return the view of a hardening."""
+    """Return the view of a hardening.
+
+    The page has all tables; the terminal has the text, the facts and the first table.
+    """
     facts = {
         "model": result.model,
         "searched with": result.search,
@@ -410,7 +413,10 @@ def _draw_shares(axes: Any, shares: ShareChanges, model: str) -> None:
 
 
 def _summarize(result: HardenResult) -> str:
-    """Describe in words how robust and how accurate the model was and is."""
+    """Describe in words how robust and how accurate the model was and is.
+
+    The run may have stopped before all of it was measured.
+    """
     before = result.before
     after = result.after
     clean_before = result.clean_before
@@ -427,6 +433,7 @@ def _summarize(result: HardenResult) -> str:
         outcomes = wording.format_outcomes(share.outcomes, result.task)
         if outcomes:
             text += f" {when}, the other plain pictures are {outcomes}."
+    # `lost` is None if the scenes before and after cannot be compared one by one.
     if result.lost is not None:
         text += (
             f" Scene by scene: {result.gained} got better, {result.lost} worse "

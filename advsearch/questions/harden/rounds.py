@@ -84,7 +84,15 @@ class Trainer(ABC):
         optimiser: MakeOptimizer | None = None,
         custom_items: Sequence[Any] = (),
     ) -> None:
-        """Set up the trainer, of which the class describes the arguments."""
+        """Set up the trainer.
+
+        Args:
+            work: samples scenes and items of the run.
+            student: the copy of the network that is trained.
+            optimiser: function from a list of parameters to an optimizer; None for
+                AdamW.
+            custom_items: the user's own items, which each round trains on.
+        """
         self.work = work
         self.config = work.config
         self.student = student
@@ -142,13 +150,14 @@ class Trainer(ABC):
     ) -> None:
         """Train the student on items.
 
-        It ends with the running average of its weights.
+        At the end the student gets the running average of its weights, which usually
+        generalizes better than the last ones.
 
         Args:
             number: number of the round, which decides the order of the items.
-            pool: all items.
+            pool: all items of this and earlier rounds.
             new: those that no earlier round has used.
-            tick: is called after each step.
+            tick: function that is called after each step, for the progress.
         """
         parameters = self.student.parameters()
         optimizer, schedule = self._make_optimizer(parameters, self.count_steps(pool))
@@ -159,6 +168,8 @@ class Trainer(ABC):
         with self.gradient_context(new) as compute_gradient:
             for n_steps, batch in enumerate(self._iterate_batches(pool, rng), start=1):
                 compute_gradient(batch, rng)
+                # A few very wrong images would otherwise make a step so large that it
+                # undoes others.
                 nn.utils.clip_grad_norm_(parameters, MAX_GRADIENT_NORM)
                 optimizer.step()
                 schedule.step()
@@ -206,6 +217,9 @@ class Trainer(ABC):
     ) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler]:
         """Create the optimizer of a round, and its schedule of learning rates.
 
+        The rate rises to its maximum in the warm-up and then falls to nearly 0 (one
+        cycle, Smith and Topin 2018, arXiv 1708.07120).
+
         Args:
             parameters: parameters that are trained.
             n_steps: number of steps of the round.
@@ -221,6 +235,7 @@ class Trainer(ABC):
             [float(group["lr"]) for group in optimizer.param_groups],
             total_steps=n_rates,
             pct_start=adjust_warm_up(self.warm_up_fraction, n_rates),
+            # not every optimizer has a momentum
             cycle_momentum=False,
         )
         return optimizer, schedule
@@ -238,7 +253,8 @@ def _interpolate(
 ) -> dict[str, Tensor]:
     """Return weights between the original (0) and the trained ones (1).
 
-    Those that are no floats, such as counters, are the trained ones.
+    Tensors that are not floating point, such as counters of batches, are the trained
+    ones.
     """
     interpolated = {
         name: torch.lerp(original[name], weight, interpolation)
@@ -322,8 +338,9 @@ class Rounds:
     def _run_rounds(self) -> None:
         """Run the rounds that are left; round 0 evaluates the original model.
 
-        Items of rounds that have ended are sampled again, since later rounds train on
-        them too.
+        A run that was stopped continues after its last stored round. Items are not
+        stored: those of earlier rounds are sampled again from their seeds, since later
+        rounds train on them too.
         """
         trainer = self.trainer
         n_scenes = self.config.scenes
@@ -338,6 +355,7 @@ class Rounds:
             self.store_round(0, [], original_score, n_trained=0, interpolation=0.0)
         pool = list(trainer.custom_items)
         n_used = 0  # items of the pool that an earlier round of this session has used
+        # Round 0 is the original model, so the first round of training is 1.
         for number in range(1, self.config.rounds + 1):
             trainer.student.network.load_state_dict(self.read_weights(number - 1))
             new_items = trainer.sample_items(
@@ -361,12 +379,13 @@ class Rounds:
         Args:
             number: number of the round.
             pool: items that it is trained on.
-            n_used: the first items of the pool, which earlier rounds have used: they
-                are as hard as their training left them.
+            n_used: number of items at the start of the pool that earlier rounds have
+                used. Their worst images are those that the earlier training found.
             held_back: items of the validation.
 
         Returns:
-            As `select_interpolation`.
+            The score on the held-back items, and the interpolation: 0 is the original
+            weights, 1 the trained ones.
         """
         self.progress.stage(f"round {number}: training", self.trainer.count_steps(pool))
         with workbench.all_for_torch():
@@ -386,15 +405,17 @@ class Rounds:
     def select_interpolation(self, held_back: Sequence[Any]) -> tuple[Score, float]:
         """Load the best mixture of original and trained weights into the student.
 
-        The best one is right most often on the worst images, among those whose clean
-        accuracy has fallen by no more than allowed; if all have fallen more, it is the
-        one with the best clean accuracy. `INTERPOLATIONS` are tried from the trained
-        weights towards the original ones, which have learned less and less. Once that
-        shows in the worst images, the rest is not evaluated, as each takes a search of
+        Among the mixtures whose clean accuracy has not fallen by more than allowed, the
+        best one is right most often on the worst images. If the clean accuracy of all
+        has fallen more, the best one has the highest clean accuracy.
+
+        `INTERPOLATIONS` are tried from the trained weights towards the original ones.
+        Mixtures nearer to the original weights have learned less, so once the accuracy
+        on worst images falls, the others are not evaluated: each would take a search of
         its own.
 
         Args:
-            held_back: items of the validation.
+            held_back: items of the validation split, which are not trained on.
 
         Returns:
             Its score, and the interpolation: a member of `INTERPOLATIONS`.
@@ -438,9 +459,12 @@ class Rounds:
             number: number of the round.
             new_items: its new items.
             score: the score of the weights.
-            n_trained: number of items that it was trained on.
-            interpolation: interpolation of the weights; see `select_interpolation`.
+            n_trained: number of items that the weights were trained on; 0 for the
+                original model.
+            interpolation: fraction of the trained weights in the mixture; the rest is
+                the original weights.
         """
+        # The result is stored last: a round that was stopped before is trained again.
         self.write_weights(ROUND_FILE.format(number))
         self.trainer.save_images(self.run, number, new_items)
         self.results.append(

@@ -102,7 +102,7 @@ class SceneJobs:
     def run_jobs(
         self, title: str, jobs: Sequence[Job], hint: str = ""
     ) -> Iterator[tuple[int, Any]]:
-        """Run jobs, and yield the index and the result of each in any order.
+        """Run jobs, and yield the index and the result of each, as soon as it is done.
 
         Args:
             title: title of the stage that the progress reports.
@@ -110,6 +110,7 @@ class SceneJobs:
             hint: how to shorten the stage.
         """
         self.progress.stage(title, len(jobs), hint=hint)
+        # Results come in any order, and a worker's batch returns the job object itself.
         index_of_job = {id(job): index for index, job in enumerate(jobs)}
         executor = self.executor or workbench.InProcess(self)
         # each job is a batch by itself
@@ -147,6 +148,8 @@ class SceneJobs:
         problem, seed = self.make_problem(
             self.splits[split], number, controls, varying_controls
         )
+        # Validation compares models on the same images, so it renders many random
+        # configurations once. In training the images are new in each round anyway.
         tries = N_VALIDATION_TRIES if split == VALIDATION else None
         return make_lessons(
             problem, views, seed, n_plain=plain, n_tries=tries, shares_texture=shared
@@ -162,22 +165,27 @@ class SceneJobs:
     ) -> str:
         """Attack a held-out scene, and return the status of the attack.
 
-        `ROBUST` if it found nothing, and the clean scene is right in as many trials as
-        an adversarial scene would have to be wrong in.
+        The status is `ROBUST` if the attack found nothing, and the model is right in
+        enough trials of the clean scene. These are as many as an adversarial scene
+        would need to be wrong in.
 
         Args:
             control: control that is searched.
             number: number of the scene.
             steps_factor: multiple of the usual steps; more than one is the stronger
                 search.
-            weights: weights of the model, safetensors; None for the original ones.
+            weights: the model's weights as bytes of a safetensors file; None for the
+                original ones.
         """
         name, scene = self.splits[HELD_OUT].load_scene(
             number, workbench.collect_scene_parameters(self.config)
         )
+        # The seed does not depend on the weights: the models before and after the
+        # training are attacked in the same way.
         seed = seeds.stream(self.config.seed, f"measured {control}", number)
         search: dict[str, Any] = {}
         if steps_factor > 1:
+            # The stronger search must not be misled where gradients are.
             search = {
                 "policy": STRONGER_POLICY,
                 "steps": steps_factor * self.config.steps,
@@ -193,7 +201,7 @@ class SceneJobs:
 
         Args:
             number: number of the scene.
-            weights: weights of the hardened model, safetensors.
+            weights: weights of the hardened model, as bytes of a safetensors file.
 
         Returns:
             Under "before" and "after" whether each image is right, with the original
@@ -207,6 +215,8 @@ class SceneJobs:
         models = {"before": self.model, "after": self.with_weights(weights)}
         evaluations = dict[str, list[Any]]()
         for view in range(CLEAN_VIEWS):
+            # The seed is another one for each view of each scene, and the same for both
+            # models.
             seed = seeds.stream(split.seed, "plain", number * CLEAN_VIEWS + view)
             for when, evaluation in _evaluate_start(problem, seed, models).items():
                 evaluations.setdefault(when, []).append(evaluation.right)
@@ -284,12 +294,13 @@ class SceneJobs:
     ) -> tuple[Problem, int]:
         """Return the problem of a scene, and the root seed of its samples.
 
-        Beside the given controls, `RANDOM_RANGES` vary at random, but for those of the
-        same kind as one of the controls, such as "camera". A scene of the training must
-        not have an object that is held out.
+        In addition to the searched controls, those of `RANDOM_RANGES` vary at random,
+        such as the camera. A random range is left out if a control of the same kind is
+        searched or varied already. A scene of the training must not have an object that
+        is held out.
 
         Args:
-            split: the split.
+            split: split that the scene belongs to.
             number: number of the scene.
             controls: controls that are searched.
             varying_controls: controls of the run that vary at random meanwhile.
@@ -319,12 +330,13 @@ class SceneJobs:
     def make_attack_config(
         self, controls: Sequence[str], name: str, **changes: object
     ) -> AttackConfig:
-        """Return the settings of an attack.
+        """Return the settings of an attack on one scene of the run.
 
         Args:
             controls: controls that are searched.
             name: name of the object.
-            changes: changes to the settings.
+            changes: further settings of the attack, such as `steps`, which override
+                those of the run.
         """
         searched = {control: self.config.controls[control] for control in controls}
         changed = {
@@ -340,6 +352,7 @@ class SceneJobs:
         return AttackConfig.from_config(
             self.config,
             **changed,
+            # The parts of a run that a single attack inside of hardening does not need.
             measure="no",
             baseline=False,
             workers=None,
@@ -351,7 +364,7 @@ class SceneJobs:
     ) -> dict[str, Any]:
         """Return the settings of the run that the searched controls take.
 
-        A setting that none of them takes is None.
+        Settings that none of the controls takes are None.
 
         Args:
             searched: settings of the searched controls by their names.
@@ -380,6 +393,7 @@ def _evaluate_start(
         models: models by name; all see the same image.
     """
     start = problem.domain.start
+    # a batch of one image (1, H, W, 3)
     image = problem.picture(start, seed, CLEAN_SPP)[None]
     truth = problem.find_truth(problem.add_conditions(start, seed))
     with torch.no_grad():
@@ -402,10 +416,11 @@ def load_scene_work(config_fields: Mapping[str, Any]) -> SceneJobs:
 
 
 def attack_scene(config: AttackConfig, scene: workbench.Scene, model: Model) -> str:
-    """Attack a scene, and return the status; see `SceneJobs.attack_held_out`.
+    """Attack a scene, and return the status of the model there.
 
-    That is how the attack ended, if it found something or the scene is wrong already;
-    "unsteady" if the clean scene is right in too few trials to be called robust.
+    It is "found" if the attack found an adversarial scene, and "already wrong" if the
+    model is wrong on the clean scene. Otherwise it is `ROBUST`, or "unsteady" if the
+    model is right in too few trials of the clean scene.
     """
     summary = workbench.attack_on(config, scene, model).summary
     if summary.ending == results.INTERRUPTED:
@@ -461,9 +476,12 @@ class SceneSplit:
 
         Args:
             number: number of the scene, from 0.
-            fixed_settings: parameters with fixed values.
+            fixed_settings: values of scene parameters that are the same in all scenes,
+                by name, such as "mug.bsdf.roughness". They override sampled ones.
         """
         name = self._get_object_name(number)
+        # A generator for each scene: it is the same in whatever order scenes are
+        # loaded.
         rng = self.make_generator(number)
         asset = OBJECTS[name].generate(rng) if name in OBJECTS else Path(name)
         environment = self.environments[int(rng.integers(len(self.environments)))]
@@ -522,13 +540,17 @@ def _sample_scene_settings(rng: np.random.Generator) -> dict[str, float]:
 
 
 def make_splits(config: HardenConfig, model: Model) -> dict[str, SceneSplit]:
-    """Return the parts of the split by name.
+    """Return the splits of scenes by name: training, further, validation and held-out.
+
+    The held-out scenes have other environments than the rest, and other objects or
+    other instances of the same objects, so that what is measured was not trained on.
 
     Raises:
-        InputError: the model has a class for no object, or an object in a file has no
-            held-out instance.
+        InputError: the model has no class for any of the objects, or an object comes
+            from a file and no held-out objects are named.
     """
     objects = _select_objects(config, model)
+    # Objects of ours have random instances; a file is a single one.
     files = [name for name in objects if name not in OBJECTS]
     if files and config.held_out is None:
         raise InputError(
@@ -562,7 +584,8 @@ def make_splits(config: HardenConfig, model: Model) -> dict[str, SceneSplit]:
 def _select_objects(config: HardenConfig, model: Model) -> tuple[str, ...]:
     """Return the objects of the training that the model has a class for.
 
-    Of objects in files that is not known here.
+    The class of an object in a file is not known before it is loaded, so these objects
+    are always included.
 
     Raises:
         InputError: there are none.
@@ -610,8 +633,8 @@ def check_disjoint(held_out: SceneSplit, training_splits: Sequence[SceneSplit]) 
     when they are sampled, as generating them takes minutes.
 
     Args:
-        held_out: the held-out part of the split.
-        training_splits: the other parts.
+        held_out: the split that is measured.
+        training_splits: all other splits.
 
     Raises:
         InputError: an environment or a file is in both.
@@ -625,6 +648,7 @@ def check_disjoint(held_out: SceneSplit, training_splits: Sequence[SceneSplit]) 
             f"held_out_environment: {', '.join(common)} is an environment "
             "of the training too; name others"
         )
+    # One object of each kind; a file has only one.
     held_out_fingerprints = {
         compute_fingerprint(asset)
         for asset in held_out.generate_objects(len(held_out.objects))

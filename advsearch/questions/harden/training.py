@@ -94,7 +94,18 @@ class ClassifierTrainer(Trainer):
         optimiser: MakeOptimizer | None = None,
         beside: Examples | None = None,
     ) -> None:
-        """Set up the trainer, of which the class describes the arguments."""
+        """Set up the trainer.
+
+        Args:
+            work: samples lessons from scenes.
+            student: the copy of the network that is trained.
+            optimiser: function from a list of parameters to an optimizer; None for
+                AdamW.
+            beside: batches of the user's own images and class indices. Each step also
+                trains with one of them.
+        """
+        # numbers of views of a scene: the setting in training, and 2 in the validation,
+        # which only compares weights
         super().__init__(work, student, optimiser)
         self.n_views = (self.config.views, 2)
         self.beside = beside
@@ -109,9 +120,10 @@ class ClassifierTrainer(Trainer):
     ) -> list[Lesson]:
         """Make lessons of scenes.
 
-        A scene has lessons for each control with a matrix of light transport, and
-        lessons for all other controls together, which are rendered. In the training
-        there are more, of further scenes: a new scene teaches more than one more view.
+        Controls of textures have a matrix of light transport: a scene has lessons for
+        each of them. All other controls together have lessons of rendered images. In
+        the training split there are also lessons of further scenes, as a new scene
+        teaches more than one more view of the same scene.
 
         Args:
             title: title of the stage that the progress reports.
@@ -132,13 +144,15 @@ class ClassifierTrainer(Trainer):
     def _matrix_jobs(self, split: str, scene_numbers: range) -> list[Job]:
         """Return the jobs that make lessons with a matrix of light transport.
 
-        There is one for each control that has such a matrix, and each scene. Only
-        scenes of the training may share a texture, or have other controls vary.
+        There is a job for each scene and each control that has such a matrix. Only in
+        scenes of the training split may views share a texture, or other controls vary.
 
         Args:
             split: name of the split.
             scene_numbers: numbers of its scenes.
         """
+        # numbers of views of each scene: in the training split, and in the validation
+        # split
         training_views, validation_views = self.n_views
         jobs = list[Job]()
         for control, number in itertools.product(
@@ -158,6 +172,7 @@ class ClassifierTrainer(Trainer):
                     number,
                     (control,),
                     views=n_views,
+                    # one view without a worst image, to keep the clean accuracy
                     plain=1,
                     shared=shares_texture,
                     varying_controls=(
@@ -171,8 +186,8 @@ class ClassifierTrainer(Trainer):
         """Return the jobs that make lessons by rendering, one for each scene.
 
         All controls without a matrix of light transport change together. In the
-        training a scene has one such view, and a plain one in which the predictions of
-        the original model count.
+        training split a scene has one such view, and one plain view on which the
+        student should predict as the original model does.
         """
         controls = self.work.rendered_controls
         if not controls:
@@ -188,10 +203,16 @@ class ClassifierTrainer(Trainer):
         ]
 
     def _further_jobs(self, scene_numbers: range) -> list[Job]:
-        """Return the jobs of the further scenes of the training, of one view each.
+        """Return the jobs of the further scenes of the training, with one view each.
 
-        The view is rendered with the rendered controls if there are any, else plain.
+        If there are controls without a matrix of light transport, they change in that
+        view; otherwise it is a plain view.
+
+        Args:
+            scene_numbers: numbers of the scenes of the round, which follow each other.
         """
+        # Each scene of the round has `n_further_scenes` further ones, with numbers of
+        # their own.
         first = self.n_further_scenes * scene_numbers[0]
         end = self.n_further_scenes * (scene_numbers[-1] + 1)
         if self.work.rendered_controls:
@@ -294,7 +315,15 @@ def _make_job(
 ) -> Job:
     """Return the job that makes lessons of a scene.
 
-    The arguments are those of `SceneJobs.sample_lessons`.
+    A job is called by a worker, which has the scenes.
+
+    Args:
+        split: name of the split of scenes.
+        number: number of the scene.
+        controls: controls that make the views harder together.
+        views: number of views with worst images.
+        plain: number of further views of the plain scene.
+        **options: further arguments of `SceneJobs.sample_lessons`.
     """
     return partial(
         SceneJobs.sample_lessons,
@@ -313,7 +342,7 @@ def _accuracy(
     """Return the fraction of lessons whose images a model gets right.
 
     Args:
-        model: returns logits.
+        model: model that returns logits.
         selected: lessons, at least one.
         get_image: returns the image (H, W, 3) of a lesson.
     """
@@ -360,17 +389,22 @@ class GradientComputer:
     ) -> None:
         """Make the worst images of lessons worse, and compute the gradient of the loss.
 
-        The gradient is left with the parameters. A further batch adds its mean loss.
+        The gradient is stored in `grad` of each parameter. A further batch adds its
+        mean loss. The batch is divided into parts, which are computed at the same time
+        on threads.
 
         Args:
             batch: the lessons.
-            further_batch: further images (N, H, W, 3) and class indices (N,).
+            further_batch: the user's own images (N, H, W, 3) and class indices (N,), or
+                None.
             seed: seed of the augmentation.
         """
         # Textures come first, so that both passes have the same parts.
         batch = sorted(batch, key=lambda lesson: not isinstance(lesson, TextureLesson))
         self._ascend_textures(batch, seed)
 
+        # Each part adds its sum, weighted with the counts of the full batch, so that
+        # the sum of the parts' gradients is the gradient of the means.
         # The loss is a mean over plain images plus one over worst images.
         plain_weight = 1.0 / len(batch)
         worst_weight = 1.0 / max(1, len(select_hard_lessons(batch)))
@@ -393,7 +427,11 @@ class GradientComputer:
             parameter.grad = torch.stack(used).sum(dim=0) if used else None
 
     def _ascend_textures(self, batch: Sequence[Lesson], seed: int) -> None:
-        """Take a step of the search for worse textures, on augmented images."""
+        """Take a step of the search for worse textures, on augmented images.
+
+        The textures are changed in place. Gradients are computed in parts on threads,
+        each with its own copy of the network (`twin`).
+        """
 
         def compute_part_gradients(
             part: Sequence[TextureLesson], twin: Trainable, seed: int
@@ -432,19 +470,20 @@ class GradientComputer:
         selected: Sequence[Lesson],
         seed: int,
     ) -> list[Sequence[Any]]:
-        """Apply a function to parts of lessons on the threads; return its results in
-        order.
+        """Apply a function to parts of lessons on threads; return its results in order.
 
         Args:
             function: is called with the part, a copy of the network for this part
                 alone, and a seed that depends on the index of the part.
             selected: the lessons.
-            seed: seed of the first part.
+            seed: seed of the first part; each next part has the next number.
         """
         parts = [
             selected[start : start + LESSONS_PER_PART]
             for start in range(0, len(selected), LESSONS_PER_PART)
         ]
+        # Threads cannot share a network whose gradients are computed, so each part has
+        # a copy.
         n_missing = len(parts) - len(self._twins)
         self._twins += [self._student.make_twin() for _ in range(n_missing)]
         part_seeds = itertools.count(seed)
@@ -460,12 +499,13 @@ class GradientComputer:
     ) -> Tensor:
         """Return the loss of a part of a batch.
 
-        At times all rendered images are mixed with each other (mixup, Zhang et al.
-        2018, arXiv 1710.09412), since they stay the same; a texture is another one each
-        time.
+        In some steps all rendered images are mixed with each other (mixup, Zhang et al.
+        2018, arXiv 1710.09412). Rendered images stay the same in all epochs, so the
+        network could learn them by heart. Textures need no mixing, as they change in
+        each step.
 
         Args:
-            student: the network.
+            student: the network that is trained.
             part: the lessons, textures first.
             plain_weight: weight of each plain image.
             worst_weight: weight of each worst image.
@@ -488,8 +528,9 @@ class GradientComputer:
             plain_weight * losses[: len(part)].sum()
             + worst_weight * losses[len(part) :].sum()
         )
-        # Plain images of scenes that are not rendered twice: where a control changed,
-        # the original model is right without being sure.
+        # The student stays near the original model's predictions on plain images.
+        # Lessons that are rendered twice are left out: even their plain image has a
+        # changed control, on which the original model may be right but unsure.
         unchanged = _find_unrendered(part)
         if unchanged:
             divergence = self._divergence_from_original(
@@ -506,6 +547,11 @@ class GradientComputer:
         """Return the Kullback-Leibler divergence from the original model's predictions.
 
         It is summed over the images (N, H, W, 3) that the original model gets right.
+
+        Args:
+            images: images (N, H, W, 3).
+            logits: the student's logits for them (N, classes).
+            right: right classes of each image.
         """
         with torch.no_grad():
             original_logits = self._original_model(images)
@@ -528,7 +574,7 @@ def _mix_images(
 
     Args:
         images: (N, H, W, 3), which are changed.
-        lesson_of_image: N of them.
+        lesson_of_image: the lesson that each image belongs to (N,).
         seed: seed of the choice whether they are mixed, of the partners and of the
             weight.
 
@@ -544,8 +590,10 @@ def _mix_images(
             for index, lesson in enumerate(lesson_of_image)
             if isinstance(lesson, RenderedLesson)
         ]
+    # All random numbers are drawn, whether images are mixed or not.
     partners = rng.permutation(mixed).astype(int).tolist()
     sampled_weight = float(rng.beta(MIXUP_BETA, MIXUP_BETA))
+    # At most 1/2, so that the image itself always has the larger weight.
     partner_weight = min(sampled_weight, 1.0 - sampled_weight)
     if mixed:
         images[mixed] = torch.lerp(images[mixed], images[partners], partner_weight)
@@ -564,9 +612,9 @@ def _find_unrendered(part: Sequence[Lesson]) -> list[int]:
 def _augment_images(part: Sequence[Lesson], seed: int) -> Tensor:
     """Return the plain images of lessons, then the worst ones, augmented (N, H, W, 3).
 
-    Plain images, worst textures and worst renders are augmented separately: so worst
-    textures change as they did in the search, without which they would no longer be
-    the worst.
+    The three groups are augmented separately, each with the same seed. So a worst
+    texture gets the same crop and colors as in the search that found it. Under another
+    augmentation it might no longer be the worst.
 
     Args:
         part: the lessons, textures first.

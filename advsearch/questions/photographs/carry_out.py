@@ -61,12 +61,15 @@ STORED_FIELDS = ("rendering", "right", "label", "file")
 def photo_agreement(run: str | Path) -> PhotoAgreement:
     """Return how the photographs of a run agree with its renderings (docs/viewer.md).
 
+    A photograph agrees with its rendering if the model is right in both or wrong in
+    both.
+
     Args:
         run: a run's name or folder.
 
     Raises:
         UnknownNameError: there is no such run.
-        FileFormatError: what was kept of a photograph is something else.
+        FileFormatError: a stored photograph has no valid row.
     """
     table = _read_photos(directory.find_run(run))
     n_photos = len(table)
@@ -93,8 +96,9 @@ def photo_agreement(run: str | Path) -> PhotoAgreement:
 def _read_photos(run: Path) -> pd.DataFrame:
     """Read the aligned photographs of a run, one row for each prediction.
 
-    Columns: those of `STORED_FIELDS`; "model", "correct" and "predicted" of the
-    photograph; and "agrees", whether it is right where the rendering is.
+    The columns are those of `STORED_FIELDS`, which are about the rendering; "model",
+    "correct" and "predicted", which are about the photograph; and "agrees", whether
+    both predictions are right or both are wrong.
     """
     rows = list[dict[str, object]]()
     with workbench.hold_process_lock(), Store.open_to_read(run) as store:
@@ -156,8 +160,8 @@ def _summarize_rendering(
     Args:
         name: name of the rendering.
         model: name of the model.
-        photos: their rows of `_read_photos`; the last one states what the model
-            predicts of the rendering.
+        photos: their rows of `_read_photos`, at least one. Each also has the prediction
+            on the rendering; the last one is used.
     """
     n_photos = len(photos)
     n_agreeing = int(photos["agrees"].sum())
@@ -177,7 +181,9 @@ def _summarize_rendering(
 
 
 def find_photographs(path: Path, task: workbench.AnyTask) -> list[Path]:
-    """Return the photographs in a directory by their suffixes; empty without it.
+    """Return the paths of the photographs in a directory.
+
+    They are found by their suffixes. The list is empty if there is no such directory.
 
     Raises:
         InputError: the task needs the object's position, and a photograph was aligned
@@ -246,9 +252,9 @@ class Photographs:
     def add_files(self, run: Path, files: Sequence[Path]) -> None:
         """Evaluate and store the photographs that a sweep of one object does not have.
 
-        A file ``rendering-12.jpg``, or ``rendering-12-`` and anything, was aligned with
-        the rendering 12. All others show the object as it stood by chance: they are
-        evaluated, but are compared with no single rendering.
+        A file ``rendering-12.jpg``, or a name that begins with ``rendering-12-``, was
+        aligned with the rendering 12. All other files show the object in any position.
+        They are evaluated, but not compared with a rendering.
         """
         with Store.open_to_read(run) as store:
             stored_names = {
@@ -293,7 +299,12 @@ class Photographs:
     def _add_loose(self, run: Path, data: bytes, source: str) -> None:
         """Evaluate a photograph without a rendering; only predictions are stored.
 
-        It is cut to the size of each model's images. Arguments as for `_add`.
+        It is cut to the size of each model's images.
+
+        Args:
+            run: directory of the run.
+            data: the image file as bytes.
+            source: where the photograph comes from, which is stored with it.
         """
         with RunDirectory.resume(run) as resumed_run:
             number = resumed_run.store.get_last_step(LOOSE_PHOTO) + 1
@@ -308,12 +319,19 @@ class Photographs:
     def _add_aligned(self, run: Path, rendering: str, data: bytes, source: str) -> None:
         """Evaluate a photograph that was aligned with a rendering, and store both.
 
-        It is cut to the size of the rendering. Arguments as for `_add`.
+        The photograph is cut to the size of the rendering.
+
+        Args:
+            run: directory of the run.
+            rendering: name of the rendering that it was aligned with.
+            data: the image file as bytes.
+            source: where the photograph comes from, which is stored with it.
         """
         rendering_file = result.find_rendering(run, rendering)
         with Image.open(rendering_file, formats=("PNG", "JPEG")) as image:
             # A bad photograph is rejected before a scene is loaded.
             cut_photo = result.sanitize_photo(data, image.size)
+        # The number of the photograph is one more than that of the last.
         with RunDirectory.resume(run) as resumed_run:
             number = resumed_run.store.get_last_step(PHOTO) + 1
             file_name = f"{rendering}-{number:04d}.jpg"
@@ -351,7 +369,7 @@ def _add_prediction(
         evaluator: evaluator of the model, whose name is added to the values.
         rendering: name of the rendering that the photograph was aligned with, if any.
         cut_photo: the image file.
-        photo: what is stored of the photograph, beside the prediction.
+        photo: what is stored of the photograph in addition to the prediction.
     """
     # A sweep over several objects stores which one it was.
     object_name = None
@@ -390,10 +408,12 @@ class _PhotoEvaluator:
     ) -> tasks.Judgement:
         """Evaluate an image file at the size of the run's renderings.
 
-        It is resized in 8 bits with Lanczos' filter, which averages where it shrinks.
+        It is resized in 8 bits with Lanczos' filter, which averages pixels when it
+        shrinks an image.
 
         Args:
-            rendering, object_name: as for `find_truth`.
+            rendering: name of the rendering that the image belongs to; None without.
+            object_name: name of the object; None for the first one.
             data: the image file.
         """
         with Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "WEBP")) as image:
@@ -412,11 +432,19 @@ class _PhotoEvaluator:
     ) -> tuple[bool, str, Mapping[str, workbench.Value]]:
         """Return whether a rendering is right, its label, and the values of its row.
 
-        A sweep's prediction is read from its row; others are made from the file.
+        The prediction on a rendering of a sweep is read from the sweep's rows. For a
+        rendering of an attack, the model predicts the image file.
+
+        Args:
+            store: stored rows of the run.
+            rendering: name of the rendering: a number for a sweep, or a name such as
+                "adversarial" for an attack.
+            file: path of its image.
 
         Raises:
             InputError: the results have no row of a sweep's rendering.
         """
+        # Renderings of a sweep are numbered; those of an attack have names.
         is_of_sweep = rendering.isdecimal()
         if is_of_sweep:
             # Each image has a row for each model.
@@ -474,16 +502,16 @@ def _find_sweep_truth(
 ) -> workbench.Truth:
     """Return the ground truth of an image of a sweep for the task of a model.
 
-    If that does not depend on the configuration, or no image is named, it is that of
-    the object.
+    If the ground truth does not depend on the configuration, or no image is named, it
+    is that of the object alone.
 
     Args:
         sweep: the loaded scenes (`SceneLoader`).
         model_index: index of the model.
         image_number: number of the image as text; None for a photograph that was
             aligned with none.
-        object_name: name of the object. The first object is taken for None, and for a
-            name that the sweep does not have; it is the only one then.
+        object_name: name of the object. If it is None, or a name that the sweep does
+            not have, the first object is used: the sweep has a single one then.
 
     Raises:
         InputError: the sweep has no such image.
@@ -506,7 +534,10 @@ def _find_sweep_truth(
 
 
 def _load_attack_evaluators(run: Path, config: AttackConfig) -> list[_PhotoEvaluator]:
-    """Load the models of an attack, with the ground truth of its images."""
+    """Load the models of an attack, with the ground truth of its images.
+
+    An attack on an ensemble has several models; each gets an evaluator.
+    """
     problem, _ = workbench.problem_from_config(workbench.with_evaluation_only(config))
     models: list[tuple[Model, Task]] = [(problem.model, problem.task)]
     if isinstance(problem.task, workbench.EnsembleTask):

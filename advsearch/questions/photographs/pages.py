@@ -99,6 +99,9 @@ class PhotographPages:
     ) -> tuple[str, bytes]:
         """Store a photograph of a rendering, and return the table of agreement as JSON.
 
+        The request is checked first: another web page in the same browser must not be
+        able to send photographs to this server.
+
         Args:
             run: the directory of the run.
             name: name of the rendering.
@@ -112,6 +115,8 @@ class PhotographPages:
                 photograph.
         """
         sent_key = headers.get(KEY, "").encode("utf-8", "replace")
+        # `compare_digest` takes equally long for all keys, so that its time tells
+        # nothing.
         has_key = hmac.compare_digest(key.encode(), sent_key)
         if headers.get("Origin") is None or not has_key:
             raise markup.RequestRejected(

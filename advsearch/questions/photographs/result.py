@@ -92,7 +92,9 @@ _PHOTO = re.compile(rf"(?:{_NAME.pattern})-[0-9]{{4,9}}\.jpg")
 
 
 def find_rendering(run: Path, name: str) -> Path:
-    """Return the file of a rendering.
+    """Return the path of the image of a rendering.
+
+    A name comes from a web request, so only names of a fixed pattern are looked up.
 
     Raises:
         InputError: the run has none of that name.
@@ -168,11 +170,14 @@ def sanitize_photo(data: bytes, shape: tuple[int, int]) -> bytes:
 def _decode_photo(data: bytes) -> Image.Image:
     """Decode a photograph, upright and in RGB.
 
+    The data comes from a browser and is not trusted, so its size is limited.
+
     Raises:
         InputError: it has too many pixels, or is no image of a known format.
     """
     try:
         with Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "WEBP")) as image:
+            # `open` reads the size without decoding the pixels.
             if image.width * image.height > MAX_PIXELS:
                 raise InputError(
                     f"photo: expected at most {MAX_PIXELS:,} pixels, got "
@@ -180,6 +185,7 @@ def _decode_photo(data: bytes) -> Image.Image:
                 )
             # A JPEG is decoded at about the size that is needed.
             image.draft("RGB", (2 * MAX_SIZE, 2 * MAX_SIZE))
+            # Phones store the direction in EXIF, and not by rotated pixels.
             return ImageOps.exif_transpose(image).convert("RGB")
     except (Image.DecompressionBombError, Image.DecompressionBombWarning):
         raise InputError(
@@ -208,7 +214,7 @@ def make_align_page(
     Args:
         run: name of the run.
         renderings: names of its renderings, of which the page shows the first.
-        table: table of agreement, below.
+        table: counts of agreement, which the page has at its end.
         key: key that the server expects with a photograph.
         phone_address: address by which another device opens the page; None if none can.
     """
@@ -237,7 +243,11 @@ def make_align_page(
 
 
 def _align_section(renderings: Sequence[str]) -> markup.Html:
-    """Return the camera with a rendering over it, or why there is none."""
+    """Return the section with the camera image and a rendering over it.
+
+    Without renderings it tells why there are none. The script of the page fills the
+    element "align".
+    """
     if not renderings:
         reason = (
             "This run kept no pictures to align with. An attack keeps them when it "
@@ -290,7 +300,11 @@ def _phone_section(address: str) -> markup.Html:
 
 
 def make_agreement_table(table: PhotoAgreement) -> markup.Html:
-    """Return the counts of right and wrong predictions, in all and by rendering."""
+    """Return the counts of right and wrong predictions, in all and by rendering.
+
+    Args:
+        table: counts of agreement.
+    """
     if not table.photos or table.interval is None:
         return markup.make_element("p", "No photographs yet.", class_="soft")
     heads = ("photographs", "right in the photograph", "wrong in the photograph")
@@ -321,7 +335,11 @@ def make_agreement_table(table: PhotoAgreement) -> markup.Html:
 
 
 def _rendering_table(renderings: Sequence[PhotographedRendering]) -> markup.Html:
-    """Return the table of agreement by rendering, with models if there are several."""
+    """Return the table of agreement by rendering, with models if there are several.
+
+    Args:
+        renderings: counts of each rendering and model.
+    """
     has_models = len({rendering.model for rendering in renderings}) > 1
     heads = [
         "rendering",

@@ -72,8 +72,9 @@ class MeasuredRounds:
     def estimate_call_seconds(self, setting: SampleSetting) -> float:
         """Estimate the seconds of a call other than the first ones.
 
-        The estimate is the setting's own; else in proportion to the most expensive
-        setting of its line; else at the highest rate of any line; 0 without any.
+        If the setting has been called, it is the median of its last calls. Otherwise
+        the time is proportional to the cost, as for the most expensive setting of its
+        line, or else as for the slowest line. It is 0 if nothing has been called.
         """
         if setting in self.wall_seconds:
             call_seconds = self.wall_seconds[setting]
@@ -96,15 +97,16 @@ class MeasuredRounds:
     def estimate_needed_seconds(
         self, setting: SampleSetting, seconds_left: float
     ) -> float:
-        """Estimate the seconds until new and earlier settings have `MIN_CALLS` calls.
+        """Estimate the seconds until new and earlier settings have enough calls.
 
-        The first calls of a setting take longer; for the new one that is taken as the
-        median of what it was for earlier ones. An earlier setting that needs more than
-        a fraction `MAX_SETTING_FRACTION` of the remaining time turned out too
-        expensive: it does not count here, and waits until the end.
+        A setting needs `MIN_CALLS` calls. Its first calls take longer, as they compile
+        kernels. The extra time of the new setting is estimated as the median of that of
+        earlier ones. An earlier setting that needs more than the fraction
+        `MAX_SETTING_FRACTION` of the remaining time has turned out to be too expensive:
+        it is not counted here, and is measured last.
 
         Args:
-            setting: the new one.
+            setting: the new setting, which has no calls yet.
             seconds_left: seconds left of the budget.
         """
         extra_of_first_calls = list[float]()
@@ -135,12 +137,21 @@ def measure_in_rounds(
 ) -> MeasuredRounds:
     """Measure settings in rounds, cheapest first, until the budget is used up.
 
-    In the first round a setting is started only if `MIN_CALLS` calls of it, and those
-    that the settings before it still need for as many, fit into the remaining time; the
-    first is always measured. The first call compiles and records kernels, so that every
-    setting has two at once: without the second, nothing would be known of its time. A
-    call that should not fit is not started: a budget is kept to within a setting's
-    first calls. Each call has a seed of its own.
+    In the first round a setting is started only if there is time for `MIN_CALLS` calls
+    of it and of all settings before it. The first setting is always measured. A first
+    call compiles kernels and takes longer, so each setting is called twice at once: the
+    second call tells its time. A call that is not expected to fit is not started, so
+    the budget can be exceeded by the first calls of a setting only. Each call has its
+    own seed.
+
+    Args:
+        settings: the settings, in any order.
+        measure: measures a setting with a seed.
+        budget: the time of all rounds.
+        rounds: number of rounds. A round calls each setting once, the first round
+            twice.
+        seed: root of the seeds.
+        on_done: called with the setting after each call.
     """
     measured = MeasuredRounds()
 
@@ -177,8 +188,14 @@ def take_reference_parts(
 ) -> list[Part]:
     """Return as many independent parts of a reference as fit into a budget.
 
-    Each has its own seed. There are at least two, whatever they take: without these,
-    nothing is known about the error. At most there are `MAX_REFERENCE_PARTS`.
+    Each has its own seed. There are at least two, however long they take, as the error
+    is estimated from their difference. There are at most `MAX_REFERENCE_PARTS`.
+
+    Args:
+        take_part: computes a part with a seed.
+        budget: time of all parts.
+        on_done: called after each part.
+        seed: root of the seeds.
     """
     parts: list[Part] = []
     expected_seconds = 0.0  # of the next part
@@ -202,12 +219,12 @@ def choose_part_samples(
 ) -> int:
     """Return the largest sample count of which several calls fit into some seconds.
 
-    The last of three calls tells how long one takes, since the first ones compile.
-    Time is taken to be proportional to the samples.
+    `COLD_CALLS` calls compile kernels; the one after them is timed. The time is assumed
+    to be proportional to the number of samples.
 
     Args:
-        call: takes a part with a number of samples.
-        seconds: time of all parts.
+        call: function that computes a part with a number of samples per pixel.
+        seconds: time of all parts together.
         parts: number of parts.
         counts: sample counts, ascending; the first is returned if none fits.
     """
@@ -274,6 +291,14 @@ class PictureBench:
         margin: Callable[[Tensor], float],
         samplers: Sequence[str],
     ) -> None:
+        """Make a renderer for each line, and list the settings to measure.
+
+        Args:
+            renderer: renderer of the scene; its sampler and denoiser are replaced.
+            u: (d,) the configuration that is rendered.
+            margin: the model's margin on an image (H, W, 3).
+            samplers: names of the samplers that are measured.
+        """
         self._u = u
         self._margin = margin
         self._space = renderer.space
@@ -283,7 +308,7 @@ class PictureBench:
         for name in ("independent", REFERENCE_SAMPLER):
             if name in samplers:
                 self._lines.append(name + OIDN)
-        # by quantity and denoiser
+        # values that errors are measured against, by ("picture" or "margin", denoiser)
         self._references: dict[tuple[str, str], ReferenceValue] = {}
         scenes = {
             name: renderer.scene.copy_with(sampler=name)
@@ -305,13 +330,12 @@ class PictureBench:
     ) -> list[PrecisionReference]:
         """Render the references, one for each denoiser, within a budget.
 
-        Each is the mean radiance of independent renders, shown as an image. There are
-        two quantities: errors of images are measured against the image without
-        denoiser, and errors of margins against the margin of the image with the same
-        denoiser.
+        A reference is the mean radiance of independent renders, converted to an image.
+        Errors of images are measured against the image without denoiser. Errors of
+        margins are measured against the margin of the image with the same denoiser.
 
         Args:
-            budget: divided evenly among the denoisers that are left.
+            budget: time of all references.
             seed: seed of the renders.
             on_done: called after each render.
 
@@ -336,7 +360,18 @@ class PictureBench:
         seed: int,
         on_done: Callable[[], None],
     ) -> list[PrecisionReference]:
-        """Render and store the references of lines with a denoiser, as above."""
+        """Render and store the references of lines with a denoiser, or with none.
+
+        Args:
+            denoiser: "none" or "oidn".
+            budget: time of these references.
+            seed: seed of the renders.
+            on_done: called after each render.
+
+        Returns:
+            A row of the result for the image (without denoiser only) and one for the
+                margin.
+        """
         line = REFERENCE_SAMPLER
         if denoiser == "oidn":
             line += OIDN
@@ -376,7 +411,7 @@ class PictureBench:
     def measure(self, setting: SampleSetting, seed: int) -> dict[str, Numbers]:
         """Render an image; return the errors of the image and of the margin.
 
-        Both have the times of the render.
+        Both errors come with the times of the render.
         """
         radiance, times = run_timed(
             lambda: self._render_radiance(setting.estimator, seed, setting.spp)
@@ -472,10 +507,12 @@ def list_gradient_parts(
 ) -> list[GradientPart]:
     """Return the parts of a space with the estimators that are valid for them.
 
-    A part is the groups of one control that the same estimators can differentiate.
+    A part has the parameters of one control that can be differentiated by the same
+    estimators, so that these can be compared.
 
     Args:
-        groups: groups of all coordinates.
+        groups: parameters of the search space, with the estimators that are valid for
+            each.
         linear: whether the loss is linear; then differences of the loss ("secant")
             equal those of the picture, and are left out.
     """
@@ -521,11 +558,19 @@ class GradientBench:
         u: Tensor,
         part: GradientPart,
     ) -> None:
+        """Choose how the reference is computed, and list the settings to measure.
+
+        Args:
+            renderer: renderer of the scene.
+            loss: loss that is differentiated.
+            u: (d,) the configuration.
+            part: the coordinates of the gradient, with their estimators.
+        """
         self._renderer = renderer
         self._loss = loss
         self._u = u
         self.part = part
-        # of references
+        # renderer of references, whose sampler reaches an error in the least time
         self._exact = renderer.copy_with(
             renderer.scene.copy_with(sampler=REFERENCE_SAMPLER)
         )
@@ -566,7 +611,7 @@ class GradientBench:
         Args:
             budget: time that it may take.
             seed: seed of its parts.
-            on_done: called after each part.
+            on_done: called after each part of the reference.
 
         Returns:
             The one row of the reference in the result.
@@ -590,6 +635,11 @@ class GradientBench:
         self, budget: TimeBudget, seed: int, on_done: Callable[[], None]
     ) -> tuple[ReferenceValue, int]:
         """Compute the reference by differences at two steps along each coordinate.
+
+        Args:
+            budget: time of the reference.
+            seed: seed of the renders.
+            on_done: called after each part.
 
         Returns:
             The reference, and the samples per pixel of each of its parts.
@@ -641,14 +691,15 @@ class GradientBench:
     def _compute_derivatives(
         self, probes: Sequence[gradients.Probe], noise: int, spp: int
     ) -> Float64Array:
-        """Compute the derivatives along probes, and how far two steps disagree: (2, n).
+        """Compute the derivatives along directions by finite differences.
 
-        A derivative is extrapolated to a step of zero. The second row has the
-        difference between its values at two steps.
+        A derivative is computed with two steps and extrapolated to a step of zero. The
+        result is (2, n): the derivatives, and the differences between the values at
+        both steps, which tell how accurate they are.
 
         Args:
             probes: n directions.
-            noise: the seed.
+            noise: seed of the renders' noise.
             spp: samples per pixel.
         """
         bench = gradients.Bench(self._exact, self._loss, self._u, noise, spp)
@@ -687,7 +738,8 @@ class GradientBench:
     def check_bias(self, seed: int) -> str | None:
         """Check the reference by an adjoint against differences along one direction.
 
-        The derivative along the direction is the product of the reference with it.
+        An adjoint may be biased where it ignores moving edges. The derivative along a
+        direction by the reference is their dot product.
 
         Returns:
             A sentence if the reference is biased; None if not, or if the reference is
@@ -729,7 +781,15 @@ class GradientBench:
 def _make_row(
     quantity: str, name: str, value: ReferenceValue, spp: int, control: str = ""
 ) -> PrecisionReference:
-    """Make the row of a reference in the result."""
+    """Make the row of a reference in the result.
+
+    Args:
+        quantity: "picture", "margin" or "gradient".
+        name: name of the sampler or the estimator.
+        value: the reference and its error.
+        spp: samples per pixel of each part.
+        control: name of the control; empty for images.
+    """
     return PrecisionReference(
         quantity=quantity,
         control=control,

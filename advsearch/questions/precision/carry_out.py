@@ -71,9 +71,9 @@ It counts from `MIN_CONFIRMATIONS` measurements on.
 def measure_precision(context: RunContext[PrecisionConfig]) -> PrecisionResult:
     """Measure error against run time, and write figures and numbers.
 
-    The image and the gradient of each control are measured one after the other, each
-    without a break, so that their times are comparable. A finished one is stored at
-    once; a resumed run continues with the next, in the remaining seconds.
+    The image and the gradient of each control are measured one after the other. Each is
+    measured in one sitting, without a break, so that its times are comparable. A
+    finished sitting is stored at once, and a resumed run continues with the next one.
     """
     config = context.config
     start_time = time.perf_counter()
@@ -102,7 +102,14 @@ def _make_result(
     sittings: Sequence[Sitting],
     setup_seconds: float,
 ) -> PrecisionResult:
-    """Return the result of the sittings that are finished, without figures yet."""
+    """Return the result of the sittings that are finished, without figures yet.
+
+    Args:
+        context: the settings and the run.
+        measurer: measurer, which knows the problem.
+        sittings: the finished sittings, of the image and of gradients.
+        setup_seconds: seconds of loading.
+    """
     config = context.config
     problem = measurer.problem
 
@@ -197,6 +204,13 @@ class QuantityMeasurer:
     def __init__(
         self, config: PrecisionConfig, problem: Problem, progress: Progress
     ) -> None:
+        """Choose renderer and loss, and plan what is measured.
+
+        Args:
+            config: the settings.
+            problem: problem of an attack, whose scene, controls and model are measured.
+            progress: gets the stages.
+        """
         self._config = config
         self.problem = problem
         self._progress = progress
@@ -219,7 +233,8 @@ class QuantityMeasurer:
         """Plan the sittings: the image first, then the gradient of each control.
 
         Raises:
-            InputError: if gradients are wanted and no control has one.
+            InputError: if the gradient is to be measured and no control has a
+                derivative.
         """
         quantities = self._config.measured_quantities
         sittings = []
@@ -236,6 +251,7 @@ class QuantityMeasurer:
                     f"`controls` {names}: has no derivative; leave "
                     "gradient out of `quantities`"
                 )
+            # The time of all gradients is divided evenly.
             fraction = TIME_FRACTIONS["gradient"] / len(parts)
             for part in parts:
                 name = f"gradient of {part.name}"
@@ -246,7 +262,10 @@ class QuantityMeasurer:
     def measure_sittings(
         self, read_or_measure: Callable[[str, Callable[[], Sitting]], Sitting]
     ) -> Iterator[Sitting]:
-        """Yield each sitting; time that one leaves is shared among those after it.
+        """Yield each sitting, within the time of the settings.
+
+        A sitting measures one quantity without a break. Time that it does not use is
+        shared among the later ones.
 
         Args:
             read_or_measure: returns the stored sitting of a name, or calls the function
@@ -302,7 +321,15 @@ class QuantityMeasurer:
         return self._measure_settings("the picture", bench, budget)
 
     def _measure_gradient(self, part: GradientPart, budget: TimeBudget) -> Sitting:
-        """Measure the gradient of a part, then its recommended setting again."""
+        """Measure the gradient of a part, then its recommended setting again.
+
+        The recommended setting was selected as the best of many noisy ones, so its
+        error looks too small. New measurements of it do not have that bias.
+
+        Args:
+            part: the coordinates of the gradient, such as those of one control.
+            budget: time of all of it.
+        """
         renderer = self._renderer
         title = f"gradient of {part.name}"
         start_time = time.perf_counter()
@@ -341,8 +368,14 @@ class QuantityMeasurer:
     ) -> list[PrecisionPoint]:
         """Measure the recommended setting of a gradient again.
 
-        Return its point, or nothing if it was not measured often enough, or nothing is
-        recommended.
+        The list has its point. It is empty if there was no time for enough
+        measurements, or if nothing is recommended.
+
+        Args:
+            title: title of the progress.
+            bench: bench of the gradient.
+            recommended: recommendation from the first measurements.
+            budget: time of the new measurements.
         """
         if recommended.estimator is None or recommended.spp is None:
             return []
@@ -356,6 +389,7 @@ class QuantityMeasurer:
             bench.measure,
             budget,
             rounds=MAX_CONFIRMATIONS,
+            # seeds that the first measurements did not use
             seed=seeds.stream(self._seed, "confirm"),
             on_done=lambda _: advance(),
         )
@@ -368,7 +402,13 @@ class QuantityMeasurer:
     def _measure_settings(
         self, title: str, bench: PictureBench | GradientBench, budget: TimeBudget
     ) -> Sitting:
-        """Compute a bench's references, and measure all of its settings in rounds."""
+        """Compute a bench's references, and measure all of its settings in rounds.
+
+        Args:
+            title: title of the progress.
+            bench: bench of the image or of a gradient.
+            budget: time of the references and the measurements.
+        """
         start_time = time.perf_counter()
         reference_budget = budget.take_fraction(REFERENCE_FRACTION)
         references = bench.compute_references(
@@ -467,18 +507,20 @@ def recommend_settings(
     round_up: RoundUp,
     or_steeper: Callable[[PrecisionPoint], bool | None] = lambda point: None,
 ) -> list[Recommended]:
-    """Return the fastest setting for a goal, of each quantity, control and family.
+    """Return the fastest setting that reaches a goal, for each quantity.
 
-    A recommendation without an estimator says that none does. One of a gradient that
-    was measured again rests on the new measurements.
+    There is one recommendation for each quantity, control and family of samplers. If no
+    setting reaches the goal, its estimator is None. If a gradient setting was measured
+    again, the recommendation uses the new measurements.
 
     Args:
         points: measured settings.
         confirmations: gradient settings that were measured again.
-        goal: the relative error.
-        round_up: gives the next sample count that a setting takes.
-        or_steeper: function of a point, whether its error may fall faster than that of
-            independent samples; see `fit_line`.
+        goal: relative error that has to be reached.
+        round_up: function that returns the next sample count that a sampler accepts,
+            such as a power of two.
+        or_steeper: function of a point that tells whether its error may fall faster
+            than that of independent samples; None if theory does not say.
     """
     # one candidate for each estimator, by quantity, control and family
     candidates: dict[tuple[str, str, str], list[Recommended]] = {}

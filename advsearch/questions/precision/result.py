@@ -378,9 +378,10 @@ def describe_recommendation(recommendation: Recommended, goal: float) -> str:
 def list_cautions(points: Sequence[PrecisionPoint]) -> list[str]:
     """Return warnings about points: errors of few pixels, and a busy machine.
 
-    A machine is busy if most measurements took over twice their processor time by the
-    clock.
+    The machine counts as busy if most measurements took more than twice their processor
+    time by the clock: they waited for other programs.
     """
+    # Heavy tails: a few pixels have most of the error.
     heavy = sorted({point.estimator for point in points if point.heavy_tailed})
     # of each point with a time by the clock: whether it took twice the processor time
     waited = [
@@ -406,7 +407,11 @@ def list_cautions(points: Sequence[PrecisionPoint]) -> list[str]:
 
 
 def _make_error_table(quantity: str, points: Sequence[PrecisionPoint]) -> ResultPart:
-    """Make the table of errors of a quantity."""
+    """Make the table of errors of a quantity: "picture", "margin" or "gradient".
+
+    Only gradients have a control and a cosine. An unknown error is printed as an upper
+    limit with "<".
+    """
     rows = [point for point in points if point.quantity == quantity]
     columns: dict[str, views.Column] = (
         {"control": "{0.control}"} if quantity == "gradient" else {}
@@ -462,9 +467,9 @@ MINUS = "\N{MINUS SIGN}"
 def draw_figures(result: PrecisionResult) -> figures.Figures:
     """Return work-precision diagrams as files: error against seconds, both logarithmic.
 
-    Filled markers are known errors; open ones with an arrow are limits: the reference
-    is no better. The dashed line falls as independent samples do. Empty if nothing is
-    known.
+    Filled markers are known errors. Open markers with an arrow are upper limits, as the
+    reference has a similar error. The dashed line falls as the error of independent
+    samples does. The result is empty if no error is known.
     """
     panels: dict[str, list[PrecisionPoint]] = {}
     for point in result.points:
@@ -497,8 +502,9 @@ def draw_figures(result: PrecisionResult) -> figures.Figures:
 
 
 def _make_caption(result: PrecisionResult) -> str:
-    """Describe the machine, the repeats and the markers of the diagrams."""
+    """Describe machine, repeats and markers for the caption of the diagrams."""
     machine = result.machine
+    # for example "16 torch threads"
     thread_counts = []
     for name, count in machine.threads.items():
         thread = "thread" if count == 1 else "threads"
@@ -597,15 +603,18 @@ def _draw_goal(axes: Any, goal: float) -> None:
 def _draw_theory(axes: Any, points: Sequence[PrecisionPoint]) -> None:
     """Draw a dashed line of slope -1/2 under the points, if they span enough time.
 
-    By theory, the error of independent samples falls with the root of their number, and
-    so of the time: error = scale / sqrt(seconds).
+    The error of a mean of n independent samples falls as 1 / sqrt(n), and the time
+    grows as n. So error = scale / sqrt(seconds).
     """
     start = min(point.seconds for point in points)
     end = max(point.seconds for point in points)
+    # The lowest point relative to that law.
+    # A line over a shorter range would say nothing.
     if not end >= 1.5 * start:
         return
     smallest = min(point.rms * math.sqrt(point.seconds) for point in points)
     scale = PERCENT * smallest * 0.8  # a little under the lowest point
+    # the middle of the range on a logarithmic axis
     center = math.sqrt(start * end)
     axes.plot(
         [start, end],
@@ -664,6 +673,11 @@ def _draw_point(axes: Any, point: PrecisionPoint, color: str, marker: str) -> No
     """Draw the relative error of one setting with its interval, in percent.
 
     A known error is a filled marker. An open one with an arrow down is an upper limit.
+
+    Args:
+        axes: axes of matplotlib, logarithmic.
+        point: the setting.
+        color, marker: style of its estimator.
     """
     x = point.seconds
     y = PERCENT * point.rms
@@ -693,7 +707,9 @@ def _draw_point(axes: Any, point: PrecisionPoint, color: str, marker: str) -> No
 def _plain_axis(axis: Any) -> None:
     """Set ticks at 1, 2 and 5 times powers of ten, labelled as plain numbers.
 
-    Over a wide range they are at powers only, over a narrow one denser.
+    The usual ticks of a logarithmic axis are powers of ten, of which a narrow range has
+    only one. The first list of factors that gives three ticks is used, so a wide range
+    has powers only, and a narrow one has denser ticks.
     """
     # takes long to import
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter

@@ -129,14 +129,15 @@ def estimate_reference(
     """Return a function of the mean of independent parts, with its jackknife error.
 
     The jackknife (Efron 1982, chapter 3) computes the function again without each part
-    in turn. How much these values scatter tells the standard error; by how much their
-    mean differs from the value, the bias that noise has through a nonlinear function.
-    The error combines both and the known `bias` as a root of the sum of squares.
+    in turn. With n parts, v the value with all of them, v_i that without part i, and m
+    the mean of the v_i, the standard error is sqrt((n - 1) / n * sum |v_i - m|^2). The
+    bias, which noise causes in a nonlinear function, is (n - 1) * |m - v|. The error is
+    the root of the sum of squares of both and of the known `bias`.
 
     Args:
-        parts: independent values (n,) of the same thing.
-        function: (n,) to (m,), of what is no mean itself, such as a picture after its
-            tone curve or a model's margin on it.
+        parts: independent estimates (n,) of the same quantity.
+        function: function of the mean, from (n,) to (m,). For example, it applies a
+            tone curve, or computes a model's margin.
         bias: a known bias of the value.
 
     Raises:
@@ -157,7 +158,7 @@ def estimate_reference(
         for jackknife_value in jackknife_values
     )
     scatter = math.sqrt((count - 1) / count * sum_of_squares)
-    # with the factor of Efron's formula; two parts are too few to tell a bias
+    # Two parts are too few to estimate a bias.
     bias_estimate = 0.0
     if count > 2:
         bias_estimate = (count - 1) * float(np.linalg.norm(center - value))
@@ -176,12 +177,12 @@ def summarize_samples(
 ) -> PrecisionPoint:
     """Estimate the error of a setting from repeated measurements.
 
-    The noise of the measurements and that of the reference are independent, so that
-    their squares add: error^2 = mean square - reference_error^2. A root mean square
-    below `MIN_ERROR_RATIO` times the error of the reference may be all of that: then
-    the error is not known, and the root mean square itself is its upper limit. The
-    interval comes from the scatter of the squares, on a logarithmic scale; a single
-    measurement and heavy tails have none.
+    The differences from the reference contain its error, too. Both errors are
+    independent, so their squares add: mean square = error^2 + reference_error^2. If the
+    root mean square is below `MIN_ERROR_RATIO` times the reference's error, it may be
+    only that: then the error is not known, and the root mean square is an upper limit.
+    The interval comes from the scatter of the squares, on a logarithmic scale. There is
+    none for a single measurement or with heavy tails.
 
     Args:
         setting: the setting that was measured.
@@ -276,8 +277,8 @@ def fit_line(
 ) -> PrecisionSlope | None:
     """Fit the line of log error against log samples by least squares.
 
-    Only points with a known error count: of others there is a limit only. None if they
-    have fewer than `MIN_FIT_POINTS` sample counts.
+    Only points with a known error are used, as the others have only an upper limit. The
+    result is None if these have fewer than `MIN_FIT_POINTS` different sample counts.
 
     The slope agrees with theory if it differs from `MONTE_CARLO_SLOPE` by
     `SLOPE_TOLERANCE` at most. It disagrees if it differs by more, and its interval
@@ -285,8 +286,8 @@ def fit_line(
 
     Args:
         points: points of one estimator.
-        or_steeper: whether a steeper slope agrees, too. None if theory says nothing;
-            then `agrees` is None.
+        or_steeper: whether a steeper slope agrees with theory, too, as for samples that
+            are spread evenly. None if theory predicts no slope; then `agrees` is None.
     """
     known = [point for point in points if point.is_known]
     if len({point.spp for point in known}) < MIN_FIT_POINTS:
@@ -296,7 +297,7 @@ def fit_line(
         np.log([point.rms for point in known]),
     )
     slope = float(line.slope)
-    # two degrees of freedom are used up by slope and offset
+    # Student's t distribution; `len(known)` - 2, as the fit has two parameters
     quantile = float(stdtrit(len(known) - 2, (1.0 + CONFIDENCE) / 2.0))
     half_width = quantile * float(line.stderr)
     return PrecisionSlope(
@@ -316,7 +317,7 @@ def fit_line(
 def _agrees_with_theory(
     slope: float, half_width: float, or_steeper: bool | None
 ) -> bool | None:
-    """Return whether a slope is that of theory; None if that is not known.
+    """Return whether a slope agrees with theory; None if that is not known.
 
     Args:
         slope: slope of log error against log samples.
@@ -359,9 +360,10 @@ def describe_disagreement(
 
 
 def has_leveled_off(points: Sequence[PrecisionPoint]) -> bool:
-    """Return whether the last step between known points is much flatter than before.
+    """Return whether the error has stopped falling, as it does if there is a bias.
 
-    That is less than half as steep as the steepest one before it.
+    That is so if the slope between the last two known points is less than half as steep
+    as the steepest slope before.
     """
     known = sorted(
         (point for point in points if point.is_known), key=lambda point: point.spp
@@ -391,19 +393,21 @@ def recommend_count(
 ) -> Recommended | None:
     """Return the smallest sample count at which one estimator reaches a relative error.
 
-    If a fitted line passes through the interval of every known point, of at least four,
-    the count comes from the line. Else the error is interpolated between the points on
-    logarithmic axes. Beyond the last point it follows the slope of the fit, or that of
-    theory if points are too few for a fit: at most up to `MAX_EXTRAPOLATION` times the
-    samples, and not at all if the error has leveled off. A point of which only a limit
-    is known counts as an error of that size. Time is interpolated as well, and is
-    proportional to the samples beyond the last point.
+    A line is fitted to the logarithms of error and samples. If it passes through the
+    intervals of all known points, of at least four, the count comes from the line.
+    Otherwise the error is interpolated between the points on logarithmic axes. Beyond
+    the last point the error follows the slope of the fit, or that of theory if there
+    are too few points for a fit. It is extrapolated to at most `MAX_EXTRAPOLATION`
+    times the samples, and not at all if the error has leveled off. An upper limit
+    counts as an error of that size. The time is interpolated as well; beyond the last
+    point it is proportional to the samples.
 
     Args:
         points: points of one estimator.
-        goal: the relative error.
+        goal: relative error that has to be reached.
         round_up: returns a sample count that the estimator accepts.
-        or_steeper: see `fit_line`.
+        or_steeper: whether the error may fall faster than that of independent samples;
+            None if theory does not say.
 
     Returns:
         The recommendation; None if no count is known to reach the goal.
@@ -446,8 +450,9 @@ def _error_on_line(line: PrecisionSlope, spp: float) -> float:
 def _explains_points(line: PrecisionSlope, ordered: Sequence[PrecisionPoint]) -> bool:
     """Return whether a falling line passes through the interval of every known point.
 
-    A line of `MIN_FIT_POINTS` points nearly always does, and so explains nothing. A
-    known point without an interval is not explained.
+    A line through only `MIN_FIT_POINTS` points nearly always does, so this is no
+    evidence, and the result is False. It is False, too, if a known point has no
+    interval.
     """
     has_spare_points = line.points > MIN_FIT_POINTS
     is_falling = line.slope <= MAX_FALLING_SLOPE
@@ -469,8 +474,14 @@ def _solve_line(
 ) -> tuple[float | None, str]:
     """Return the samples at which a fitted line reaches a goal, and their basis.
 
-    The line is log error = offset + slope * log samples. The samples are at least the
-    smallest measured number, and None beyond `MAX_EXTRAPOLATION` times the largest.
+    The line is log(error) = offset + slope * log(samples), which is solved for the
+    samples. They are at least the smallest number that was measured, and None if they
+    exceed `MAX_EXTRAPOLATION` times the largest.
+
+    Args:
+        line: the fitted line.
+        ordered: its points, by ascending samples.
+        goal: relative error that has to be reached.
     """
     samples = math.exp((math.log(goal) - line.offset) / line.slope)
     smallest = float(ordered[0].spp)
@@ -509,9 +520,9 @@ def confirm_recommendation(
 ) -> Recommended:
     """Return a recommendation that rests on a point measured after it was selected.
 
-    What looks cheapest among noisy points is mostly a lucky one, and its error looks
-    smaller than it is. New measurements, with seeds of their own, don't have that bias.
-    If their error is above the goal, the sample count grows by (error / goal)^2, as the
+    The setting that looks cheapest among noisy ones is often a lucky one, whose error
+    was measured too small. New measurements with other seeds do not have that bias. If
+    their error is above the goal, the sample count grows by (error / goal)^2, as the
     error of independent samples falls with the root of their number, but by at most
     `MAX_EXTRAPOLATION`.
 
@@ -542,19 +553,21 @@ def _interpolate_count(
     line: PrecisionSlope | None,
     or_steeper: bool | None,
 ) -> tuple[float | None, str]:
-    """Return the samples from which on the error stays at or below a goal.
+    """Return the number of samples from which the error stays at or below a goal.
 
-    That is between the last point above the goal and the next, on logarithmic axes.
+    It is interpolated between the last point above the goal and the next point, on
+    logarithmic axes.
 
     Args:
         ordered: points by ascending samples.
         goal: the relative error.
-        line: fitted, for what lies beyond the last point; None without.
-        or_steeper: see `fit_line`.
+        line: fitted line, for sample counts beyond the last point; None if there is
+            none.
+        or_steeper: None if theory predicts no slope, which is used without a line.
 
     Returns:
-        The samples, None if nothing is known of so many; and whether they are
-        "measured", "interpolated" or "extrapolated".
+        The number of samples, or None if it is too far beyond the last point; and
+        whether it is "measured", "interpolated" or "extrapolated".
     """
     indices_above = [index for index, point in enumerate(ordered) if point.rms > goal]
     if not indices_above:
@@ -577,15 +590,16 @@ def _extrapolate_count(
 ) -> float | None:
     """Return the samples beyond the last point at which a goal is reached.
 
-    The error follows the slope of the line, or that of theory without a line. None if
-    neither is known, if the slope is too flat, if the last error is only a limit, if
-    the points have leveled off, or beyond `MAX_EXTRAPOLATION` times the samples.
+    The error follows the slope of the line, or that of theory without a line. The
+    result is None if neither is known, if the slope is too flat, if the last error is
+    only an upper limit, if the error has leveled off, or if more than
+    `MAX_EXTRAPOLATION` times the samples would be needed.
 
     Args:
         ordered: points by ascending samples.
         goal: the relative error.
-        line: fitted; None without.
-        or_steeper: None if theory has no slope.
+        line: fitted line; None if there is none.
+        or_steeper: None if theory predicts no slope.
     """
     last = ordered[-1]
     slope = None
@@ -597,7 +611,8 @@ def _extrapolate_count(
         return None
     if not last.is_known or has_leveled_off(ordered):
         return None
-    # error ~ samples^slope; a slope steeper than the limit is not relied on
+    # error ~ samples^slope, so samples ~ error^(1 / slope). A slope that is steeper
+    # than the limit would promise too much.
     factor = (goal / last.rms) ** (1.0 / max(slope, MIN_EXTRAPOLATED_SLOPE))
     return last.spp * factor if factor <= MAX_EXTRAPOLATION else None
 
@@ -607,8 +622,7 @@ def _interpolate_value(
 ) -> float:
     """Interpolate a value at a sample count, on logarithmic axes.
 
-    Below the first point it is that of the first one; beyond the last it follows a
-    slope.
+    Below the first point it is constant; beyond the last point it follows a slope.
 
     Args:
         ordered: points by ascending samples.

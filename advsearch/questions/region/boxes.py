@@ -73,22 +73,26 @@ def grow_box(
     samples: int = 200,
     on_check: Callable[[], None] = lambda: None,
 ) -> GrownBox:
-    """Grow a box around a point, then check it with samples that nothing was fitted to.
+    """Grow a box around a point, then check it with fresh samples.
 
-    Each face in turn tries to move out by a fraction of its distance to the bound. The
-    slab that it would win is probed at random points; if all have the center's
-    prediction, it moves. The fraction is 1/2 at first, and halved when no face can move
-    any more. Growing ends after `MAX_PROBED` images for each parameter at the latest.
+    Each face in turn tries to move outwards by a fraction of its distance to the bound.
+    The slab that it would add is probed at random points. If all of them have the
+    center's prediction, the face moves. The fraction is 1/2 at first, and is halved
+    when no face can move any more. Growing ends after `MAX_PROBED` images for each
+    parameter at the latest.
 
-    Then the box is sampled. For each exception, the face that cuts off the least of the
-    box moves in to it, and the box is sampled anew, with other seeds, `ATTEMPTS` times
-    at most; the last check counts whatever it shows.
+    Then the box is sampled. An exception is a sample with another prediction than the
+    center. For each, the face that cuts off the least of the box moves inwards, so that
+    the exception is outside. Then the box is sampled again with other seeds, at most
+    `ATTEMPTS` times. The last check is reported whatever it shows. The samples of a
+    check are independent of the box, so that a confidence interval from them is valid.
 
     Args:
-        is_same: whether a point has the prediction of the center.
+        is_same: function that tells whether a point (d,) has the prediction of the
+            center.
         center: center in [0, 1] (d,).
         seed: seed of the random points.
-        samples: samples of each check.
+        samples: number of samples of each check.
         on_check: called at the beginning of each check.
 
     Raises:
@@ -132,6 +136,13 @@ class GrowingBox:
     """
 
     def __init__(self, is_same: IsSame, center: Tensor, seed: int) -> None:
+        """Start with a box that is only the center.
+
+        Args:
+            is_same: function that tells whether a point has the center's prediction.
+            center: center in [0, 1] (d,).
+            seed: seed of the random points.
+        """
         self._is_same = is_same
         self._center = center
         self._seed = seed
@@ -160,10 +171,10 @@ class GrowingBox:
         return points[[not self._evaluate(point) for point in points]]
 
     def exclude(self, point: Tensor) -> None:
-        """Move a face in, so that a point lies outside and the center stays inside.
+        """Move a face inwards, so that a point is outside and the center stays inside.
 
-        It is the face that cuts off the least of the box. Points outside change
-        nothing.
+        Of all faces that could do so, the one that cuts off the least of the box moves.
+        A point that is outside already changes nothing.
 
         Args:
             point: (d,) with another prediction than the center.
@@ -172,7 +183,8 @@ class GrowingBox:
         if not is_inside:
             return
         width = (self.high - self.low).clamp_min(1e-12)  # not divided by 0
-        # the fraction of the box that a face cuts off, of each axis (d,)
+        # the fraction of the box that is cut off if a face of each axis moves to the
+        # point (d,)
         lost_fraction = torch.where(
             point > self._center,
             (self.high - point) / width,
@@ -184,22 +196,23 @@ class GrowingBox:
         axis = int(lost_fraction.argmin())
         is_upper = point[axis] > self._center[axis]
         face = self.high if is_upper else self.low
+        # The face moves a little beyond the point, towards the center (`PULLED_IN` <
+        # 1).
         face[axis] = torch.lerp(self._center[axis], point[axis], PULLED_IN)
 
     def _push(self, face: int, fraction: float) -> bool:
-        """Move a face out if the slab that it wins has the center's prediction.
+        """Move a face outwards if the slab that this adds has the center's prediction.
 
-        It tries a fraction of the distance to the bound, or all of it if little is
-        left. The slab is probed at random points, one of which is moved to the outer
-        face. If one has another prediction, or the step is less than `MIN_STEP`, the
-        face stays.
+        The step is a fraction of the distance to the bound, or all of it if little is
+        left. The slab is probed at random points. If one has another prediction, or the
+        step is less than `MIN_STEP`, the face stays.
 
         Args:
             face: its index: 2 * axis, and 1 more for the upper face.
             fraction: fraction of the distance to the bound, 0 or 1.
 
         Returns:
-            Whether it moved.
+            Whether the face moved.
         """
         axis, is_upper = divmod(face, 2)
         distance = float(1.0 - self.high[axis]) if is_upper else float(self.low[axis])
@@ -217,10 +230,12 @@ class GrowingBox:
             slab_high[axis] = self.low[axis]
             outer = slab_low[axis]
         probes = self._sample(slab_low, slab_high, PROBES)
+        # One point is on the outer face, which random points never reach.
         probes[0, axis] = outer
         if not all(self._evaluate(point) for point in probes):
             return False
         corner = self.high if is_upper else self.low
+        # Rounding may lead a little outside of [0, 1].
         corner[axis] = outer.clamp(0.0, 1.0)
         return True
 

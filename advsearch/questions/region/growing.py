@@ -63,9 +63,10 @@ class VariedParameters:
 
 
 def find_region(context: RunContext[RegionConfig]) -> RegionResult:
-    """Load the problem, grow and check the box, and draw the map.
+    """Find the region around a configuration in which the prediction stays the same.
 
-    After an interrupt the result has no box.
+    That is to load the problem, to grow and check the box, and to draw the map. After
+    an interrupt the result has no box.
     """
     config = context.config
     stages = context.stages
@@ -136,7 +137,8 @@ def count_renders(verifier: workbench.Verifier) -> dict[str, int]:
 def find_varied(problem: Problem, config: RegionConfig) -> VariedParameters:
     """Find the parameters in which the box grows, and its center.
 
-    They are those of `vary`, or all that are searched but discrete choices.
+    They are the parameters that the setting `vary` names, or else all searched
+    parameters. A discrete choice has no interval and is left out.
 
     Raises:
         UnknownNameError: `vary` names a parameter that the controls do not search.
@@ -162,6 +164,7 @@ def find_varied(problem: Problem, config: RegionConfig) -> VariedParameters:
             f"map: expected two parameters in `vary`, got {len(names)}: "
             f"{', '.join(names)}"
         )
+    # their indices among the coordinates of a configuration
     coordinates = torch.tensor([coordinate_by_name[name] for name in names])
     return VariedParameters(names, coordinates, read_center(problem, config))
 
@@ -185,7 +188,8 @@ def _list_coordinates(problem: Problem) -> dict[str, int]:
 def read_center(problem: Problem, config: RegionConfig) -> Tensor:
     """Return the configuration (d,) around which the box grows.
 
-    It is the scene's own, or the adversarial one of a run.
+    It is the scene's own configuration or, with the setting `around`, the adversarial
+    configuration of a run.
 
     Raises:
         InputError: that run is over other controls.
@@ -214,6 +218,13 @@ class RegionSearch:
         verifier: workbench.Verifier,
         varied: VariedParameters,
     ) -> None:
+        """Prepare the search for the box.
+
+        Args:
+            context: the settings and the run.
+            verifier: renders and evaluates points.
+            varied: the parameters that the box has sides for.
+        """
         self._config = context.config
         self._run = context.run
         self._verifier = verifier
@@ -222,13 +233,21 @@ class RegionSearch:
         self._is_wrong_at_center = False
 
     def run(self) -> GrownRegion:
-        """Find the verdict at the center, grow the box, and draw the map."""
+        """Find the verdict at the center, grow the box, and draw the map.
+
+        The verdict is whether the model is right or wrong at the center; the box is
+        where it stays so.
+        """
         config = self._config
         verifier = self._verifier
         varied = self._varied
+        # enough samples per pixel that noise does not decide the prediction at the
+        # center
         verifier.choose_spp({"centre": varied.center})
         self._is_wrong_at_center = find_verdict(verifier, varied.center)
         if config.specialise:
+            # the number of images that may be rendered faster if the light is prepared
+            # once
             n_images = boxes.USUAL_PROBED * len(varied.names) + config.map**2
             workbench.prepare_surface_light(
                 verifier, varied.center, varied.coordinates, n_images
@@ -286,16 +305,17 @@ class RegionSearch:
         self._verifier.stages.begin("search", title, limit, hint=hint, at_most=True)
 
     def _is_same(self, values: Tensor, number: int) -> bool:
-        """Return whether the verdict at coordinates (k,) is that of the center.
+        """Return whether the verdict at a point is that of the center.
 
         An image without the object, or with a prediction that is not a number, has no
-        verdict, and so not that of the center.
+        verdict, so the result is False.
 
         Args:
-            values: values of the parameters that vary.
+            values: values of the k parameters that vary, in [0, 1] (k,).
             number: number of the point, which seeds its noise.
         """
-        # Images of the check are rendered, never predicted.
+        # While the box grows, images may be predicted from the prepared light. Those of
+        # the check are rendered, as its result is reported.
         predictor = None if self._is_checking else self._verifier.state.predictor
         u = self._varied.with_values(values)
         (trial,) = self._verifier.try_configurations(
@@ -307,10 +327,10 @@ class RegionSearch:
 
 
 def find_verdict(verifier: workbench.Verifier, center: Tensor) -> bool:
-    """Return whether the model is wrong at the center.
+    """Return whether the model is wrong at the center, tried with several seeds.
 
     Raises:
-        InputError: that depends on the noise, or predictions are not numbers, or the
+        InputError: the prediction depends on the noise, or is not a number, or the
             object is not in the image.
     """
     verifier.stages.begin("verification", "looking at the centre", CENTER_TRIALS)
@@ -348,13 +368,14 @@ def describe_box(
 ) -> list[BoxSide]:
     """Return the range of each varied parameter inside the box, in its unit.
 
-    If no control describes a number, it is a fraction of the parameter's range. A
-    component of a vector is named ``NAME.INDEX``.
+    A range is in the unit that the parameter's control describes, such as degrees. If
+    no control describes it, it is a fraction of the parameter's range. A component of a
+    vector is named ``NAME.INDEX``, for example "camera.target.0".
 
     Args:
         problem: problem of the scene.
         grown: the box.
-        varied: its parameters.
+        varied: the parameters that the box has sides for.
     """
     low_values = problem.describe(varied.with_values(grown.low))
     high_values = problem.describe(varied.with_values(grown.high))
@@ -408,8 +429,8 @@ def draw_map(
     Args:
         verifier: verifier that evaluates the points.
         size: points along each axis.
-        varied: the parameters.
-        box: its sides.
+        varied: the two parameters that are the axes of the map.
+        box: the two sides of the box, in the same order.
         run: where the figure is saved.
     """
     rows = _measure_margins(verifier, size, varied)
@@ -439,6 +460,7 @@ def _measure_margins(
         "or `verify_spp` shorten it"
     )
     verifier.stages.begin("map", "drawing the map", size * size, hint=hint)
+    # A single point lies in the middle of the range.
     grid = torch.linspace(0.0, 1.0, size) if size > 1 else torch.tensor([0.5])
 
     def find_configuration(number: int) -> Tensor:
@@ -460,7 +482,13 @@ def _measure_margins(
 def find_ranges(
     problem: Problem, varied: VariedParameters, box: Sequence[BoxSide]
 ) -> list[AxisRange]:
-    """Return the full range of each of two parameters, in its unit if it has one."""
+    """Return the full range of each of two parameters, in its unit if it has one.
+
+    Args:
+        problem: problem of the scene.
+        varied: the two parameters.
+        box: the sides of the box, whose names and units are used.
+    """
     low_values = problem.describe(varied.with_values(torch.full((2,), 0.0)))
     high_values = problem.describe(varied.with_values(torch.full((2,), 1.0)))
     ranges = []
@@ -478,7 +506,13 @@ def find_ranges(
 def draw_margins(
     axes: Any, rows: list[list[float]], x_range: AxisRange, y_range: AxisRange
 ) -> None:
-    """Draw margins and the line at which the verdict changes on matplotlib axes."""
+    """Draw margins and the line at which the verdict changes on matplotlib axes.
+
+    Args:
+        axes: axes of matplotlib.
+        rows: margins on the grid, row by row from the lowest.
+        x_range, y_range: ranges of both parameters.
+    """
     extent = (x_range.low, x_range.high, y_range.low, y_range.high)
     x_title = figures.format_axis_title(x_range.name, x_range.unit)
     y_title = figures.format_axis_title(y_range.name, y_range.unit)

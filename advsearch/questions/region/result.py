@@ -180,7 +180,8 @@ def make_region_view(result: RegionResult) -> ShownResult:
 
 
 def make_region_claims(result: RegionResult) -> Iterator[views.Claim]:
-    """Yield the claim about the box, if it is known."""
+    """Yield the claim about the box, if the box is known."""
+    # An interrupted run has no box.
     if (
         not result.samples
         or result.same is None

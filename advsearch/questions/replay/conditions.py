@@ -128,7 +128,9 @@ class ReplayCondition:
 def list_conditions(
     problem: Problem, spp: int, resize: Callable[[tuple[int, int]], Problem]
 ) -> Iterator[ReplayCondition]:
-    """Yield every condition of a problem except other models, unchanged first.
+    """Yield every condition of a problem except other models.
+
+    The first one is the unchanged condition, as the run verified it.
 
     Args:
         problem: the problem of the run.
@@ -158,8 +160,8 @@ def same_render(
 ) -> ReplayCondition:
     """Return a condition that uses the run's images as they are, or changes them.
 
-    With the samples of the run's verification they are not rendered again for it: all
-    such conditions have the same `light` and `source`.
+    All such conditions have the same `light` and `source`, so they share their renders.
+    With the samples per pixel of the verification nothing is rendered again for them.
     """
     return ReplayCondition(
         name,
@@ -259,7 +261,8 @@ def apply_sensor(
     """Return an image (H, W, 3) as a camera's sensor records it.
 
     Args:
-        sensor_values: values of parameters of the control `sensor`; all others are 0.
+        sensor_values: values of the parameters of the control `sensor`, by name;
+            parameters that are missing are 0.
         image: sRGB in [0, 1].
         seed: seed of the sensor's noise.
     """
@@ -274,7 +277,11 @@ def apply_sensor(
 
 
 def blender_condition(problem: Problem, spp: int) -> ReplayCondition:
-    """Return the condition that renders with Cycles, available or not."""
+    """Return the condition that renders with Cycles.
+
+    If Blender is not installed, or the scene cannot be exported, the condition holds
+    the reason, which the result reports.
+    """
     renderer = problem.renderer
     description, _ = renderer.scene.definition
     condition = ReplayCondition(
@@ -298,15 +305,17 @@ def model_condition(
 ) -> ReplayCondition:
     """Return the condition under which another model predicts the scene.
 
-    If that takes the same images as the run's own model, it uses the run's images; else
-    it has renders of its own.
+    If the other model takes images of the same size and formation as the run's own
+    model, it predicts the same renders, which saves time. Otherwise the scene is
+    rendered for it.
 
     Args:
         problem: problem of the run.
-        other_problem: the same with the other model.
+        other_problem: the same problem with the other model.
         name: name of the other model.
         spp: samples per pixel.
     """
+    # Conditions with equal `light` share their renders.
     light: Hashable = name
     takes_same_images = other_problem.renderer.formation == problem.renderer.formation
     if takes_same_images:
@@ -327,13 +336,15 @@ def photograph_conditions(
 ) -> Iterator[ReplayCondition]:
     """Yield a condition for each photograph of a folder.
 
-    If the run used a single one of them, that is left out: it is tried as verified.
+    If the attack used a single photograph, that one is left out: the unchanged
+    condition tries it already.
 
     Args:
         parts: parts of the attack.
-        folder: folder of photographs.
+        folder: directory of photographs, or a name as for the setting `backdrop`.
         spp: samples per pixel.
-        threads: the setting `threads` of the problems; empty to leave it.
+        threads: {"threads": number of threads} for the problems; empty for the run's
+            own.
     """
     other_photographs, used_photographs = workbench.move_to_photographs(parts, folder)
     if len(used_photographs) == 1:
@@ -372,11 +383,14 @@ def replay(
 ) -> ReplayResult:
     """Render the adversarial scene of a run under other conditions (docs/questions.md).
 
-    The clean scene is rendered under each of them too.
+    The clean scene is rendered under each condition, too: the model has to be right
+    there. All other options are the settings of `advsearch replay`.
 
     Args:
-        attack: one that was kept and has ended: its result, or name or folder of its
-            run.
+        attack: an attack that has ended and whose run is stored: its result, or the
+            name or directory of its run.
+        progress: where progress is reported; None for the default.
+        **options: settings, such as `trials`.
     """
     run: str | Path | AttackResult = attack
     parts = None
@@ -388,6 +402,8 @@ def replay(
                 "was not; give it a `run`"
             )
         run = attack.run
+        # Parts that exist in Python only, such as a model object, cannot be loaded from
+        # the run. The result still has them.
         python_only = _read_python_only_parts(Path(run))
         if attack.parts is not None:
             parts = attack.parts()
@@ -424,8 +440,8 @@ def run_replay(
 
     Args:
         context: the settings and the run.
-        parts: Python objects that the attack was called with; None loads what its run
-            names.
+        parts: Python objects that the attack was called with, such as its model; None
+            loads what the run names.
 
     Raises:
         InputError: the attack has no adversarial configuration, or its scene has
@@ -438,6 +454,7 @@ def run_replay(
     attack = _load_attack(attack_directory)
     settings.check_no_duplicates((RUN_MODEL, *config.models), "model")
     parts = parts or workbench.load_parts_of_run(attack_directory)
+    # an empty mapping, so that the run's own setting remains
     threads = {} if config.threads is None else {"threads": config.threads}
     load_problem = partial(workbench.make_problem_with_warnings, parts, **threads)
     problem, warnings = load_problem()
@@ -450,11 +467,14 @@ def run_replay(
     table = _Table(
         u=workbench.read_stored_configuration(attack_directory, problem),
         trials=config.trials,
+        # a stream of its own: no noise of the attack is repeated
         seed=seeds.stream(parts.config.seed, "replay"),
         run=context.run,
         progress=context.progress,
     )
     with context.until_interrupted():
+        # Conditions with the same renders are tried together, so that each image is
+        # rendered once.
         for batch in batch_by_light(conditions, spp):
             table.fill(batch)
     rows = table.list_rows(conditions)
@@ -509,6 +529,8 @@ def select_conditions(
 ) -> list[ReplayCondition]:
     """Return the conditions that the settings select, the unchanged one first.
 
+    The unchanged condition is always included, as a reference for the others.
+
     Args:
         config: the settings.
         problem: the problem of the run.
@@ -525,6 +547,8 @@ def select_conditions(
         if condition.name in config.selected_names
     ]
     for model_name in config.models:
+        # A run with several models has an `ensemble`, which the single other model
+        # replaces.
         other_problem = load_problem(model=model_name, ensemble=None)[0]
         conditions.append(model_condition(problem, other_problem, model_name, spp))
     return conditions
@@ -533,9 +557,10 @@ def select_conditions(
 def batch_by_light(
     conditions: Sequence[ReplayCondition], spp: int
 ) -> list[list[ReplayCondition]]:
-    """Put the conditions that share the run's renders into the first batch.
+    """Divide conditions into batches that share their renders.
 
-    Every other condition is a batch by itself.
+    The first batch has all conditions that share the renders of the run; it is empty if
+    there are none. Every other condition is a batch by itself.
 
     Args:
         conditions: the conditions.
@@ -577,8 +602,11 @@ class _Table:
     def fill(self, conditions: Sequence[ReplayCondition]) -> None:
         """Add the rows of conditions that share their renders.
 
-        A condition that is not available, or that Blender fails at, gets a row with the
-        reason.
+        A condition that is not available, or in which Blender fails, gets a row with
+        the reason.
+
+        Args:
+            conditions: conditions that share their renders.
         """
         reasons = [
             condition.unavailable_reason
@@ -611,9 +639,13 @@ class _Table:
             )
 
     def _render(self, conditions: Sequence[ReplayCondition]) -> None:
-        """Render the trials of conditions, and count the renders even if it stops.
+        """Render the trials of conditions, and count the renders.
 
-        There are as many trials of the clean scene as of the adversarial one.
+        They are counted even after an interrupt. There are as many trials of the clean
+        scene as of the adversarial scene.
+
+        Args:
+            conditions: conditions that share their renders.
         """
         names = ", ".join(dict.fromkeys(condition.name for condition in conditions))
         if len(conditions) == 1:
@@ -642,7 +674,11 @@ class _Table:
     def _add_trials(
         self, retrial_of_condition: Mapping[ReplayCondition, workbench.RetrialCondition]
     ) -> None:
-        """Try the clean scene under all conditions, then the adversarial one."""
+        """Try the clean scene under all conditions, then the adversarial scene.
+
+        Args:
+            retrial_of_condition: what renders and predicts each condition.
+        """
         retrials = workbench.Retrials(
             list(retrial_of_condition.values()),
             self.run,

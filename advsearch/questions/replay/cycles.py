@@ -208,7 +208,18 @@ class Cycles:
         max_depth: int,
         denoise: bool,
     ) -> None:
-        """Find Blender, and check the scene; no process is started yet."""
+        """Find Blender, and check the scene; no process is started yet.
+
+        Args:
+            description: the scene.
+            size: height and width of the images in pixels.
+            max_depth: maximum number of segments of a light path.
+            denoise: whether Blender denoises the images.
+
+        Raises:
+            BlenderError: Blender is not installed, or the scene has something that
+                cannot be exported to Blender.
+        """
         try:
             self._command = workbench.find_blender(
                 "Blender's Cycles has to render it", "leave `ways=blender` out"
@@ -218,6 +229,7 @@ class Cycles:
         unsupported = _find_unsupported(description)
         if unsupported:
             raise BlenderError(
+                # Five names are enough for a message.
                 f"the scene has {', '.join(unsupported[:5])}, which is not "
                 "carried over to Blender"
             )
@@ -232,8 +244,8 @@ class Cycles:
     def radiance(self, inputs: Mapping[str, Tensor], seed: int, spp: int) -> Tensor:
         """Render linear radiance (H, W, 3), as `MitsubaScene.radiance` does.
 
-        A process of Blender goes on as long as the inputs stay the same; for others a
-        new one is started.
+        A process of Blender is used as long as the inputs stay the same. For other
+        inputs a new process is started.
 
         Raises:
             BlenderError: Blender stopped, or took too long.
@@ -254,7 +266,12 @@ class Cycles:
     ) -> tuple[dict[str, object], bytes, np.ndarray | None]:
         """Return the settings for Blender, the meshes as glTF, and the environment.
 
-        The environment is linear radiance (H, W, 3), or None.
+        The environment is linear radiance (H, W, 3), or None if no map lights the
+        scene.
+
+        Args:
+            inputs: values of the scene's inputs by name, such as
+                "mug.bsdf.reflectance"; they override the description.
         """
         scene = self._description
         height, width = self._resolution
@@ -265,12 +282,14 @@ class Cycles:
         if scene.environment is not None:
             radiance = np.asarray(scene.environment.radiance, np.float32)
         if "environment.padded" in values:
-            # An environment that is searched has one more column on both sides.
+            # A searched environment repeats one column at each side, so that
+            # interpolation wraps around. These two columns are removed.
             radiance = values["environment.padded"][:, 1:-1].numpy()
 
         blender_settings = self._make_settings(
             values, width, height, has_environment=radiance is not None
         )
+        # z is up in our scenes, and y in glTF.
         shapes = [_turn_for_blender(mesh) for mesh in meshes]
         return blender_settings, workbench.encode_glb(shapes), radiance
 
@@ -285,7 +304,8 @@ class Cycles:
         """Return what `RENDER_SCRIPT` reads: image size, camera, lamps, environment.
 
         Args:
-            values: the scene's inputs; what is missing is as the scene has it.
+            values: the scene's inputs by name; an input that is missing has the value
+                of the scene's description.
             width, height: width and height of the image, pixels.
             has_environment: whether an environment map lights the scene.
         """
@@ -310,8 +330,14 @@ class Cycles:
     ) -> dict[str, object]:
         """Return the camera for `RENDER_SCRIPT`.
 
-        Its angle is in radians; its shift is a fraction of the longer side of the
-        image, and upwards, while ours is a fraction of each side, and downwards.
+        Blender's angle of view is in radians. Its shift is a fraction of the longer
+        side of the image and points upwards, while ours is a fraction of the width or
+        height and points downwards.
+
+        Args:
+            values: the scene's inputs by name, such as "camera.fov" in degrees; the
+                description has those that are missing.
+            width, height: width and height of the image in pixels.
         """
         scene = self._description
         to_world = values.get(
@@ -354,12 +380,13 @@ def _describe_lamps(
 ) -> list[dict[str, object]]:
     """Return the lamps that are switched on, for `RENDER_SCRIPT`.
 
-    Each has a "color", linear radiance or intensity; and either "ball", the matrix
-    (4, 4) of a unit sphere, or None and "to_world", that of a point.
+    Each lamp is a mapping. "color" is its linear radiance or intensity (3,). A
+    spherical lamp has in "ball" the matrix (4, 4) from the unit sphere to the world. A
+    point lamp has None there, and its position in "to_world" (4, 4).
 
     Args:
         scene: the scene.
-        values: the scene's inputs; what is missing is as the scene has it.
+        values: the scene's inputs by name; the scene has those that are missing.
     """
     lamps: list[dict[str, object]] = []
     for lamp in scene.lamps.values():
@@ -404,12 +431,13 @@ def _make_ground(
 ) -> list[assets.Shape]:
     """Return the ground of a scene as a mesh, a square around the origin at height 0.
 
-    Empty if the scene has no ground, or its parts have one already.
+    The list is empty if the scene has no ground, or if one of its meshes is the ground
+    already.
 
     Args:
         scene: the scene.
-        reflectance: linear (H, W, 3) of a ground that is a photograph; None for the
-            photograph itself.
+        reflectance: linear reflectance (H, W, 3) that replaces the photograph on the
+            ground; None for the photograph itself.
     """
     photograph = scene.photograph
     if photograph is not None:
@@ -451,6 +479,14 @@ class _Process:
         meshes: bytes,
         radiance: np.ndarray | None,
     ) -> None:
+        """Write the scene to a temporary directory, and start Blender.
+
+        Args:
+            program: command that starts Blender.
+            blender_settings: camera, lamps and image size for the script.
+            meshes: meshes as a glTF file.
+            radiance: environment map (H, W, 3), linear; None for none.
+        """
         self._temporary = tempfile.TemporaryDirectory(prefix="advsearch-cycles-")
         self._directory = Path(self._temporary.name)
         self._log = self._directory / "log.txt"
@@ -466,7 +502,13 @@ class _Process:
         meshes: bytes,
         radiance: np.ndarray | None,
     ) -> None:
-        """Write the files that the script reads, and the script itself."""
+        """Write the files that the script reads, and the script itself.
+
+        Args:
+            blender_settings: camera, lamps and image size.
+            meshes: meshes as a glTF file.
+            radiance: environment map (H, W, 3), linear; None for none.
+        """
         settings_text = json.dumps(blender_settings)
         (self._directory / "scene.json").write_text(settings_text, "utf-8")
         (self._directory / "scene.glb").write_bytes(meshes)
@@ -476,7 +518,10 @@ class _Process:
                 image.write(str(self._directory / "environment.exr"))
 
     def _start(self, program: list[str]) -> subprocess.Popen[bytes]:
-        """Start Blender with the script.
+        """Start Blender with the script that renders.
+
+        Args:
+            program: command that starts Blender, or a Python that has the module bpy.
 
         Raises:
             BlenderError: Blender can't be started.
@@ -491,6 +536,8 @@ class _Process:
                     [*program, str(script), *separator, str(self._directory)],
                     cwd=self._directory,
                     env=workbench.make_environment(str(self._directory)),
+                    # The log is a file, as a full pipe that nobody reads would block
+                    # Blender.
                     stdin=subprocess.PIPE,
                     stdout=log,
                     stderr=log,
@@ -501,7 +548,14 @@ class _Process:
                 ) from error
 
     def render(self, seed: int, spp: int) -> Tensor:
-        """Render one image with its own noise, linear (H, W, 3).
+        """Render one image, linear (H, W, 3).
+
+        The process runs already and waits for lines of "seed spp number" on its
+        standard input. It writes the image NUMBER.exr.
+
+        Args:
+            seed: seed of the noise.
+            spp: samples per pixel.
 
         Raises:
             BlenderError: Blender stopped, or took too long.
@@ -530,6 +584,7 @@ class _Process:
             time.sleep(POLL_INTERVAL)
         with OpenEXR.File(str(path)) as image:
             channels = image.channels().values()
+            # There is one layer, named by Blender.
             pixels = next(iter(channels)).pixels  # RGB, perhaps with alpha
             radiance = torch.from_numpy(np.array(pixels[..., :3], dtype=np.float32))
         path.unlink()

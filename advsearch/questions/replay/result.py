@@ -193,6 +193,7 @@ class ReplayResult(views.InNotebook, results.SceneResult):
 
     @property
     def brief(self) -> str:
+        """Where the adversarial scene holds, in a few words for lists of runs."""
         if self.transfer is not None:
             return (
                 f"holds in {self.transfer.holding} of {self.transfer.clean_right} "
@@ -228,13 +229,17 @@ VERDICTS = {HOLDS: "holds", CLEAN_IS_WRONG: "clean is wrong too"}
 def count_transfer(
     table: Sequence[ReplayRow], method: str = PHOTOGRAPH
 ) -> PhotographTransfer | None:
-    """Count in how many photographs an adversarial scene holds; None without any.
+    """Count in how many photographs an adversarial scene holds.
+
+    A scene holds if the model is still wrong. The rate is among photographs in which
+    the model is right about the clean scene. The result is None without photographs.
 
     Each photograph counts once, however many renders it was tried with.
 
     Args:
         table: all rows.
-        method: `PHOTOGRAPH` or `SEARCHED_PHOTOGRAPH`, the `way` of the rows that count.
+        method: which rows count: `PHOTOGRAPH` for photographs that the attack did not
+            use, `SEARCHED_PHOTOGRAPH` for those that it used.
     """
     rows = [row for row in table if row.way == method and row.ending != NOT_DONE]
     if not rows:
@@ -330,6 +335,7 @@ def summarize_replay(result: ReplayResult) -> str:
     """Summarize in words under which conditions the adversarial scene holds."""
     if all(row.ending == NOT_DONE for row in result.table):
         return "Nothing was rendered again."
+    # The first row is the unchanged condition.
     unchanged, *other_rows = result.table
     changed = [
         row

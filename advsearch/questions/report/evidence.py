@@ -98,9 +98,14 @@ def count_conditions(
 ) -> list[ConditionShare]:
     """Count right predictions by each value of each axis of a sweep.
 
-    Given the rows of photographs, count instead how many of them agree with the
-    rendering that they are aligned with: right in both or wrong in both. Values
-    without anything that was counted are left out; other results have no axes.
+    With rows of photographs, those are counted instead that agree with the rendering
+    which they are aligned with: the model is right in both or wrong in both. Values
+    without any counts are left out. Results of other commands than `sweep` have no
+    axes, so the list is empty.
+
+    Args:
+        result: result of the run.
+        photographs: rows of the photographs of the run; None counts the renderings.
     """
     if not is_sweep(result):
         return []
@@ -109,7 +114,7 @@ def count_conditions(
         if photographs is None:
             right = row.correct
             total = row.configurations
-            # a single draw has no interval
+            # A single image has no interval, so nothing is known of the fraction.
             interval = row.interval or UNKNOWN_FRACTION
         else:
             right, total = _count_agreeing(photographs, row.axis, row.value)
@@ -215,21 +220,24 @@ def describe_criterion(
     criterion: float,
     selected_axes: Sequence[str] = (),
 ) -> list[str]:
-    """Describe whether a criterion, a minimum fraction that is right, is met.
+    """Describe whether a criterion is met: a minimum fraction of right predictions.
 
-    If values of axes were chosen, each condition is evaluated separately: a fraction
-    over all of them would change with the choice. Without conditions, the sentences
-    state that choice. A fraction of failures has no criterion.
+    If the user selected the values of an axis, each condition is evaluated separately,
+    since a fraction over all conditions would depend on the selection. Without
+    conditions, the sentences state that the values were selected. A fraction of
+    failures has no criterion.
 
     Args:
         claims: claims of the run.
-        conditions: fractions by condition.
+        conditions: fraction of right predictions under each condition, such as
+            "weather: rain".
         criterion: the minimum fraction.
-        selected_axes: axes whose values were chosen.
+        selected_axes: names of axes whose values the user selected.
     """
     verdict_of_condition = {
         row.condition: evaluate_criterion(criterion, row.interval) for row in conditions
     }
+    # "open": the interval of the fraction includes the criterion.
     listed_verdicts = ["not met"]
     if selected_axes:
         listed_verdicts.append("open")
@@ -253,7 +261,13 @@ def _count_verdicts(
     criterion: float,
     selected_axes: Sequence[str],
 ) -> str:
-    """Describe in how many conditions a criterion is met, not met, or open."""
+    """Describe in how many conditions a criterion is met, not met, or open.
+
+    Args:
+        verdict_of_condition: "met", "not met" or "open" for each condition.
+        criterion: minimum fraction of right predictions.
+        selected_axes: names of axes whose values the user selected.
+    """
     counts = Counter(verdict_of_condition.values())
     return (
         f"At least {wording.percent(criterion)}, each condition by its own 95 % "
@@ -267,7 +281,13 @@ def _count_verdicts(
 def _criterion_of_claims(
     claims: Sequence[views.Claim], criterion: float, selected_axes: Sequence[str]
 ) -> list[str]:
-    """Describe for each claimed fraction of right predictions if a criterion is met."""
+    """Describe for each claimed fraction of right predictions if a criterion is met.
+
+    Args:
+        claims: claims of the run.
+        criterion: minimum fraction of right predictions.
+        selected_axes: names of axes whose values the user selected.
+    """
     remark = ""
     if selected_axes:
         remark = (
@@ -288,7 +308,9 @@ def _criterion_of_claims(
 
 
 def read_exposure(path: str) -> dict[str, dict[str, float]]:
-    """Read weights of values by axis, such as ``environment: {street: 0.8, wet: 0.2}``.
+    """Read how common the values of each axis are in use, from a YAML file.
+
+    For example, ``environment: {street: 0.8, wet: 0.2}``. Weights need not add up to 1.
 
     Raises:
         InputError: if the YAML file is missing, or has no weights.
@@ -327,18 +349,27 @@ def describe_exposure(
 ) -> list[str]:
     """Describe the fraction of right predictions weighted by how common values are.
 
-    It is the weighted mean of the fractions; its bounds are those of the bounds of
-    intervals that hold jointly (Bonferroni).
+    For each axis this is the mean of the fractions of its values, weighted by the
+    exposure. Each fraction has an interval, and all intervals hold jointly
+    (Bonferroni). The bounds of the weighted mean are the weighted means of their lower
+    and upper bounds.
+
+    Args:
+        result: result of the run.
+        conditions: fraction of right predictions for each value of each axis.
+        exposure: weights by axis and value: how common each value is in use.
 
     Raises:
         UnknownNameError: if a weighted value is none of its axis.
     """
     lines = []
-    # Predictions that share a draw, as frames of a drive do, are not independent.
+    # The intervals assume independent predictions. Frames of one drive are not, and
+    # results other than sweeps may have selected their images.
     is_independent = is_sweep(result) and result.units is None
     for axis, weights in exposure.items():
         rows = {row.value: row for row in conditions if row.axis == axis}
         if not rows:
+            # The run does not vary this axis.
             continue
         for value in weights:
             if value not in rows:
@@ -382,8 +413,10 @@ def _weighted_mean(
 ) -> tuple[float, float, float]:
     """Return the weighted mean of the rates of right predictions, with its bounds.
 
-    Each of the k rates has an interval of confidence 1 - 0.05 / k, so that all hold
-    together with 95 % (Bonferroni). The bounds of the mean are the means of theirs.
+    The mean is sum(weight * rate) / sum(weight). Each of the k rates has an interval
+    with confidence 1 - 0.05 / k, so that all intervals hold jointly with 95 %
+    (Bonferroni). The lower bound of the mean is the weighted mean of their lower
+    bounds; the upper bound likewise.
 
     Args:
         rows: counts of right predictions by the value of an axis.
@@ -434,16 +467,18 @@ def describe_domain(
     recorded: Sequence[RecordedSettings],
     searched: Sequence[str],
 ) -> dict[str, DomainPart]:
-    """Describe the parts of an operational design domain: ranges, or fixed values.
+    """Describe an operational design domain: what varied, and what was fixed.
 
-    A part varied if a sentence is about it, or else if a control of the run belongs to
-    it. Where the place varied, light and weather are as each environment has them. What
-    belongs to no part is under `OTHER`, if there is anything.
+    An operational design domain lists the conditions that a system is made for, in
+    parts such as "place", "light" and "weather". A part varied if one of the sentences
+    is about it, or else if a control of the run belongs to it. If the place varied,
+    fixed light and weather are described as those of each environment. What belongs to
+    no part is under `OTHER`, if there is anything.
 
     Args:
         result: result of the run.
         recorded: settings that it recorded.
-        searched: sentences on what varied.
+        searched: sentences about what varied, as of `describe_searched`.
     """
     fixed = _fixed_domain(result, recorded)
     controls = [*getattr(result, "controls", ()), *getattr(result, "over", ())]
@@ -486,7 +521,8 @@ def _fixed_domain(
 
     Args:
         result: result of the run.
-        recorded: the settings that it recorded, its own first.
+        recorded: settings that the run recorded; its own come first, then those of runs
+            that it is based on.
     """
     fixed = defaultdict[str, list[str]](list)
     environment = getattr(result, "environment", "") or join_values(
@@ -596,11 +632,12 @@ def list_photograph_claims(photos: Any) -> list[views.Claim]:
 def warn_of_different_models(
     models: Sequence[str], digests: Sequence[str]
 ) -> list[str]:
-    """Warn if several runs are of different models.
+    """Return warnings if several runs are of different models.
 
     Args:
         models: name of the model of each run.
-        digests: digests of the model's files of each run, as a text.
+        digests: digests of the model's files of each run, as a text; empty if not
+            recorded.
     """
     warnings = []
     names = sorted(set(models))
@@ -646,8 +683,10 @@ def describe_run(
         name: name of the run.
         result: its result.
         claims: its claims.
-        recorded: the settings that it recorded, its own first.
-        versions: versions and digests that it noted.
+        recorded: settings that the run recorded; its own come first, then those of runs
+            that it is based on.
+        versions: versions of packages and digests of files that the run recorded, by
+            name.
     """
     run_settings = recorded[0].values if recorded else {}
     values = _get_fields(result)
@@ -700,11 +739,12 @@ def _describe_subject(
 ) -> dict[str, str]:
     """Return object, environment, model, task and what counts as right, by name.
 
-    What is not known is left out.
+    Values that are not known are left out.
 
     Args:
         result: result of the run.
-        recorded: the settings that it recorded, its own first.
+        recorded: settings that the run recorded; its own come first, then those of runs
+            that it is based on.
     """
     values = _get_fields(result)
     objects = values.get("object") or ", ".join(values.get("objects") or ())
@@ -748,8 +788,8 @@ def describe_searched(
 ) -> list[str]:
     """Describe what varied in a run: parameters with ranges, and controls.
 
-    A control has the ranges that were set; without any, and without a sentence about
-    its parameters, it varied over its defaults.
+    A control is described by the ranges that were set. If none were set, and no other
+    sentence is about its parameters, it varied over its default ranges.
 
     Args:
         result: result of the run.
@@ -830,14 +870,14 @@ def _describe_measurement(
     settings: Mapping[str, object],
     recorded: Sequence[RecordedSettings],
 ) -> dict[str, str]:
-    """Return policy, seed, samples and the like as text, by name.
+    """Return how a run measured: policy, seed, samples and so on, as text by name.
 
-    What a run does not have is left out.
+    Values that the run does not have are left out.
 
     Args:
         result: result of the run.
         settings: its own settings.
-        recorded: all settings that it recorded.
+        recorded: all settings that the run recorded.
     """
     tasks = [run_settings.task for run_settings in recorded if run_settings.is_of_scene]
     trials = "Trials of the worst configuration" if is_sweep(result) else "Trials"
@@ -936,14 +976,19 @@ def collect_evidence(
     by: str = "",
     twins: str | None = None,
 ) -> tuple[Evidence, dict[str, bytes]]:
-    """Return runs as evidence, with the pictures that it names.
+    """Return the claims of runs as evidence, and the pictures that it names.
+
+    The pictures are PNG files as bytes, by name.
 
     Args:
         runs: names or directories of the runs.
-        criterion: minimum fraction of right predictions.
-        exposure: weights of values by axis.
+        criterion: minimum fraction of right predictions that is required; None for
+            none.
+        exposure: weights by axis and value, such as ``{"weather": {"rain": 0.2}}``: how
+            common each value is in use.
         by: who is responsible for the evidence.
-        twins: a run of twins; None: those that the runs themselves named.
+        twins: name or directory of a run of `advsearch twins`, which compares
+            photographs with renders. None for the runs that the runs themselves name.
     """
     evidence_runs = list[EvidenceRun]()
     pictures = dict[str, bytes]()
@@ -953,6 +998,7 @@ def collect_evidence(
         run = _make_evidence_run(folder, criterion, exposure or {}, twins)
         update = {"pictures": list(run_pictures), "begun": _format_start(folder)}
         evidence_runs.append(run.model_copy(update=update))
+    # A misspelled axis would otherwise be ignored silently.
     known_axes = {row.axis for run in evidence_runs for row in run.conditions}
     warnings = _compare_models(evidence_runs)
     for axis in sorted(set(exposure or {}) - known_axes):
@@ -1031,7 +1077,17 @@ def _compare_models(runs: Sequence[EvidenceRun]) -> list[str]:
 def _make_evidence_run(
     folder: Path, criterion: float | None, exposure: Exposure, twins: str | None
 ) -> EvidenceRun:
-    """Return a run as evidence; a run without a summary claims nothing."""
+    """Return a run as evidence.
+
+    A run without a summary has not ended, and claims nothing.
+
+    Args:
+        folder: directory of the run.
+        criterion: minimum fraction of right predictions; None for none.
+        exposure: weights of values by axis: how common each value is in use.
+        twins: a run that compares photographs with renders; None for the one that this
+            run names.
+    """
     if not (folder / directory.summary.NAME).is_file():
         return _make_unfinished_run(folder)
     result = read_result(folder)
@@ -1041,7 +1097,8 @@ def _make_evidence_run(
 
     sweeps = _read_sweeps(result)
     searched = _list_searched(folder, result, sweeps) or run.searched
-    # What was made from sweeps is about their domain; the first stands for all.
+    # A result that was made from several sweeps is about their domain. They have the
+    # same domain, so that the first is described.
     domain = describe_domain(sweeps[0].result if sweeps else result, recorded, searched)
     conditions = count_conditions(result)
     weighted = describe_exposure(result, conditions, exposure)
@@ -1100,6 +1157,11 @@ def _describe_stored_run(
 
     The recorded settings are the run's own first, then those of its claims, then those
     of the runs.
+
+    Args:
+        folder: directory of the run.
+        result: its result.
+        claims: its claims.
     """
     read_paths = [
         *find_read_sweeps(result),
@@ -1223,7 +1285,13 @@ def _describe_limits(
     *,
     is_weighted: bool,
 ) -> list[str]:
-    """Describe what a reader must not conclude from a run."""
+    """Describe what a reader must not conclude from a run.
+
+    Args:
+        claims_of_photographs: claims that compare photographs with renderings.
+        domain: what varied and what was fixed, by the part of the domain.
+        is_weighted: whether fractions were weighted by exposure.
+    """
     n_compared = sum(
         claim.extent.total for claim in claims_of_photographs if claim.extent
     )

@@ -106,11 +106,11 @@ class RecordedSettings:
 
     @cached_property
     def _meaningless(self) -> set[str]:
-        """The settings that make no sense beside the others that were recorded.
+        """The settings that have no meaning together with the other recorded settings.
 
-        They are those that a command rejects beside them, as `fps` without a path.
-        Nothing is known, and none is returned, if the settings are not valid any more:
-        versions or files may have changed since the run.
+        These are settings that a command would reject, such as `fps` without a path of
+        the camera. If the recorded settings are not valid any more, since versions or
+        files have changed after the run, nothing is known and the set is empty.
         """
         if self._config_class is None:
             return set()
@@ -161,14 +161,15 @@ def _shorten(value: object) -> str:
 
 
 def _list_task_options(recorded_task: Any, objective: object) -> dict[str, Any]:
-    """Return the options of a task by name, those of its parts after their names.
+    """Return the options of a task by name.
 
-    Options that a run sets are left out, and empty ones. None are known of a task that
-    cannot be made any more.
+    Options of the parts of an ensemble have the part's name before theirs, as in
+    "NAME.OPTION". Options that the run sets itself are left out, and so are empty ones.
+    The result is empty if the task cannot be made any more.
 
     Args:
-        recorded_task: as for `describe_task`.
-        objective: as for `describe_task`.
+        recorded_task: the recorded setting `task`.
+        objective: the recorded setting `objective`, if it is a name.
     """
     from advsearch.extend import workbench  # it brings torch, which takes a second
 
@@ -227,6 +228,11 @@ def collect_settings(
     """Return the settings of a run, of its claims, and of the runs that it read.
 
     Claims are those of a suite that were tested, with its counterexamples.
+
+    Args:
+        folder: directory of the run.
+        result: its result.
+        read: directories of the runs that it read.
     """
     recorded = [RecordedSettings("", read_run_settings(folder))]
     for kind, settings_by_name in (read_noted_settings(folder, result) or {}).items():

@@ -167,7 +167,11 @@ def _describe_author(evidence: Evidence) -> str:
 
 
 def make_sections(run: EvidenceRun) -> dict[str, list[str]]:
-    """Return the lines of the sections of a run by title, without empty ones."""
+    """Return the lines of the sections of a run by title, without empty ones.
+
+    Args:
+        run: the run.
+    """
 
     def list_named(texts: Mapping[str, str]) -> list[str]:
         """Return a line for each text, with its name before it."""
@@ -206,7 +210,12 @@ CLAIM_HEADS = ("claim", "in words", "counted", "95 % interval")
 def make_evidence_page(
     evidence: Evidence, pictures: Mapping[str, bytes] | None = None
 ) -> str:
-    """Return evidence as a page, with pictures (PNG) by name."""
+    """Return evidence as an HTML page, which needs no other file.
+
+    Args:
+        evidence: the evidence.
+        pictures: PNG files as bytes, by the names that the evidence has for them.
+    """
     n_runs = len(evidence.runs)
     show = "shows" if n_runs == 1 else "show"
     claims = [claim for run in evidence.runs for claim in run.claims]

@@ -335,9 +335,10 @@ def register_cases(
 
     Args:
         group: group of the cases.
-        measure: runs a case.
-        rows: name, what must hold, and arguments of the function; `slow` among them is
-            no argument but whether the case is slow.
+        measure: function that runs a case; it is called with the arguments of the row.
+        rows: for each case its name, a text on what must hold, and the function's
+            arguments. The key "slow" is not an argument; it marks a case that takes
+            long.
     """
     for name, requirement, options in rows:
         arguments = {key: value for key, value in options.items() if key != "slow"}

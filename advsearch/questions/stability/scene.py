@@ -60,14 +60,15 @@ def make_renderer(
     plugins: Mapping[str, Mapping[str, object]] = MappingProxyType({}),
     denoise: str = "none",
 ) -> gradients.Renderer:
-    """Return `render(u, seed, spp)` of a small image, as `Scene.renderer` does.
+    """Return a renderer of a small image, which is called as `render(u, seed, spp)`.
 
-    Differences are taken per pixel, since the losses of the cases are smooth.
+    Derivatives by finite differences are taken of each pixel and not of the loss, since
+    the losses of the cases are smooth.
 
     Args:
-        controls: what varies.
-        thing: the object, its name, or what makes it.
-        environment: a plain one by default.
+        controls: controls that vary, with their settings.
+        thing: the object, its name, or a function that makes it.
+        environment: environment of the scene; None for a plain one.
         settings: settings of the scene.
         plugins: further shapes, as Mitsuba's dictionaries by name.
         denoise: the denoiser.
@@ -182,25 +183,26 @@ def check_scene(
 ) -> CaseOutcome:
     """Render a scene, differentiate it, and search from there.
 
-    The gradient is compared with differences, which takes most of the time. Always
-    checked are: the image is in [0, 1], nothing is NaN or infinite; with `compare` the
-    gradient's error and its noise; and whatever bounds are passed.
+    It is always checked that the image is in [0, 1], and that nothing is NaN or
+    infinite. With `compare`, the gradient is compared with finite differences, which
+    takes most of the time. Bounds that are passed are checked as well.
 
     Args:
         controls: settings of the controls.
-        thing: the object.
+        thing: the object, its name, or a function that makes it.
         u: the configuration (d,), or some of its values by index; the others are those
             of the start.
         spp: samples per pixel.
         compare: whether to compare the gradient with differences.
         seeds: minimum and maximum number of seeds of the differences.
-        repeats: gradients that are compared.
-        evaluations: evaluations of the search.
+        repeats: number of gradients that are compared.
+        evaluations: number of evaluations of the search.
         mean: bounds of the image's mean.
         gradient: bounds of the largest absolute entry of the gradient.
         ending: expected status of the search.
-        other_scene: arguments of `make_renderer` for another scene.
-        difference: bounds of the mean difference from its image.
+        other_scene: arguments of `make_renderer` for a second scene, whose image is
+            compared with the first; None for no comparison.
+        difference: bounds of the mean absolute difference of both images.
         **scene: further arguments of `make_renderer`.
     """
     renderer = make_renderer(controls, thing, **scene)  # type: ignore[arg-type]
@@ -308,7 +310,13 @@ def _compare_images(
     other: gradients.Renderer,
     bounds: Bounds,
 ) -> Check:
-    """Check the mean difference of an image from that of another scene's start."""
+    """Check the mean difference of an image from that of another scene's start.
+
+    Args:
+        renderer, start: renderer and configuration of the first image.
+        other: renderer of the second image, at its own start.
+        bounds: lower and upper bound of the mean absolute difference.
+    """
     difference = mean_difference(
         render_image(renderer, start), render_image(other, other.start)
     )
@@ -320,10 +328,10 @@ def _compare_images(
 def _check_gradient(
     rows: Sequence[results.Measured],
 ) -> tuple[list[Check], float | None]:
-    """Check the comparison of derivatives with differences: its noise and the errors.
+    """Check noise and errors of derivatives that were compared with differences.
 
-    There is a check of the derivative with the largest noise and one of that with the
-    largest error; without derivatives there is none.
+    One check is for the derivative with the largest noise, another for the one with the
+    largest error. Without derivatives there are no checks.
 
     Args:
         rows: the compared derivatives.
@@ -354,16 +362,16 @@ def search_scene(
 ) -> workbench.SearchResult:
     """Search from a configuration with the margin of a linear model of two classes.
 
-    One logit is 0, the other `LOGIT_SCALE` times the increase of the loss over the
-    start, minus 1. So the margin is -1 at the start, and above 0 once the loss has
-    increased by 1 / `LOGIT_SCALE`.
+    A search maximizes the margin and stops above 0. Here the margin is LOGIT_SCALE *
+    (loss - loss at the start) - 1. So it is -1 at the start, and above 0 once the loss
+    has increased by 1 / `LOGIT_SCALE`.
 
     Args:
         renderer: renderer of the scene.
         loss: loss of an image.
         start: (d,) configuration.
         spp: samples per pixel.
-        evaluations: evaluations with gradients, that the search makes.
+        evaluations: number of evaluations with gradients that the search makes.
     """
     loss_at_start = float(loss(render_image(renderer, start, 0, spp)))
     gradient_cost = make_domain(renderer, start).gradient_cost
@@ -374,6 +382,7 @@ def search_scene(
     # Steps count renders: each evaluation takes the image and those of its gradient.
     # One more is left for an image without a gradient.
     steps = evaluations * (1 + gradient_cost) + 1
+    # one candidate that is rendered once more: the smallest complete search
     return run_search(
         renderer, margin, steps, spp=spp, start=start, candidates=1, repeats=1
     )
@@ -402,14 +411,16 @@ def compare_gradient(
 ) -> list[results.Measured]:
     """Compare the plan's gradient of a smooth linear loss with differences.
 
-    Differences are between renders with the same random numbers.
+    The finite differences are between renders with the same random numbers, so that
+    their noise mostly cancels.
 
     Args:
-        renderer: whose formation is linear meanwhile.
+        renderer: renderer of the scene; while it is measured, its image formation has
+            no tone curve.
         u: the configuration (d,).
         spp: samples per pixel.
         seeds: minimum and maximum number of seeds of the differences.
-        repeats: gradients that are compared.
+        repeats: number of gradients that are compared.
     """
     formation = renderer.formation
     bench = gradients.Bench(
@@ -438,14 +449,14 @@ def measure_inward_slope(
 ) -> tuple[float, float]:
     """Return the derivative of the smooth linear loss along a direction inwards.
 
-    Values at the ends of their range can only move inwards. The direction moves those
-    that increase the loss this way by `factor` into the range, and leaves all others.
+    Values at a bound of their range can only move inwards. The direction moves those
+    values by `factor` that increase the loss in this way; all other values stay.
 
     Args:
         renderer: renderer of the scene.
         gradient: (d,) of the loss at the start.
         factor: factor on the direction.
-        seeds: seeds over which differences are averaged.
+        seeds: number of seeds over which the differences are averaged.
         spp: samples per pixel.
 
     Returns:
@@ -466,6 +477,8 @@ def measure_inward_slope(
             float(loss(render_image(linear, u + count * step * direction, seed, spp)))
             for count in range(3)
         )
+        # f'(0) = (4 f(h) - 3 f(0) - f(2h)) / (2h) + O(h^2), the forward difference of
+        # second order
         slopes.append((4.0 * at_1 - 3.0 * at_0 - at_2) / (2.0 * step))
     return float(gradient @ direction), math.fsum(slopes) / seeds
 
@@ -473,7 +486,7 @@ def measure_inward_slope(
 def evaluate(
     renderer: gradients.Renderer, loss: gradients.Loss, spp: int, query: workbench.Query
 ) -> policies.Evaluation:
-    """Evaluate a configuration by a loss of the image; above 0 is a success.
+    """Evaluate a configuration by a loss of the image; a loss above 0 is a success.
 
     The index of the query is the seed of the noise. The cost is in renders with `spp`
     samples.
@@ -522,7 +535,7 @@ def run_search(
         loss: loss of the image, which is maximized.
         steps: steps of the search.
         spp: samples per pixel.
-        start: None for the renderer's.
+        start: the first configuration (d,); None for the renderer's own start.
         policy: None for "pgd".
         **options: options of `attacks.search`; without them no candidate is rendered
             again.

@@ -71,10 +71,10 @@ DARKNESS = make_gray_environment(0.0)
 
 
 def exposure_case(control: str, low: float, high: float) -> dict[str, object]:
-    """Return arguments of `check_scene` at the end of a range of exposures, stops.
+    """Return arguments of `check_scene` at the extreme end of a range of exposures.
 
-    That is the upper end of positive ones, the lower end of negative ones. The exposure
-    is the first value of the configuration.
+    It is the upper end of a range of positive exposures (in stops), and the lower end
+    of a range of negative ones. The exposure is the first value of the configuration.
     """
     is_upper_end = high > 0.0
     return {
@@ -201,15 +201,17 @@ for word, value in (("negative", -1.0), ("infinite", math.inf), ("nan", math.nan
 
 
 def leave_plateau(low: float, high: float) -> CaseOutcome:
-    """Search for a darker picture from a white one, where no gradient points the way.
+    """Search for a darker picture from a white one, where the gradient is zero.
 
-    The way out is a lower exposure.
+    All pixels are clipped at white, so the loss is constant near the start. Policies
+    have to find a lower exposure without a gradient.
 
     Args:
-        low, high: range of the exposure, stops. Up to about 4 something in the picture
-            is not white.
+        low, high: range of the exposure in stops. Below about 4 stops some pixels are
+            not white.
     """
     renderer = make_renderer({"camera": {"exposure": [low, high]}})
+    # the highest exposure, as 1 is the upper bound of each range
     start = torch.ones_like(renderer.start)
     start_query = workbench.Query(start, 0, gradient=True)
     checks = []
@@ -339,6 +341,8 @@ def look_through_glass() -> CaseOutcome:
 def texels_at_the_ends() -> CaseOutcome:
     """Texels at the ends of the range have a gradient, and the search moves them
     inwards only.
+
+    The texture is a checkerboard of 0 and 1, which are the bounds.
     """
     controls = {"texture": {"resolution": 8, "epsilon": 0.2}}
     renderer = make_renderer(controls, make_checkered_mug)
@@ -681,7 +685,12 @@ register_cases(
 
 @register_case("geometry", "million-triangles", slow=True)
 def million() -> CaseOutcome:
-    """Finite, right, and like the coarse mesh of the same shape."""
+    """Finite, right, and like the coarse mesh of the same shape.
+
+    The mesh is a sphere of a million triangles. The gradients are those by its texture
+    and by a shift.
+    """
+    # 1000 columns and 501 rows give about 2 * 1000 * 500 triangles.
     fine_mesh = assets.normalise_mesh(workbench.make_sphere(501, 1000))
     coarse_mesh = assets.normalise_mesh(workbench.make_sphere(64, 128))
     coarse = make_renderer(SHIFT, make_checkered_object(coarse_mesh))
@@ -710,6 +719,8 @@ def million() -> CaseOutcome:
 def gimbal() -> CaseOutcome:
     """At a pitch of 90 degrees the gradients by angles and by the rotation vector are
     right.
+
+    At this pitch, yaw and roll rotate about the same axis (gimbal lock).
     """
     angles = {
         "pose": {
@@ -748,7 +759,10 @@ def gimbal() -> CaseOutcome:
 
 
 def full_turn(controls: ControlSettings) -> CaseOutcome:
-    """Check that 0 and 360 degrees are the same, in picture, gradient and steps.
+    """Check that 0 and 360 degrees are the same angle.
+
+    Image and gradient have to be equal, and a step past 360 degrees has to continue at
+    0.
 
     Args:
         controls: a control with one angle, whose range is 0 to 360 degrees.
@@ -773,7 +787,7 @@ def full_turn(controls: ControlSettings) -> CaseOutcome:
             slope_difference / float(zero_slope.abs().max()),
             most=0.05,
         ),
-        # to 0.01, but for rounding
+        # A step of 0.01 past the end goes to 0.01, except for rounding.
         check_range(
             "where a step of 0.01 past the end goes",
             float(past_end.max()),
@@ -805,7 +819,9 @@ for control, name in (
 
 
 def run_cases(context: RunContext[StabilityConfig]) -> StabilityResult:
-    """Run cases of the suite in order, until the end, the time is over, or Ctrl-C.
+    """Run cases of the suite in order.
+
+    The run ends with the last case, when its time is over, or with Ctrl-C.
 
     The result of a case is stored at once: a resumed run continues with the next.
     """
@@ -880,8 +896,9 @@ def estimate_hessian(
 ) -> Tensor:
     """Estimate second derivatives (k, k), float64, of an objective f by differences.
 
-    They are central, of steps h: (f(+) - 2 f + f(-)) / h^2 on the diagonal, and (f(++)
-    - f(+-) - f(-+) + f(--)) / (4 h_i h_j) elsewhere.
+    These are central differences with steps h. On the diagonal they are (f(+) - 2 f +
+    f(-)) / h^2, elsewhere (f(++) - f(+-) - f(-+) + f(--)) / (4 h_i h_j), where + and -
+    are steps forwards and backwards along the directions i and j.
 
     Args:
         value: the objective f.
@@ -949,6 +966,9 @@ def _measure_shift_slope(half_width: float) -> float:
 def light_rotation_texel() -> CaseOutcome:
     """All three move, the condition number is printed, and the objective's unit does
     not matter.
+
+    The search is over the power of a light, a rotation and texels, whose units and
+    curvatures differ. The condition number is that of the Hessian.
     """
     controls: ControlSettings = {
         "light": {"type": "point", "power": [0.0, 12.0], "x": 1.0, "y": -1.0, "z": 2.0},
@@ -959,6 +979,7 @@ def light_rotation_texel() -> CaseOutcome:
     u = renderer.start.clone()
     u[:2] = torch.tensor([0.5, 0.1])  # power and rotation; texels follow
     hessian = _estimate_three_curvatures(renderer, u)
+    # Derivatives by u become derivatives by watts: one watt is 1/12 of the range.
     # from the unit box to watts, degrees and sRGB
     from_unit_box = torch.diag(torch.tensor([1.0 / 12.0, 1.0 / 360.0, 1.0]).double())
     path, _ = _record_path(renderer, u, 1.0)
@@ -1006,7 +1027,13 @@ def _estimate_three_curvatures(renderer: gradients.Renderer, u: Tensor) -> Tenso
 def _record_path(
     renderer: gradients.Renderer, u: Tensor, scale: float
 ) -> tuple[Tensor, str]:
-    """Search with a scaled objective; return the path (steps, d) and the status."""
+    """Search with a scaled objective; return the path (steps, d) and the status.
+
+    Args:
+        renderer: renderer of the scene.
+        u: configuration at which the search starts (d,).
+        scale: factor on the objective, which must not change the path.
+    """
     loss = gradients.make_smooth_loss(renderer.formation.resolution)
     path: list[Tensor] = []
     result = run_search(
@@ -1053,8 +1080,8 @@ def heavy_render(count: int = 24) -> CaseOutcome:
     """The plan takes differences of the loss for what moves a mesh, which have no heavy
     tail.
 
-    Of so many Gaussian numbers fewer than one lot in 1,000 has one farther from the
-    median than 12 median distances.
+    The farthest sample may be at most 12 median distances from the median. For 24
+    Gaussian samples, that is exceeded less than once in 1,000 trials.
     """
     controls = {"pose": {"x": [-0.3, 0.3]}}
     renderer = make_renderer(controls).copy_with(transfer="linear")

@@ -47,14 +47,16 @@ def test(
 ) -> SuiteResult:
     """Test the claims of a suite, counterexamples first (docs/testing.md).
 
-    Files for other programs are written at the end.
+    Claims are not tested if a counterexample fails, unless `all` is set. Reports for
+    other programs, such as JUnit XML and SARIF, are written at the end.
 
     Args:
-        suite: a YAML file.
+        suite: path of the suite's YAML file, or its content as Python mappings.
     """
     from advsearch.questions.test.carry_out import try_suite  # imports torch
 
     config = context.config
+    # checked before the test, which may take hours
     files: dict[str, Path] = {}
     for name in FILE_FORMATS:
         file = getattr(config, name)

@@ -69,12 +69,12 @@ def try_suite(
 ) -> SuiteResult:
     """Test the claims of a suite; what a resumed run decided is not tested again.
 
-    With `add` it tests nothing but the new counterexample, which is deleted again
-    unless the model fails on it.
+    With the setting `add` only the new counterexample is tested. If the model does not
+    fail on it, the counterexample is deleted again.
 
     Args:
         context: context of the experiment; its settings name the suite.
-        suite: instead of the one that the settings name.
+        suite: parsed suite that replaces the file that the settings name.
 
     Raises:
         InputError: if the suite names something that does not exist, contradicts
@@ -86,6 +86,8 @@ def try_suite(
     # a check before the work: raises an error if the run of twins cannot be read
     if config.twins is not None:
         workbench.read_twins(config.twins)
+    # A resumed run tests the suite that it has started with, even if the file has
+    # changed.
     loaded_suite = _read_noted_suite(context.resumed) or suite or _read_suite(config)
     added = None
     if config.add is not None:
@@ -94,7 +96,8 @@ def try_suite(
         planned = _plan_claims(loaded_suite, config, added)
         is_from_file = loaded_suite is not suite
         if is_from_file:
-            # A file must not do what only its caller may.
+            # A file may come from others: it must not load code or use powers that only
+            # the caller may grant.
             for claim in planned:
                 claim.config.check_powers(f"claims.{claim.name}.settings")
         remarks = _check_claims(planned, loaded_suite)
@@ -143,7 +146,13 @@ def _read_suite(config: SuiteConfig) -> Suite:
 def _note_settings(
     context: RunContext[SuiteConfig], suite: Suite, planned: Sequence[PlannedClaim]
 ) -> None:
-    """Note the settings of claims, so that a resumed run tests with the same."""
+    """Store the settings of claims, so that a resumed run tests with the same ones.
+
+    Args:
+        context: the settings and the run.
+        suite: the suite that is tested.
+        planned: its claims and counterexamples.
+    """
     run = context.run
     run.store.write_note(SUITE_NOTE, json.dumps(suite.model_dump(mode="json")))
     settings_of_examples = {
@@ -152,7 +161,8 @@ def _note_settings(
         if claim.example is not None
     }
     run.store.write_note(SETTINGS_NOTE, json.dumps(settings_of_examples))
-    # settings whose files must not change until the run is resumed
+    # The digests of files that these settings name are stored: they must not change
+    # before the run is resumed.
     used_settings = list[dict[str, Any]]()
     for planned_claim in planned:
         used_settings.append(planned_claim.config.to_json())
@@ -183,7 +193,7 @@ class _SuiteRun:
     def run_claims(self) -> str:
         """Test every claim, and return the status of the run.
 
-        After an interrupt the others get results without a verdict.
+        After an interrupt, the claims that are left get results without a verdict.
         """
         tester = self.tester
         with tester.context.until_interrupted():
@@ -192,7 +202,8 @@ class _SuiteRun:
                 last = self.results[-1]
                 tester.progress.message(f"{claim.name}: {last.answer}: {last.reason}")
                 if number < len(self.planned):
-                    # what is read of a run that is killed
+                    # The summary of the claims so far is written after each claim, so
+                    # that it can be read even if the run is killed.
                     so_far = self.make_result(results.INTERRUPTED, None)
                     tester.run.write_summary(so_far)
         if tester.context.ending == results.INTERRUPTED:
@@ -211,15 +222,17 @@ class _SuiteRun:
         return results.OUT_OF_TIME if Cause.OUT_OF_TIME in causes else "done"
 
     def _test_claim(self, claim: PlannedClaim) -> ClaimResult:
-        """Test a claim, or return its noted result, or why it is not tested.
+        """Return the result of a claim, testing it if necessary.
 
-        A result is noted unless the time ended the test.
+        A claim that the run has tested before has a stored result. A result is stored
+        unless the time ended its test, so that a resumed run tests the claim again.
         """
         key = f"claim {claim.name}"
         tester = self.tester
         noted = tester.run.store.read_json_note(key)
         if noted is not None:
             return ClaimResult.of(noted)
+        # for example because a counterexample has failed or the time is over
         untested = self._refuse_claim(claim)
         if untested is not None:
             return untested
@@ -242,8 +255,9 @@ class _SuiteRun:
     def _refuse_claim(self, claim: PlannedClaim) -> ClaimResult | None:
         """Return the result of a claim that is not tested; None for one that is.
 
-        It is not tested if an unexpected counterexample failed (unless the settings ask
-        for all), the time is over, or a counterexample does not suit the model.
+        There are three reasons. A counterexample failed unexpectedly, then claims are
+        not tested unless the setting `all` is set. The time is over. Or a
+        counterexample does not suit the model.
         """
         counterexample_failed = any(
             result.kind == "counterexample" and not result.accepted
@@ -264,7 +278,13 @@ class _SuiteRun:
     def _make_untested(
         self, claim: PlannedClaim, reason: str, cause: Cause | None = None
     ) -> ClaimResult:
-        """Make the result of a claim that is not tested, or not yet."""
+        """Make the result of a claim that is not tested, or not yet.
+
+        Args:
+            claim: the claim.
+            reason: reason why it is not tested; empty if it is about to be tested.
+            cause: kind of that reason; None without.
+        """
         text = ""
         if claim.example is None:
             text = describe_claim(self.tester.suite.claims[claim.name], claim.config)
@@ -303,7 +323,10 @@ class _SuiteRun:
         return f"{command} {shlex.join(arguments)}".rstrip()
 
     def make_result(self, ending: str, added: Counterexample | None) -> SuiteResult:
-        """Make the result of the claims so far; with `update`, expect its verdicts.
+        """Make the result of the claims so far.
+
+        With the setting `update`, the verdicts of a complete run are stored as those
+        that are expected from now on.
 
         Args:
             ending: status of the run.
@@ -348,11 +371,11 @@ class _SuiteRun:
     ) -> tuple[list[ClaimResult], list[str]]:
         """Store the verdicts of claims as expected.
 
-        Claims that were not tested since a counterexample failed keep what is expected
-        of them.
+        Claims that were not tested because a counterexample failed keep their expected
+        verdicts.
 
         Returns:
-            The claims with what is expected now, and a sentence for each change.
+            The claims with their new expected verdicts, and a sentence for each change.
         """
         verdicts = {
             claim.name: claim.answer
@@ -369,10 +392,10 @@ class _SuiteRun:
         return updated, changes
 
     def _find_twins(self, configs: Sequence[SceneConfig]) -> Any:
-        """Return what a run of twins shows about renders of these claims.
+        """Return how far renders agree with photographs, by a run of twins.
 
-        Twins are renders of photographed objects, which are compared with their
-        photographs. None if no run of them is named.
+        Twins are renders of photographed objects, which are compared with the
+        photographs. The result is None if the settings name no run of twins.
 
         Args:
             configs: settings of each claim.
@@ -398,7 +421,14 @@ def _join_distinct(names: Iterable[str]) -> str:
 def _plan_claims(
     suite: Suite, config: SuiteConfig, added: Counterexample | None
 ) -> list[PlannedClaim]:
-    """Plan what is tested: counterexamples, then claims; a new counterexample alone.
+    """Plan what is tested: counterexamples first, then claims.
+
+    A new counterexample is tested alone.
+
+    Args:
+        suite: the suite.
+        config: settings of the command, which override those of the suite.
+        added: the new counterexample, or None.
 
     Raises:
         InputError: if names clash, or `only` selects nothing or names no claim.
@@ -406,6 +436,7 @@ def _plan_claims(
     changes = {
         "model": config.model,
         "threads": config.threads,
+        # False is the default, which must not override the suite's setting.
         "deterministic": config.deterministic or None,
     }
     if added is None:
@@ -430,7 +461,9 @@ def _plan_claims(
 def _select_claims(
     planned: Sequence[PlannedClaim], config: SuiteConfig
 ) -> list[PlannedClaim]:
-    """Select the claims that `only` names, by default all.
+    """Select the claims that the setting `only` names, by default all.
+
+    The name of `ALL_COUNTEREXAMPLES` selects all counterexamples.
 
     Raises:
         InputError: if it names no claim, or none is left.
@@ -462,7 +495,10 @@ def _select_claims(
 def _plan_example(
     example: Counterexample, suite: Suite, changes: Mapping[str, object]
 ) -> PlannedClaim:
-    """Plan the test of a counterexample, which may not suit the model."""
+    """Plan the test of a counterexample.
+
+    If it does not suit the suite's model, the reason is stored, and it is not tested.
+    """
     refusal = ""
     try:
         config = example.make_config(suite, changes)
@@ -481,8 +517,8 @@ def _plan_example(
 def _check_claims(planned: Sequence[PlannedClaim], suite: Suite) -> list[str]:
     """Load everything that claims name, and return remarks.
 
-    A wrong name would otherwise end minutes of rendering. Files of counterexamples are
-    loaded at once when they are tested.
+    Otherwise a wrong name would be noticed only after minutes of rendering.
+    Counterexamples are not loaded here, as they are tested first anyway.
 
     Raises:
         InputError: if a claim could not be tested or decided.
@@ -499,6 +535,7 @@ def _check_claims(planned: Sequence[PlannedClaim], suite: Suite) -> list[str]:
     checked = list[AttackConfig]()
     for planned_claim, claim in claims:
         for config in _list_used_configs(planned_claim, claim):
+            # Many claims share their settings, which are checked once.
             if config in checked:
                 continue
             try:
@@ -529,7 +566,7 @@ def _check_search(name: str, config: AttackConfig) -> None:
     """Check that the settings of a claim are those of a single search for an error.
 
     Raises:
-        InputError: for the first setting that is of something else.
+        InputError: for the first setting that belongs to another kind of run.
     """
     for setting, is_wrong, expected in (
         ("object", len(config.objects) > 1, "one object; make a claim of each"),

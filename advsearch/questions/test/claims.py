@@ -241,7 +241,15 @@ class ClaimTester:
     def _test_by_search(
         self, pending: ClaimResult, config: AttackConfig
     ) -> ClaimResult:
-        """Test by a search, as a part of this run, that nothing breaks a model."""
+        """Test by an attack the claim that nothing breaks a model.
+
+        The attack is a part of this run. The claim fails if the attack finds a verified
+        adversarial scene.
+
+        Args:
+            pending: the result without a verdict, which is filled in.
+            config: settings of the attack.
+        """
         search = self._make_search(config)
         summary = self.context.run_part(pending.name, search)
         assert isinstance(summary, workbench.AttackSummary)
@@ -252,7 +260,8 @@ class ClaimTester:
         picture = None
         if evaluated.verdict == FAILED:
             picture = self._find_search_picture(pending.name, summary)
-        # "products" are of matrices: they give images without rendering
+        # "products" counts images computed by matrices of light transport, without a
+        # render.
         n_pictures = sum(
             count for name, count in summary.renders.items() if name != "products"
         )
@@ -307,10 +316,19 @@ class ClaimTester:
     ) -> ClaimResult:
         """Sample pictures until they decide a claim, or all of them are sampled.
 
-        It is about the predictions of a model alone, or compared with those of another
-        model or about changed pictures.
+        The claim is about the predictions of one model, or compares them with those of
+        another model, or with those on changed pictures. A confidence sequence stays
+        valid however often it is looked at, so sampling may stop as soon as the claim
+        is decided.
+
+        Args:
+            pending: the result without a verdict, which is filled in.
+            claim: the claim.
+            config: settings of the pictures.
         """
         problem = self._load_problem(config)
+        # Only one bound is compared with the claim's limit, so the interval is
+        # one-sided.
         sequence = statistics.sequential.ConfidenceSequence(
             self.suite.confidence, sides=1
         )
@@ -354,9 +372,11 @@ class ClaimTester:
         """Evaluate pictures until their scores decide the claim, or there are no more.
 
         Args:
-            evaluated: queries with their evaluations, and those of the other side.
+            evaluated: queries, each with the evaluation by the model under test and
+                that of the other side, or None.
             claim: what is claimed.
-            sequence: a confidence sequence of the mean score, which gets each score.
+            sequence: confidence sequence of the mean score, to which each score is
+                added.
 
         Returns:
             The scores, the verdict, and the worst picture against the claim.
@@ -364,6 +384,7 @@ class ClaimTester:
         sample = _PictureSample()
         for query, evaluation, other in evaluated:
             score, badness, text = score_picture(claim, evaluation, other)
+            # The object is not visible in the picture, so nothing can be predicted.
             if score is None:
                 sample.n_hidden += 1
                 continue
@@ -391,8 +412,8 @@ class ClaimTester:
     ) -> Iterator[Iterator[Evaluated]]:
         """Open the workers that evaluate sampled pictures, of one or of two models.
 
-        A claim that pictures are right has no other side. Else the other side is the
-        other model, or the same one on changed pictures.
+        The other side is what the model is compared with: another model, or the same
+        model on changed pictures. A claim that pictures are right has none.
 
         Args:
             name: name of the claim.
@@ -447,11 +468,13 @@ class ClaimTester:
     ) -> tuple[Problem, ChangePicture | None]:
         """Return the problem of the other side, and what makes its pictures.
 
-        None makes no picture: then the other side has a rendering of its own.
+        The other side is what the model is compared with. The function changes a
+        picture of the model under test. It is None if the other side needs renders of
+        its own.
 
         Args:
             claim: the claim.
-            config: settings of its pictures.
+            config: settings of the pictures.
             problem: problem of the model under test.
         """
         if isinstance(claim, NoWorseClaim):
@@ -459,14 +482,20 @@ class ClaimTester:
             takes_same_images = other.renderer.formation == problem.renderer.formation
             return other, _same_picture if takes_same_images else None
         if isinstance(claim, ChangeClaim):
-            # evaluated by what is true of the picture before the change
+            # The ground truth is that of the picture before the change.
             return problem, self._make_change(claim, config, problem)
         return problem, None
 
     def _make_change(
         self, claim: ChangeClaim, config: SceneConfig, problem: Problem
     ) -> ChangePicture:
-        """Return the function that changes the picture of a query as claimed."""
+        """Return the function that changes the picture of a query as claimed.
+
+        Args:
+            claim: a claim about predictions under a change, such as a blurred picture.
+            config: settings of the scene.
+            problem: problem of the model under test.
+        """
         if claim.when != workbench.WITHOUT_OBJECT:
             return lambda query, picture: workbench.change_image(
                 picture, claim.when, problem.model.cameras
@@ -486,13 +515,16 @@ class ClaimTester:
     ) -> Iterator[Evaluated]:
         """Yield queries with their evaluations, until the time is over.
 
-        As many are evaluated at once as there are workers for.
+        Queries are evaluated in batches that keep all workers busy.
 
         Args:
             journal: evaluates the queries.
             queries: what to evaluate.
-            other_side: evaluates the other side, if there is one.
+            other_side: what the model is compared with, such as another model; None if
+                nothing.
         """
+        # Without workers a batch has one query, so that a decided claim renders no more
+        # than it needs.
         batch_size = 1
         if journal.evaluator.executor is not None:
             batch_size = BATCHES_AHEAD * (self.config.workers or CLUSTER_WORKERS)
@@ -518,11 +550,11 @@ class ClaimTester:
     ) -> ClaimResult:
         """Test a counterexample: the model should be right on it.
 
-        One whose files or scene have changed, or that does not suit the model, stays
+        If its files or its scene have changed, or it does not suit the model, it stays
         undecided, with the reason.
 
         Args:
-            pending: the result without a verdict.
+            pending: the result without a verdict, which is filled in.
             example: the counterexample.
             config: settings that it is tested with.
         """
@@ -565,9 +597,9 @@ class ClaimTester:
             pending: the result without a verdict.
             example: the counterexample.
             problem: problem of the model under test.
-            over: whether conditions vary; then each trial has one of the clean scene
-                under the same conditions, and does not count if the model is wrong
-                there.
+            over: whether conditions vary. Then the clean scene is rendered under the
+                same conditions in each trial, and the trial does not count if the model
+                is wrong there.
         """
         sample = self._sample_trials(example, problem, over=over)
         update = _trials_result(sample, problem.task.name, over=over)
@@ -589,9 +621,15 @@ class ClaimTester:
     ) -> _TrialSample:
         """Make trials until further ones would change nothing, or the time is over.
 
-        The picture of the first wrong trial is saved. Arguments as for
-        `_test_by_trials`.
+        The picture of the first wrong trial is saved.
+
+        Args:
+            example: the counterexample.
+            problem: problem of the model under test.
+            over: whether conditions vary; then the clean scene is rendered in each
+                trial, too.
         """
+        # Offsets are stored with rounding, which may leave the budget by a little.
         u = problem.domain.project(example.make_configuration(problem.domain.start))
         # trials by which it is added are not repeated as trials of the suite
         prefix = "added " if self.config.add is not None else ""
@@ -609,6 +647,7 @@ class ClaimTester:
         ):
             outcome = evaluate_trial(trial, clean)
             sample.outcomes.append(outcome)
+            # `outcome` is None for a trial that does not count.
             if outcome is False:
                 sample.wrong_payloads.append(trial.payload)
                 if not sample.label:
@@ -696,7 +735,7 @@ def _evaluate_with_pictures(
 
     Args:
         journal: its evaluator renders and predicts them.
-        pictures: gets the pictures; None if they are not needed.
+        pictures: mapping to which the pictures are added; None if they are not needed.
         queries: what to evaluate.
     """
     with_image = pictures is not None
@@ -714,7 +753,13 @@ def _evaluate_batch(
     other_side: _OtherSide,
     batch: Sequence[workbench.Query],
 ) -> tuple[Iterable[policies.Evaluation], Iterable[policies.Evaluation]]:
-    """Return the evaluations of both sides of a batch of queries."""
+    """Return the evaluations of both sides of a batch of queries.
+
+    Args:
+        journal: evaluates the model under test, and stores the rows.
+        other_side: what the model is compared with.
+        batch: the queries.
+    """
     pictures: dict[int, Tensor | None] | None = {}
     if other_side.change is None:
         pictures = None
@@ -737,10 +782,13 @@ def _evaluate_other_side(
     pictures: Mapping[int, Tensor | None] | None,
     queries: Sequence[workbench.Query],
 ) -> Iterator[policies.Evaluation]:
-    """Evaluate the other side: on changed pictures, or on its own ones.
+    """Evaluate what the model under test is compared with.
+
+    That is a model on the same pictures after a change, such as blurring, or another
+    model on pictures of its own.
 
     Args:
-        other_side: the other side.
+        other_side: the evaluator and, if pictures are changed, the change.
         problem: problem of the model under test.
         pictures: its pictures, by the index of the query.
         queries: what to evaluate.
@@ -762,9 +810,9 @@ def _evaluate_other_side(
 
 
 def claim_worker(values: dict[str, Any]) -> Callable[[Any], Any]:
-    """Return what a worker process calls for a claim about two models.
+    """Return the function that a worker process calls for a claim about two models.
 
-    A model is loaded at its first use; requests name it by its index.
+    A request names its model by index, "0" or "1". A model is loaded at its first use.
 
     Args:
         values: settings of the claim's pictures, with both models.
@@ -785,7 +833,8 @@ def sample_queries(
 ) -> Iterator[workbench.Query]:
     """Yield configurations sampled uniformly from the full space and budget.
 
-    Each has its own seed.
+    Each has its own seed of the noise. The samples depend on the kind and the index
+    alone, so that a resumed run samples the same.
 
     Args:
         problem: problem of the model under test.
@@ -800,6 +849,7 @@ def sample_queries(
         (u,) = problem.domain.sample(generator)
         seed = seeds.stream(problem.seed, kind, index)
         values = {}
+        # Descriptions of large textures would make the stored rows large.
         if problem.domain.dim <= MAX_STORED_VALUES:
             values = problem.describe(u, seed)
         yield workbench.Query(
@@ -821,9 +871,10 @@ def threshold_mean(claim: ShareClaim | NoWorseClaim) -> float:
 def check_pictures(name: str, claim: AnyClaim, confidence: float) -> str:
     """Check a claim's number of pictures; return a remark, or "" if it is enough.
 
-    A model that is always right has to be able to hold the claim with so many pictures,
-    and one that is always wrong to fail it. The remark is about a claim that compares
-    two models, if these are not enough for two that predict alike.
+    With that number of pictures, a model that is always right has to be able to hold
+    the claim, and one that is always wrong to fail it. Otherwise the test is useless
+    whatever the model predicts. For a claim that compares two models there is a remark
+    if the pictures could not show that two models which predict alike are equally good.
 
     Raises:
         InputError: if no predictions of so many pictures could decide it both ways.
@@ -862,8 +913,10 @@ def score_picture(
 ) -> _PictureScore:
     """Score a picture for a claim.
 
-    The score is whether the model is right, or predicts as claimed. Of two models it is
-    1 if only the first is right, 0 if only the other is, else 1/2.
+    The score is 1 if the model is right, or predicts as claimed, and 0 otherwise. For
+    two models it is 1 if only the first is right, 0 if only the other is, and 1/2 if
+    both are right or both are wrong. The score is None, and the picture does not count,
+    if the object is not visible.
 
     Args:
         claim: what is claimed.
@@ -875,6 +928,7 @@ def score_picture(
     if prediction.is_out_of_view:
         return _PictureScore(None)
     if other is None:
+        # how wrong the model is; an infinite or undefined score sorts last
         badness = judgement.score if math.isfinite(judgement.score) else -math.inf
         text = f"most wrong where it says {prediction.label}"
         return _PictureScore(float(judgement.right), badness, text)
@@ -921,8 +975,8 @@ def _describe_sample(
     Args:
         claim: what is claimed.
         sample: the pictures.
-        interval: interval of the mean of their scores.
-        example: the worst example against the claim.
+        interval: confidence interval of the mean score.
+        example: text about the worst picture against the claim; empty if there is none.
         task: name of the task.
     """
     n_for = sample.scores.count(1.0)

@@ -147,7 +147,11 @@ class _Block(BaseModel):
 
     @classmethod
     def quantize(cls, values: Floats, signs: bool, square: int) -> _Block:
-        """Quantize and compress offsets (n,).
+        """Quantize and compress offsets (n,) from the clean scene.
+
+        Offsets become integer multiples of a step. Large blocks, such as textures, may
+        store signs only, or one value for each square of texels, so that the file of a
+        counterexample stays small.
 
         Args:
             values: the offsets.
@@ -163,6 +167,7 @@ class _Block(BaseModel):
         elif stores_signs:
             # 1.0 where nothing differs: a step of 0 is none
             step = float(np.abs(values).max()) or 1.0
+        # A texture has side * side texels of 3 values.
         side = isqrt(len(values) // 3)
         is_texture = not is_small and 3 * side * side == len(values)
         if not is_texture or side % square != 0:
@@ -170,6 +175,7 @@ class _Block(BaseModel):
         square_values = values
         if square > 1:
             square_values = _average_squares(values, side, square)
+        # little-endian 16-bit integers, the same on all machines
         steps = np.round(square_values / step).astype("<i2")
         data = _pack_signs(steps) if stores_signs else steps.tobytes()
         compressed = lzma.compress(data, lzma.FORMAT_ALONE)
@@ -198,7 +204,7 @@ class _Block(BaseModel):
         return offsets
 
     def _decompress_steps(self) -> np.ndarray[Any, Any]:
-        """Return the steps of the stored values as integers (n / square^2,).
+        """Return the stored values as integer multiples of the step (n / square^2,).
 
         Raises:
             ValueError, LZMAError: if they are corrupt.
@@ -208,7 +214,8 @@ class _Block(BaseModel):
         if self.signs:
             n_bytes = math.ceil(n_steps / 3)  # three in a byte
         decompressor = lzma.LZMADecompressor(memlimit=MAX_MEMORY)
-        # more than what is expected shows that it is another block
+        # The file is not trusted: memory and size are limited. One byte more than
+        # expected is read, which shows that the data is another block's.
         max_bytes = 2 * n_steps + 1
         data = decompressor.decompress(base64.b85decode(self.offsets), max_bytes)
         if len(data) != n_bytes:
@@ -294,9 +301,10 @@ class Counterexample:
     def make_config(self, suite: Suite, changes: Mapping[str, object]) -> AttackConfig:
         """Return the settings that test it: its own, with the suite's network.
 
-        Settings of the network are replaced all together, if the suite or the changes
-        name a model, else none. Settings of the machine are always the defaults, with
-        the changes.
+        If the suite or the changes name a model, all settings of the network are
+        replaced, otherwise none: settings of one network do not suit another. Settings
+        of the machine, such as the number of threads, are the defaults, updated by the
+        changes.
 
         Args:
             suite: the suite.
@@ -406,9 +414,11 @@ def evaluate_trial(
 def decide_trials(n_right: int, n_wrong: int, *, over: bool) -> str:
     """Return the verdict of the trials that count.
 
-    One scene is held if all are right, and failed if all are wrong. Over conditions a
-    run counts as found at a rate of 90 %, so the scene is held if the model is right in
-    as many, and failed if it is wrong in more than half with 95 % confidence.
+    Without conditions the counterexample is held if the model is right in all trials,
+    failed if it is wrong in all, and otherwise undecided, as the prediction depends on
+    the noise. Over conditions it is held if the model is right in 90 % of the trials,
+    which is the rate at which an attack counts as successful. It is failed if the model
+    is wrong in more than half with 95 % confidence.
 
     Args:
         n_right, n_wrong: trials in which the model is right, and in which it is wrong.
@@ -438,7 +448,7 @@ def _is_wrong_on(
     Args:
         example: the counterexample as it is stored.
         problem: problem of the run.
-        trials: number of trials; of one scene, the first that is right ends them.
+        trials: number of trials. Without `over`, the first right prediction ends them.
         over: whether conditions vary; then the clean scene is rendered too, under the
             same conditions.
     """
@@ -455,6 +465,7 @@ def _is_wrong_on(
             judgements.append(problem.judge(picture, full_configuration))
         is_right = evaluate_trial(*judgements)
         outcomes.append(is_right)
+        # One right trial is enough: the scene cannot be failed any more.
         if is_right and not over:
             return False
     n_right = outcomes.count(True)
@@ -465,7 +476,12 @@ def _is_wrong_on(
 def add_counterexample(suite: str, run: str) -> Counterexample:
     """Store the adversarial scene of a run as a counterexample of a suite.
 
-    It has the smallest form in which the run's own model still fails on it.
+    The offsets are stored in the smallest form in which the run's own model still fails
+    on the scene.
+
+    Args:
+        suite: path of the suite's file.
+        run: name or directory of the run of an attack.
 
     Raises:
         InputError: if the run found nothing, or its scene is no counterexample.
@@ -542,8 +558,9 @@ def _write_smallest(
 ) -> Counterexample:
     """Write the smallest form of a counterexample on which the model fails.
 
-    Forms store the offsets more or less finely. Each is written, read back and tried;
-    the last, finest one is kept whatever the model says.
+    Forms store the offsets more or less finely, the coarsest first. Each is written,
+    read back and tried. The last and finest form is stored whatever the model predicts;
+    the suite's test then decides.
 
     Args:
         base: path of the file without suffix.
@@ -554,6 +571,7 @@ def _write_smallest(
     """
     block_sizes = [block.size for block in problem.domain.blocks]
     blocks = np.split(offsets, np.cumsum(block_sizes)[:-1])
+    # Small blocks are always stored finely, so all forms would be the same.
     has_large_block = max(block_sizes) > MAX_FINE_VALUES
     *coarse_forms, finest_form = FORMS if has_large_block else FORMS[-1:]
     trials = count_trials(over=over)
@@ -579,7 +597,8 @@ def _write_form(
         base: path of the file without suffix.
         values: content of the file except for the blocks.
         blocks: offsets of each block from the clean scene.
-        signs, square: the form; see `FORMS`.
+        signs: whether only signs of large blocks are stored.
+        square: side of the squares of texels that share a value.
     """
     stored = [_Block.quantize(block, signs, square).model_dump() for block in blocks]
     text = json.dumps({**values, "blocks": stored}, indent=1)
@@ -641,7 +660,7 @@ def _read(path: Path) -> Counterexample:
     """Read a counterexample.
 
     Raises:
-        FileFormatError: if the file is none, or corrupt.
+        FileFormatError: if the file is missing or corrupt.
     """
     content, offsets = _read_content(path)
     try:
@@ -664,7 +683,7 @@ def _read_content(path: Path) -> tuple[_File, Floats]:
     """Read the content of a counterexample's file, and its offsets (d,).
 
     Raises:
-        FileFormatError: if the file is none, or corrupt.
+        FileFormatError: if the file is missing or corrupt.
     """
     try:
         text = stored_files.read_text(path, "a counterexample", MAX_SIZE)
@@ -689,7 +708,9 @@ EXPECTED_FILE = "expected.json"
 
 
 def read_expected(suite: str) -> dict[str, str]:
-    """Read the expected verdicts of claims that are not expected to be held.
+    """Read the expected verdicts of the claims that are not expected to be held.
+
+    The file is optional: without it all claims are expected to be held.
 
     Raises:
         FileFormatError: if the file is corrupt.

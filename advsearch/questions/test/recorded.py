@@ -21,8 +21,12 @@ def read_noted_settings(
 ) -> dict[str, dict[str, Mapping[str, Any]]]:
     """Return the settings of each claim and counterexample that was tested.
 
-    They are by the kind, "claim" or "counterexample", and then by name. If the noted
-    suite cannot be read, "claim" is missing.
+    The result is indexed by the kind, "claim" or "counterexample", and then by the
+    name. If the stored suite cannot be read, "claim" is missing.
+
+    Args:
+        run: directory of the run.
+        result: result of the run, which tells what was tested.
     """
     with Store.open_to_read(run) as store:
         suite = store.read_json_note(SUITE_NOTE)
@@ -33,7 +37,7 @@ def read_noted_settings(
         if claim.cause not in (Cause.COUNTEREXAMPLE_FAILED, Cause.NOT_REACHED)
     }
     settings: dict[str, dict[str, Mapping[str, Any]]] = {}
-    # what is raised for a corrupt suite
+    # These are the errors that a corrupt suite raises.
     with suppress(KeyError, AttributeError, TypeError, ValueError):
         settings["claim"] = {
             name: values

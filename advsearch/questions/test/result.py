@@ -165,7 +165,11 @@ NOT_TESTED_YET = "not tried yet"
 
 
 def make_view(result: SuiteResult) -> ShownResult:
-    """Lay out a result: a table of the claims, then each that is not held."""
+    """Lay out a result for the terminal and the page.
+
+    First comes a table of all claims, then a section for each claim that is not held,
+    with its picture and the command that repeats it.
+    """
     sections = [
         ResultPart(
             "The claims",
@@ -176,6 +180,7 @@ def make_view(result: SuiteResult) -> ShownResult:
         )
     ]
     for claim in result.claims:
+        # These were not tested, so there is nothing to tell about them.
         if claim.answer == HELD or claim.cause is Cause.COUNTEREXAMPLE_FAILED:
             continue
         pictures = []
@@ -191,7 +196,12 @@ def make_view(result: SuiteResult) -> ShownResult:
 
 
 def describe_claim(claim: AnyClaim, config: SceneConfig) -> str:
-    """Describe what is claimed in a sentence."""
+    """Describe what is claimed in a sentence.
+
+    Args:
+        claim: the claim.
+        config: settings that it is tested with.
+    """
     model = wording.shorten_name(config.model)
     subject = f"{wording.shorten_name(config.object)}, {', '.join(config.controls)}"
     if isinstance(claim, RightClaim):
@@ -237,12 +247,14 @@ def describe_fraction(
     """Describe why a claim about a fraction is held, failed or undecided.
 
     Args:
-        claimed: what is claimed of a picture.
+        claimed: what is claimed about a picture, "right" or "as claimed".
         verdict: HELD, FAILED or UNDECIDED.
-        n_right: number of pictures of which it holds.
+        n_right: number of pictures for which it is true.
         n_pictures: number of all pictures.
-        interval: interval of the fraction that holds at all times jointly.
-        worst: where it did not hold; empty if it always did.
+        interval: bounds of the fraction, from a confidence sequence: they are valid at
+            all sample sizes together.
+        worst: text about the picture that most contradicts the claim; empty if none
+            does.
         outcomes: the outcomes of a detector in the other pictures, or empty.
     """
     reason = "no picture"
@@ -274,12 +286,14 @@ def describe_difference(
         n_pictures: number of all pictures.
         n_only_this: pictures in which only the model under test is right.
         n_only_other: pictures in which only the other one is.
-        interval: interval of the difference of their fractions.
+        interval: bounds of the difference (fraction right of the model under test minus
+            that of the other), in [-1, 1].
         other_model: the other model.
     """
     if not n_pictures:
         return "no picture"
     pictures = wording.format_count(n_pictures, "picture")
+    # percentage points
     bounds = " to ".join(f"{100.0 * bound:+.1f}" for bound in interval)
     points = 100.0 * (n_only_this - n_only_other) / n_pictures
     reason = (
@@ -309,7 +323,7 @@ class SearchVerdict(NamedTuple):
 def evaluate_search(
     summary: workbench.AttackSummary, config: AttackConfig
 ) -> SearchVerdict:
-    """Return what a search shows about a claim that nothing breaks a model.
+    """Return the verdict of a search about a claim that nothing breaks a model.
 
     The claim fails if the clean scene is wrong already, or a wrong prediction is
     verified. It is undecided if what was found is wrong in some trials only, or the
@@ -317,7 +331,8 @@ def evaluate_search(
 
     Args:
         summary: summary of the search.
-        config: its settings, with the steps that were planned.
+        config: settings of the search; `steps` is the number that was planned, which is
+            more than were done if the time ended the search.
     """
     verified = summary.verified
     if summary.ending == "already wrong":
@@ -391,7 +406,8 @@ def describe_trials(
     Args:
         verdict: HELD, FAILED or UNDECIDED.
         n_right, n_wrong: trials in which the model is right, and in which it is wrong.
-        n_uncounted: trials that do not count.
+        n_uncounted: trials that do not count, as the object is not visible or, over
+            conditions, the clean scene is predicted wrong.
         label: the first wrong prediction.
         interval: interval of the fraction of right trials; None if no trial counts.
         over: whether conditions vary.
@@ -521,8 +537,8 @@ KIND_DESCRIPTIONS = {
 def format_junit(result: SuiteResult) -> str:
     """Return JUnit XML with a test case for each claim.
 
-    Failed claims are failures, undecided ones are errors, and those that are so as
-    expected are skipped.
+    Failed claims are failures, and undecided claims are errors. Claims that are failed
+    or undecided as expected count as skipped, so that they do not break a build.
     """
     answers = [(claim.answer, claim.accepted) for claim in result.claims]
     attributes = {
@@ -553,7 +569,13 @@ def format_junit(result: SuiteResult) -> str:
 def _add_test_case(
     suite: ElementTree.Element, result: SuiteResult, claim: ClaimResult
 ) -> None:
-    """Add the test case of a claim to a test suite of JUnit."""
+    """Add the test case of a claim to a test suite of JUnit.
+
+    Args:
+        suite: element of the test suite, which the test case is added to.
+        result: result of the full suite.
+        claim: result of the claim.
+    """
     case = ElementTree.SubElement(
         suite,
         "testcase",
@@ -582,8 +604,9 @@ def _add_test_case(
 def format_sarif(result: SuiteResult) -> str:
     """Return SARIF 2.1.0 with a result for each claim that is not held.
 
-    A rule is a kind of claims; locations are in the suite's file. What is so as
-    expected is `unchanged`, all else `new`.
+    SARIF (OASIS 2020) is a JSON format for findings of analyses, which code hosts
+    display. Each kind of claims is a rule, and locations are lines of the suite's file.
+    Results that are as expected have the state `unchanged`, all others `new`.
     """
     kinds = list(dict.fromkeys(claim.kind for claim in result.claims))
     rules = [
@@ -619,7 +642,14 @@ def format_sarif(result: SuiteResult) -> str:
 def _sarif_result(
     result: SuiteResult, claim: ClaimResult, rule_index: int, suite_lines: Sequence[str]
 ) -> dict[str, object]:
-    """Return the SARIF result of a claim."""
+    """Return the SARIF result of a claim.
+
+    Args:
+        result: result of the full suite.
+        claim: result of the claim, which is not held.
+        rule_index: index of the claim's kind in the list of rules.
+        suite_lines: lines of the suite's file, for the location.
+    """
     message = (
         f"{claim.name}: {claim.answer}: {claim.reason}. Claimed: {claim.statement}."
     )
@@ -638,6 +668,7 @@ def _sarif_result(
         "level": "error" if claim.answer == FAILED else "warning",
         "message": {"text": message},
         "locations": [{"physicalLocation": location}],
+        # A fingerprint identifies the same finding in the next run.
         "partialFingerprints": {"claim/v1": claim.name},
         "baselineState": "unchanged" if claim.accepted else "new",
         "properties": {name: value for name, value in properties.items() if value},

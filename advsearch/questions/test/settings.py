@@ -312,6 +312,8 @@ class Suite(_YamlModel):
     def make_config(self, name: str, **changes: object) -> SceneConfig:
         """Return the settings that a claim is tested with.
 
+        Settings of the claim override those of the suite, and `changes` override both.
+
         Args:
             name: name of the claim.
             **changes: settings of the command, which override those of the claim; None
@@ -325,6 +327,7 @@ class Suite(_YamlModel):
             ("settings", self.settings),
             (f"claims.{name}.settings", claim.settings),
         ):
+            # For example the seed: all claims of a suite have the same.
             for known in claim_settings:
                 if known in SUITE_ONLY_SETTINGS:
                     raise InputError(
@@ -370,7 +373,12 @@ def parse_suite(data: Mapping[str, object], where: str) -> Suite:
 
 
 def _describe_error(error: Any) -> str:
-    """Describe a problem that pydantic found, with what was expected."""
+    """Describe an error of pydantic as "where: expected ..., got ...".
+
+    Args:
+        error: an entry of `ValidationError.errors()`, with "type", "loc", "input" and
+            "ctx".
+    """
     kind = error["type"]
     # pydantic puts the kind of a claim into its path
     location = [str(part) for part in error["loc"] if part not in CLAIM_KINDS]
@@ -388,6 +396,7 @@ def _describe_error(error: Any) -> str:
     where = ".".join(location)
     name = location[-1]
     if kind == "extra_forbidden":
+        # A path of more than two names leads into a claim, such as claims.NAME.SETTING.
         return f"{where}: {_describe_unknown_name(name, in_claim=len(location) > 2)}"
     if kind == "value_error":
         return f"{where}: {str(error['msg']).removeprefix('Value error, ')}"

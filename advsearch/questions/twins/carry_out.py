@@ -67,10 +67,14 @@ class Selection:
 def run_twins(context: RunContext[TwinsConfig], *, network: Any = None) -> TwinsResult:
     """Compare photographs with their twins.
 
+    A twin is a render of the same object, in the same pose and seen by the same camera
+    as in the photograph.
+
     Args:
         context: context of the run.
-        network: the model, where a Python caller passes one; or a mapping from the
-            names of frames to models, each of which has not seen its frames.
+        network: the model, if a Python caller passes one, or a mapping from names of
+            frames to models. The mapping is for cross-validation: each frame is
+            predicted by a model that was not trained on it.
     """
     config = context.config
     context.progress.stage("loading")
@@ -119,7 +123,13 @@ class ModelJudge:
     def predict(
         self, frame: str, twin: rendering.Twin, facts: tasks.Facts
     ) -> Iterator[TwinPrediction]:
-        """Yield the predictions about the photograph and its twins."""
+        """Yield the predictions about the photograph and its twins.
+
+        Args:
+            frame: name of the frame, which may have its own model.
+            twin: the images of the object.
+            facts: facts of the scene, from which the task finds the ground truth.
+        """
         truth = self.task.truth(facts)
         self._calibrate_once(twin, truth)
         model = self._model_of_frame.get(frame, self.model)
@@ -158,13 +168,15 @@ class ModelJudge:
 def load_judges(
     config: TwinsConfig, network: Any
 ) -> tuple[list[ModelJudge], list[str]]:
-    """Load the models, and return a judge for each, and warnings.
+    """Load the models, and return a judge for each model, and warnings.
 
-    Models of single frames have one judge together.
+    A judge predicts and evaluates images. If each frame has its own model, all these
+    models have one judge together.
 
     Args:
-        config: config of the run.
-        network: as for `run_twins`.
+        config: settings of the run.
+        network: the model, or a mapping from names of frames to models; None loads the
+            models that the settings name.
 
     Raises:
         InputError: the models take images of different sizes.
@@ -175,6 +187,7 @@ def load_judges(
     if network is None:
         networks = list(settings.split_names(config.model))
     elif network_of_frame:
+        # Each model once, though it is used for many frames.
         networks = list(dict.fromkeys(network_of_frame.values()))
     scene_config: Any = config
     models, warnings = workbench.load_models(networks, task, scene_config)
@@ -207,6 +220,13 @@ class Comparison:
     def __init__(
         self, context: RunContext[TwinsConfig], judges: Sequence[ModelJudge]
     ) -> None:
+        """Prepare the comparison.
+
+        Args:
+            context: context of the run.
+            judges: judges of the models, at least one; all take images of the same
+                size.
+        """
         self._context = context
         self._config = context.config
         self._judges = judges
@@ -228,10 +248,13 @@ class Comparison:
         return DETECTOR_MARGIN if is_detector else CLASSIFIER_MARGIN
 
     def select(self, objects: Sequence[PhotographedObject]) -> Selection:
-        """Choose the rows that are used, and their windows.
+        """Select the objects that are compared, and their windows of the photographs.
 
-        Left out are other frames, objects that are mostly hidden, and objects that are
-        out of view or tiny.
+        Objects are left out if their frame is not selected, or if they are mostly
+        hidden, out of view, or tiny.
+
+        Args:
+            objects: all objects of the list of photographs.
 
         Raises:
             InputError: none is left, or a model does not know a label.
@@ -249,6 +272,7 @@ class Comparison:
         checked_labels: set[tuple[str, str]] = set()
         windows: dict[int, rendering.PhotoWindow] = {}
         for number, item in visible.items():
+            # Each label is checked once, and each mesh is loaded once.
             label = (item.object, item.label)
             if label not in checked_labels:
                 self._check_label(item)
@@ -324,8 +348,8 @@ class Comparison:
         """Yield the rows, object by object, so that each mesh is loaded once.
 
         Args:
-            selection: rows that are compared.
-            measurements: `Measurements` of the run, where finished rows are stored.
+            selection: objects that are compared, and their windows.
+            measurements: stored rows of the run, by name; finished rows are added.
         """
         self._context.progress.stage("twins", len(selection.windows))
         # Objects of one mesh and one camera's pixels share a renderer.
@@ -341,7 +365,15 @@ class Comparison:
     def _compare_group(
         self, numbers: Sequence[int], selection: Selection, measurements: Any
     ) -> Iterator[TwinRow]:
-        """Yield the rows of objects with one mesh, each for all models."""
+        """Yield the rows of objects that have the same mesh, for each object and model.
+
+        Objects of one mesh are rendered together, so that the scene is loaded once.
+
+        Args:
+            numbers: numbers of the objects.
+            selection: all selected objects.
+            measurements: stored rows of the run; a resumed run continues with the rest.
+        """
         missing = [
             number for number in numbers if not self._is_stored(number, measurements)
         ]
@@ -380,7 +412,12 @@ class Comparison:
     def _render_layers(
         self, selection: Selection, numbers: Sequence[int]
     ) -> dict[int, rendering.Layer]:
-        """Render the objects of some rows, which have one mesh, alone."""
+        """Render objects that have the same mesh, to be put into their photographs.
+
+        Args:
+            selection: all selected objects and their windows.
+            numbers: numbers of the objects that are rendered.
+        """
         if not numbers:
             return {}
         renderer = self._make_renderer(
@@ -410,9 +447,10 @@ class Comparison:
         """Make a renderer for objects that have one mesh.
 
         Args:
-            renderer_type: `SurroundedRenderer`, or `LayerRenderer`, or what makes one.
+            renderer_type: class `SurroundedRenderer` or `LayerRenderer`, or a function
+                that makes one.
             environment: environment that lights them.
-            selection: all rows.
+            selection: all selected objects.
             numbers: numbers of the rows that it renders.
         """
         item = selection.objects[numbers[0]]
@@ -435,7 +473,14 @@ class Comparison:
         layer: Any,
         renderer: Any,
     ) -> rendering.Twin:
-        """Render an object in the environment, and return all images of it."""
+        """Render an object in the environment, and return all images of it.
+
+        Args:
+            number: number of the object.
+            selection: all selected objects and their windows.
+            layer: the object rendered into the photograph.
+            renderer: renders it in the environment.
+        """
         item = selection.objects[number]
         window = selection.windows[number]
         environment = self._config.environment_name
@@ -459,12 +504,13 @@ class Comparison:
         make_twin: Callable[[], rendering.Twin],
         judge: ModelJudge,
     ) -> TwinRow:
-        """Return what a model says of an object's photograph and of its twins.
+        """Return a model's predictions on an object's photograph and on its twins.
 
         Args:
             number: number of the row, which is that of the object.
-            selection: all rows.
-            make_twin: renders the twins; called once, and only here.
+            selection: all selected objects.
+            make_twin: function that renders the twins; it is cached, as all models
+                share them.
             judge: the model's judge.
         """
         item = selection.objects[number]
@@ -515,7 +561,12 @@ class Comparison:
     def make_result(
         self, rows: Sequence[TwinRow], warnings: Sequence[str]
     ) -> TwinsResult:
-        """Count rows; the worst disagreements come first."""
+        """Return the result: counts over all rows, and the pairs that disagree most.
+
+        Args:
+            rows: rows of all objects and models.
+            warnings: warnings of the run.
+        """
         task_title = self._judges[0].task.title
         table = []
         factors = []
@@ -555,14 +606,14 @@ def rank_disagreement(row: TwinRow) -> tuple[bool, float]:
 
 
 def parse_frames(text: str | None) -> Callable[[str], bool]:
-    """Return a function that states whether a frame is used, by its name.
+    """Return a function that tells, by its name, whether a frame is used.
 
     Args:
         text: names and ranges FIRST:LAST of the numbers that names end in, both
             included, separated by commas; None for all frames.
 
     Raises:
-        InputError: a range is none.
+        InputError: an entry has a colon but is not a range.
     """
     if text is None:
         return lambda frame: True
@@ -580,7 +631,8 @@ def parse_frames(text: str | None) -> Callable[[str], bool]:
             )
 
     def is_used(frame: str) -> bool:
-        # of "scene/000012" or "000012.png"
+        # "scene/000012" and "000012.png" both have the number "000012".
+        """Return whether the frame is selected by its name or its number."""
         number = frame.rpartition("/")[2].partition(".")[0]
         if frame in names or number in names:
             return True

@@ -34,7 +34,17 @@ def make_table(
 def _make_model_table(
     rows: Sequence[TwinRow], surroundings: Sequence[str], model: str, task: str
 ) -> list[results.TwinAgreement]:
-    """Return the part of a table that is about one model."""
+    """Return the rows of a table that are about one model.
+
+    There is a row over all objects, one for each object if there are several, and one
+    for each condition, such as "night".
+
+    Args:
+        rows: rows of the model.
+        surroundings: names of the surroundings of twins, such as environments.
+        model: name of the model.
+        task: title of the task.
+    """
     objects = sorted({row.object for row in rows})
     conditions = sorted({row.condition for row in rows if row.condition})
     groups: list[tuple[str, str, Sequence[TwinRow]]] = [("", "", rows)]
@@ -67,11 +77,14 @@ def count_agreement(
     object_name: str = "",
     condition: str = "",
 ) -> results.TwinAgreement:
-    """Return how far photographs and twins agree, with intervals over frames.
+    """Count how often a model is right in both photograph and twin, or in neither.
+
+    Intervals are over frames, as objects in one frame are not independent. `kappa` of
+    the result is Cohen's kappa: agreement beyond chance.
 
     Args:
         rows: at least one, of one model.
-        surroundings: surroundings of the twins.
+        surroundings: name of the twins' surroundings, such as an environment.
         model: name of the model, for the result.
         task: title of the task, for the result.
         object_name: name that all rows share; empty where they have several.
@@ -146,7 +159,14 @@ def estimate_kappa(
 def estimate_margin_correlation(
     photos: Sequence[TwinPrediction], twins: Sequence[TwinPrediction], units: IntArray
 ) -> results.Estimate | None:
-    """Return the rank correlation of margins; None where it has no interval."""
+    """Return the rank correlation of margins in photographs and twins.
+
+    It is None if it has no interval, for example if there are too few frames.
+
+    Args:
+        photos, twins: predictions on both, in the same order.
+        units: number of the frame of each row (n,).
+    """
     first = np.array([photo.margin for photo in photos])
     second = np.array([twin.margin for twin in twins])
     is_known = np.isfinite(first) & np.isfinite(second)
@@ -161,10 +181,15 @@ def estimate_margin_correlation(
 def estimate_box_agreement(
     rows: Sequence[TwinRow], surroundings: str
 ) -> results.Estimate | None:
-    """Return how often boxes of a detector agree; None where there are no pairs.
+    """Return how often a detector's boxes agree in photograph and twin.
 
-    Of photograph and twin the best box of the right class counts, where both have one;
-    they agree if their overlap over their union reaches `MIN_BOX_OVERLAP`.
+    The best box of the right class is used in each. Rows in which one of both has no
+    such box are left out. Boxes agree if their intersection over union is at least
+    `MIN_BOX_OVERLAP`. The result is None without rows.
+
+    Args:
+        rows: rows of one model.
+        surroundings: name of the twins' surroundings.
     """
     agrees = []
     used_rows = []
@@ -240,10 +265,15 @@ FACTORS: dict[str, tuple[str, Callable[[TwinRow], float | None]]] = {
 def explain_disagreement(
     rows: Sequence[TwinRow], surroundings: str
 ) -> list[FactorPart]:
-    """Return how often photograph and twin disagree by parts of each factor.
+    """Return how often photograph and twin disagree, by parts of each factor.
 
-    Each has `N_PARTS` parts with about as many rows; a factor that is constant, or of
-    which too few rows are known, is left out.
+    A factor is a property such as the object's size. It is divided into `N_PARTS` parts
+    with equally many rows. A factor is left out if it is constant, or known for too few
+    rows.
+
+    Args:
+        rows: rows of all models.
+        surroundings: name of the twins' surroundings.
     """
     parts: list[FactorPart] = []
     for name, (unit, get_value) in FACTORS.items():
@@ -268,8 +298,15 @@ def _cut_factor(
 ) -> Iterator[FactorPart]:
     """Yield the parts of a factor with values (n,) of its rows.
 
-    A part is the rows between two quantiles of the values. There is none if quantiles
-    coincide, as those of a constant do.
+    A factor is a property of the photographs, such as the object's size. A part has the
+    rows between two quantiles of its values. There are no parts if quantiles coincide,
+    as those of a constant do.
+
+    Args:
+        name, unit: name and unit of the factor.
+        values: value of the factor in each row (n,).
+        rows: the rows.
+        surroundings: name of the twins that are compared with the photographs.
     """
     edges = np.quantile(values, np.linspace(0.0, 1.0, N_PARTS + 1))
     if len(np.unique(edges)) <= N_PARTS:

@@ -176,6 +176,7 @@ def _find_models(folder: Path) -> Path:
     resolved = folder.resolve()
     for parent in (resolved, *resolved.parents[:2]):
         if (parent / "models").is_dir():
+            # Data sets are often downloaded without all photographs.
             return parent / "models"
     raise InputError(
         f"photographs: expected the meshes of {folder} in a folder models in it or "
@@ -184,7 +185,16 @@ def _find_models(folder: Path) -> Path:
 
 
 def _read_scene(scene: Path, models: Path, condition: str) -> Listing:
-    """Read one scene of a BOP data set, whose photographs are of one condition."""
+    """Read one scene of a data set in the format of BOP (bop.felk.cvut.cz).
+
+    `scene_gt.json` has poses of objects by image number, and `scene_camera.json` has
+    the cameras. Lengths are in millimeters.
+
+    Args:
+        scene: directory of the scene.
+        models: directory of the meshes.
+        condition: condition of all its photographs, such as "night"; or empty.
+    """
     truths = _read_json(scene / GROUND_TRUTH)
     cameras = _read_json(scene / "scene_camera.json")
     infos: Mapping[str, Any] = {}
@@ -246,7 +256,13 @@ def _read_bop_silhouette(
 def _read_bop_object(
     where: str, entry: Mapping[str, Any], models: Path
 ) -> dict[str, Any]:
-    """Return object, mesh and pose of an entry of the ground truth."""
+    """Return object, mesh and pose of an entry of the ground truth.
+
+    Args:
+        where: place in the file, for messages.
+        entry: entry of the object.
+        models: directory of the meshes.
+    """
     number = entry.get("obj_id")
     if not isinstance(number, int) or not 0 <= number <= MAX_OBJECT_NUMBER:
         raise errors.FileFormatError(f"{where}: expected obj_id, a whole number")
@@ -332,7 +348,10 @@ def _read_list(path: Path) -> Iterator[PhotographedObject]:
 
 
 def _read_rows(path: Path) -> list[dict[str, Any]]:
-    """Read a list as mappings; those of CSV have texts, and leave empty cells out."""
+    """Read the rows of a list of photographs, in CSV, JSON or YAML.
+
+    A row is a mapping. Rows of CSV have texts as values, and no keys for empty cells.
+    """
     suffix = path.suffix.lower()
     is_yaml = suffix not in (".csv", ".json")  # YAML has two suffixes
     text = stored_files.read_existing_text(
@@ -361,20 +380,20 @@ def _read_rows(path: Path) -> list[dict[str, Any]]:
 
 
 def _read_row(row: Mapping[str, Any], path: Path, where: str) -> PhotographedObject:
-    """Read a row of a list.
+    """Read a row of a list: one object in one photograph.
 
     Args:
         row: values by the names in `LIST_KEYS`.
-        path: path of the list, whose folder has the files.
+        path: path of the list; names of files are relative to its directory.
         where: the list and the row, for messages.
 
     Raises:
-        FileFormatError: something in it cannot be used.
+        FileFormatError: a value is missing or not valid.
     """
     _check_keys(row, where)
     photograph = _get_file(row, "photograph", path, where)
     mesh = _get_file(row, "object", path, where)
-    # Of a (4, 4) matrix, the last row says nothing.
+    # A pose is a matrix (3, 4) or (4, 4). The last row of the latter is 0, 0, 0, 1.
     numbers = _to_numbers(row["pose"], f"{where}: pose", 12, 16)
     matrix = np.eye(4)
     matrix[:3] = numbers[:12].reshape(3, 4)
@@ -409,7 +428,16 @@ def _check_keys(row: Mapping[str, Any], where: str) -> None:
 
 
 def _get_file(row: Mapping[str, Any], key: str, path: Path, where: str) -> Path:
-    """Return a file that a row names, which lies in the list's folder or below."""
+    """Return the path of a file that a row names.
+
+    It has to be in the directory of the list or below: a list may come from others.
+
+    Args:
+        row: values of the row by name.
+        key: name of the value, such as "mask".
+        path: path of the list.
+        where: the list and the row, for messages.
+    """
     name = str(row[key])
     file = path.parent / name
     if "\0" in name or not reading.is_inside(file, path.parent):
@@ -425,7 +453,17 @@ def _get_file(row: Mapping[str, Any], key: str, path: Path, where: str) -> Path:
 def _read_row_camera(
     row: Mapping[str, Any], path: Path, photograph: Path, where: str
 ) -> Pinhole:
-    """Return the camera of a row: its `K`, or that of a camera file."""
+    """Return the camera of a row: its `K`, or that of a camera file.
+
+    `K` is the matrix (3, 3) of a pinhole camera, with focal lengths and principal point
+    in pixels.
+
+    Args:
+        row: values of the row by name.
+        path: path of the list; names of files are relative to its directory.
+        photograph: path of the photograph, whose size turns fractions into pixels.
+        where: the list and the row, for messages.
+    """
     has_matrix = "K" in row
     has_file = "camera" in row
     if has_matrix == has_file:  # both or neither
@@ -439,7 +477,7 @@ def _read_row_camera(
 
     file = _get_file(row, "camera", path, where)
     model = workbench.read_camera(str(file))
-    # fractions of the width and the height
+    # These are fractions of the width and the height.
     lens = {key: model.values[key] for key in ("fx", "fy", "cx", "cy")}
     distortion = [value for key, value in model.values.items() if key not in lens]
     if any(distortion) or model.kind != PINHOLE_KIND:
@@ -457,20 +495,20 @@ def _read_row_camera(
 
 
 def _to_numbers(value: Any, where: str, *counts: int) -> Float64Array:
-    """Return finite numbers of a list, or of a text with blanks between them.
+    """Return finite numbers from a list, or from a text with blanks between them.
 
     Args:
-        value: what a file has, of any type.
+        value: value from a file, which may have any type.
         where: place in the file, for messages.
         *counts: how many numbers there may be.
 
     Raises:
-        FileFormatError: it is something else.
+        FileFormatError: the value is not such a list or text.
     """
     words: Sequence[Any] = value.split() if isinstance(value, str) else value
     expected = " or ".join(map(str, counts))
     try:
-        # `float` takes true for 1.
+        # `float(True)` is 1.0, so booleans have to be rejected here.
         has_booleans = any(isinstance(word, bool) for word in words)
         if len(words) not in counts or has_booleans:
             raise ValueError

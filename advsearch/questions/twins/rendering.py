@@ -74,7 +74,13 @@ class Twin:
 
 
 def project_object(item: PhotographedObject, asset: assets.ObjectAsset) -> Float64Array:
-    """Return the positions (V, 2) of an object's vertices in its photograph, pixels.
+    """Return the pixel coordinates (x, y) of an object's vertices (V, 2).
+
+    They are projected into the photograph by its pinhole camera.
+
+    Args:
+        item: the object, with its pose and the camera of the photograph.
+        asset: the object's mesh.
 
     Raises:
         InputError: a part of the object is behind the camera.
@@ -99,20 +105,24 @@ def choose_window(
     model_size: tuple[int, int],
     margin: float,
 ) -> PhotoWindow | None:
-    """Return the window around an object, which has the shape that the model takes.
+    """Return the window around an object, with the aspect ratio that the model takes.
 
-    The box of the full silhouette, whether it is hidden or not, is widened by `margin`
-    times its longer side on each side and to the model's shape, and moved into the
-    photograph; where it is larger than the photograph, it is shrunk.
+    The window begins as the bounding box of the object's silhouette, including parts
+    that other objects hide. It is widened on each side by `margin` times its longer
+    side, and then to the model's aspect ratio. If it is larger than the photograph, it
+    is shrunk. Finally it is moved into the photograph.
 
     Args:
-        positions: (V, 2) of the vertices, pixels.
+        positions: pixel coordinates (x, y) of the mesh's vertices in the photograph (V,
+            2).
         photo_size: (height, width) of the photograph in pixels.
-        model_size: (height, width) that the model takes.
-        margin: 0 or more.
+        model_size: (height, width) of the images that the model takes.
+        margin: width that is added on each side, as a fraction of the box's longer
+            side.
 
     Returns:
-        None where the object is out of view, or smaller than `MIN_SILHOUETTE`.
+        The window; None if the object is out of view, or smaller than `MIN_SILHOUETTE`
+        pixels.
     """
     low = positions.min(axis=0)
     high = positions.max(axis=0)
@@ -182,6 +192,18 @@ class LayerRenderer:
         seed: int,
         is_matched: bool = True,
     ) -> None:
+        """Load the object and its environment, and make the renderer.
+
+        Args:
+            asset: the object, with z up and its front at +x.
+            unit: unit of its file, such as "mm".
+            light: name of the environment that lights it.
+            film: (height, width) of the renders in pixels.
+            spp: samples per pixel.
+            seed: seed of the noise.
+            is_matched: whether the object gets the noise and the blur of the
+                photograph.
+        """
         self._asset = asset
         self._spp = spp
         self._seed = seed
@@ -208,9 +230,10 @@ class LayerRenderer:
         Args:
             item: the object; its mesh is that of this renderer.
             photograph: photograph that shows it.
-            window: window of the photograph.
-            model_size: (height, width) of what is visible.
-            number: number of the row, which has noise of its own.
+            window: window of the photograph around the object.
+            model_size: (height, width) of the mask and depths that are returned for
+                tasks.
+            number: number of the row, from which the seed of the noise is derived.
         """
         renderer = self._renderer
         inputs = renderer.scene.assembly(make_camera_inputs(item, self._asset, window))
@@ -236,8 +259,8 @@ class LayerRenderer:
     ) -> dict[str, Tensor]:
         """Return the inputs by which a render becomes a window of a photograph.
 
-        They are its pixels, noise and blur, what hides the object, and the exposure in
-        stops over that of the renderer.
+        They are the photograph's pixels, noise and blur, a mask of what hides the
+        object, and the exposure in stops relative to that of the renderer.
         """
         front = read_front(item, photograph)
         in_window = replace(photograph, crop=window, front=front)
@@ -263,6 +286,16 @@ class SurroundedRenderer:
         spp: int,
         seed: int,
     ) -> None:
+        """Load the object in its environment, and make the renderer.
+
+        Args:
+            asset: the object, with z up and its front at +x.
+            unit: unit of its file, such as "mm".
+            environment: name of the environment that surrounds it.
+            film: (height, width) of the renders in pixels.
+            spp: samples per pixel.
+            seed: seed of the noise.
+        """
         self._asset = asset
         self._spp = spp
         self._seed = seed
@@ -273,8 +306,12 @@ class SurroundedRenderer:
     def render(
         self, item: PhotographedObject, window: PhotoWindow, number: int = 0
     ) -> Tensor:
-        """Render the object as a photograph shows it, sRGB (h, w, 3) of the film's
-        size; arguments as for `LayerRenderer.render`.
+        """Render the object in the environment, sRGB (h, w, 3) of the film's size.
+
+        Args:
+            item: the object, with its pose and the camera of the photograph.
+            window: window of the photograph around the object.
+            number: number of the row, from which the seed of the noise is derived.
         """
         renderer = self._renderer
         inputs = renderer.scene.assembly(make_camera_inputs(item, self._asset, window))
@@ -295,14 +332,18 @@ def make_twin(
     surrounded: Mapping[str, Tensor],
     model_size: tuple[int, int],
 ) -> Twin:
-    """Bring a photograph and its twins to the model's size.
+    """Resize a photograph and its twins to the model's size.
+
+    The images are the photograph, the object rendered into the photograph, the object
+    in each environment, and the photograph with the object replaced by a mean color.
+    The last one shows whether the model uses the surroundings.
 
     Args:
         item: the object.
         photograph: photograph that shows it.
-        window: window of the photograph.
-        layer: the object in the photograph.
-        surrounded: sRGB renders by environment.
+        window: window of the photograph around the object.
+        layer: the object rendered into the photograph, and its coverage of each pixel.
+        surrounded: sRGB renders (H, W, 3) of the object, by environment.
         model_size: (height, width) in pixels.
     """
     window_size = (window.height, window.width)
@@ -323,6 +364,7 @@ def make_twin(
         {name: resize(image, model_size) for name, image in images.items()},
         layer.sight,
         layer.alpha,
+        # the side in pixels of a square with the object's area
         size=math.sqrt(float(layer.alpha.sum())),
         brightness=float(difference.mean()) if len(difference) else 0.0,
         contrast=float(around.std()) if len(around) > 1 else 0.0,
@@ -336,7 +378,10 @@ def _compute_visible_coverage(
     window: PhotoWindow,
     layer: Layer,
 ) -> Tensor:
-    """Return what an object covers of a window (h, w), less what hides it, in [0, 1]."""
+    """Return how much of each pixel a visible object covers (h, w), in [0, 1].
+
+    Parts that other things hide in the photograph do not count.
+    """
     front = read_front(item, photograph)
     if front is None:
         return layer.alpha
@@ -356,11 +401,12 @@ def correlate_luminance(first: Tensor, second: Tensor) -> float | None:
 def _make_sight(
     surfaces: Any, metres: float | None, model_size: tuple[int, int]
 ) -> Any:
-    """Return what is visible of the object, as tasks take it.
+    """Return the visible mask and the depths of the object, as tasks take them.
 
     Args:
-        surfaces: what the renderer sees in each pixel of the film.
-        metres: metres of one object size, in which depths are; None if not known.
+        surfaces: first surface and depth in each pixel of the film.
+        metres: size of the object in metres. Depths are in units of the object's size.
+            None if it is not known.
         model_size: (height, width) of the result.
     """
     # imports the tasks
@@ -370,7 +416,7 @@ def _make_sight(
         """Scale values of pixels (h, w) to the model's size, by the nearest pixel."""
         return F.interpolate(values[None, None].float(), size=model_size)[0, 0]
 
-    # Depths stay in object sizes where nothing is known of the size.
+    # If the size is not known, depths stay in units of the object's size.
     metres_per_unit = metres or 1.0
     return tasks.Sight(
         scale(surfaces.visible_mask(OBJECT)) > 0.5,
@@ -415,9 +461,15 @@ def make_camera_inputs(
 ) -> dict[str, Tensor]:
     """Return the scene inputs of the camera that sees a window of a photograph.
 
-    The world has the coordinates of the mesh. The angle of view is that of the window's
-    longer side; shifts are from the principal point to the window's center, in widths
-    and heights of the window.
+    World coordinates are those of the mesh. The angle of view is that of the window's
+    longer side: 2 * atan(side / (2 * focal length)). The shifts lead from the camera's
+    principal point to the window's center, as fractions of the window's width and
+    height.
+
+    Args:
+        item: the object, with its pose and the camera of the photograph.
+        asset: the object's mesh.
+        window: window of the photograph around the object.
     """
     mesh_to_camera = FLIP @ compute_mesh_to_camera(item, asset)
     camera_to_world = np.linalg.inv(mesh_to_camera)
@@ -477,8 +529,8 @@ def read_front(
 ) -> npt.NDArray[np.uint8] | None:
     """Return levels (H, W), 255 where another thing hides the object; None if unknown.
 
-    The mask of what is visible is widened by a pixel, since the edges of masks are not
-    smooth.
+    The mask of the object's visible part is widened by a pixel: its edge is jagged, and
+    would otherwise cut into the object.
     """
     if item.visible_mask is None:
         return None
@@ -503,9 +555,10 @@ def load_mask(path: Path, window: PhotoWindow) -> Tensor:
 def measure_pose(
     item: PhotographedObject, twin: Twin, window: PhotoWindow
 ) -> float | None:
-    """Return how far a twin's silhouette agrees with the data set's, as IoU.
+    """Return how well a twin's silhouette agrees with that of the data set.
 
-    It is that of masks, or else of their boxes; None where there is neither.
+    It is the intersection over union (IoU) of the masks, or else of the boxes. It is
+    None if the data set has neither. A low value means that the pose is wrong.
     """
     covered = twin.coverage > 0.5
     if item.mask is not None:

@@ -59,13 +59,14 @@ def _outline(
 
     Args:
         angle: parameters of the points (N,), from -pi to pi; 0 is the front end.
-        front, rear: x of its ends.
+        front, rear: x of its front and its rear end.
         half_width: its extent along y and -y.
         power: power of the superellipse.
         center_x: x of its center.
     """
     cosine = np.cos(angle)
     sine = np.sin(angle)
+    # Points with a positive cosine are on the front half.
     half_length = np.where(cosine >= 0.0, front - center_x, center_x - rear)
     # x = a |cos|^(2/power) fulfils |x/a|^power + |y/b|^power = 1 with y likewise
     exponent = 2 / power
@@ -77,7 +78,10 @@ def _outline(
 def _shell(
     levels: Array, power: float, center_x: float, height: Height, corner: float
 ) -> list[Patch]:
-    """Create the painted patches of a stack of superellipses.
+    """Create the painted patches of a shell that follows a stack of superellipses.
+
+    The shell is cut into five charts, so that each is nearly flat and its texture is
+    hardly distorted.
 
     Args:
         levels: (R, 4), a row for each superellipse: its fraction of the height, half
@@ -116,8 +120,13 @@ def _shell(
 def _outline_angles(levels: Array, power: float, center_x: float) -> Array:
     """Return angles (C,) of columns that are evenly spaced along the widest outline.
 
-    C is `COLUMNS` + 1: the first and the last are the middle of the rear. The arguments
-    are those of `_shell`.
+    C is `COLUMNS` + 1: the first and the last column are the middle of the rear.
+
+    Args:
+        levels: (R, 4), a row for each outline: fraction of the height, half the width,
+            x of the front and of the rear end.
+        power: power of the superellipses.
+        center_x: x of their center.
     """
     widest = levels[np.argmax(levels[:, 1])]
     _, half_width, front, rear = widest
@@ -136,8 +145,15 @@ def _shell_points(
 ) -> Array:
     """Return the points (R, C, 3) of a stack of R superellipses.
 
-    `angle` (C,) has the angles of the columns; the other arguments are those of
-    `_shell`.
+    Each outline has the same angles, so that columns run from bottom to top.
+
+    Args:
+        levels: (R, 4), a row for each outline: fraction of the height, half the width,
+            x of the front and of the rear end.
+        power: power of the superellipses.
+        center_x: x of their center.
+        height: function that returns z from the fraction of the height, x and y.
+        angle: angles of the columns (C,).
     """
     points = np.empty((len(levels), COLUMNS + 1, 3))
     for index, (height_fraction, half_width, front, rear) in enumerate(levels):
@@ -274,7 +290,12 @@ def _inside(points: Array) -> dict[str, Array]:
 
 
 def _inside_grilles(abs_y: Array, x: Array, z: Array) -> dict[str, Array]:
-    """Return how far points lie inside the two grilles, whose edges are slanted."""
+    """Return how far points lie inside the two grilles, whose edges are slanted.
+
+    Args:
+        abs_y, x, z: coordinates of the points (N,); y without its sign, as a car is
+            symmetric.
+    """
     low_grille = _softest(
         0.62 - abs_y, z - 0.24 + 0.02 * abs_y, 0.37 - 0.02 * abs_y - z
     )
@@ -288,7 +309,12 @@ def _inside_grilles(abs_y: Array, x: Array, z: Array) -> dict[str, Array]:
 
 
 def _inside_windows(abs_y: Array, x: Array, z: Array) -> dict[str, Array]:
-    """Return how far points lie inside the windows of the cabin."""
+    """Return how far points lie inside the windows of the cabin.
+
+    Args:
+        abs_y, x, z: coordinates of the points (N,); y without its sign, as a car is
+            symmetric.
+    """
     # about half the cabin's width at each height
     half_width = np.interp(z, [0.93, 1.15, 1.36], [0.795, 0.735, 0.668])
     windscreen = _softest(0.85 * half_width - abs_y, 1.36 - z)
@@ -360,7 +386,11 @@ def _opening(name: str) -> shapes.Field:
 
 
 def _body_and_cabin() -> list[Patch]:
-    """Create the body and the cabin with their openings."""
+    """Create the body and the cabin with their openings.
+
+    A row of levels is (fraction of the height, half the width, x of the front end, x of
+    the rear end), in metres.
+    """
     # levels of smaller and smaller outlines at the full height: they close body and
     # cabin at the top, but for a hole in the body under the cabin
     deck = [
@@ -719,7 +749,11 @@ FINISHES = {
 
 @family(metres=1.0, texels=384)
 def car(sampler: ParameterSampler) -> Instance:
-    """Make a car of random proportions and paint."""
+    """Make a car of random proportions and paint.
+
+    Lengths are in metres. `sampler(x, low=..., high=...)` returns x for the canonical
+    car and a uniform sample for a random one.
+    """
     color = sampler.sample_color(
         "2a5fa8", "b3202a", "d9dadb", "2f6f4f", "e0a02c", "3a3f45", p_random=0.2
     )
@@ -747,6 +781,8 @@ def car(sampler: ParameterSampler) -> Instance:
         shapes.stretch_patches(patches, stretch),
         paints,
         material=FINISHES["paint"],
+        # Fewer texels per length than for the paint where little is seen; more for the
+        # words on the plate.
         texel_density={
             "rubber": 0.3,
             "well": 0.15,

@@ -62,6 +62,9 @@ def _shelves(
     The highest comes first. A rectangle goes on the lowest shelf that has room for it,
     or opens a new shelf on top of the others.
 
+    The first shelf that has room is taken, which is not always the best packing, but
+    gives the same result on every machine.
+
     Args:
         sizes: (width, height) of each, width >= height, in object units.
         scale: texels per unit.
@@ -113,16 +116,23 @@ def pack_charts(
     """Pack charts of size (width, height) into a square at the largest scale that fits.
 
     They have a common scale, which is found by bisection. A chart that is higher than
-    wide is packed lying on its side (`is_rotated`).
+    wide is rotated by 90 degrees (`is_rotated`), as shelves waste less room on wide
+    charts.
+
+    Args:
+        sizes: (width, height) of each chart, in object units.
+        side: side of the atlas in texels.
 
     Raises:
         ValueError: there are too many charts for their gutters alone.
     """
+    # rounded, so that machines that differ in the last bits pack alike
     exact_sizes = [
         (round(width, DECIMALS), round(height, DECIMALS)) for width, height in sizes
     ]
     lying_sizes = [(max(size), min(size)) for size in exact_sizes]
     lower_scale = 0.0  # nothing but gutters
+    # At this scale the widest chart is as wide as the square: no larger one can fit.
     upper_scale = side / max(width for width, _ in lying_sizes)
     best = _shelves(lying_sizes, lower_scale, side)
     for _ in range(N_BISECTIONS):
@@ -206,7 +216,8 @@ def join_patches(
 ) -> assets.Mesh:
     """Join patches into a mesh of largest extent 1, centered and standing on z = 0.
 
-    Every value is rounded to `DECIMALS`.
+    Every value is rounded to `DECIMALS` decimals, so that all machines make the same
+    file.
 
     Args:
         patches: patches of the object.
@@ -227,6 +238,8 @@ def join_patches(
     vertices = np.concatenate([patch.vertices for patch in patches])
     origin, extent = assets.find_footing(vertices)
     vertices = (vertices - origin) / extent
+    # Some vertices at poles belong to no triangle. They are removed, and the indices of
+    # the others are renumbered without gaps.
     # No triangle uses some vertices at poles.
     used = np.unique(faces)
     renumbered_faces = np.searchsorted(used, faces).astype(np.uint32)
@@ -308,6 +321,10 @@ class ObjectFamily:
 
         The mesh has largest extent 1 and rests on z = 0. The same state of the
         generator gives the same asset.
+
+        Args:
+            rng: random generator that all parameters are sampled from; None for the
+                canonical instance.
         """
         instance = self.make(ParameterSampler(rng))
         if instance.finishes:
@@ -331,6 +348,7 @@ class ObjectFamily:
             material=instance.material,
             label=self.label,
             source=workbench.library.BUNDLED_OBJECT,
+            # `size_in_metres` is the length of one unit of the patches.
             surface=surface,
             finishes=instance.finishes,
             size_in_metres=round(float(extent) * self.size_in_metres, 4),
@@ -400,12 +418,15 @@ def sample_material(
     sampled_roughness = sampler(
         roughness, low=roughness - spread, high=roughness + spread
     )
+    # Few objects have another clearcoat, and very few are partly of metal, as among
+    # real objects of this kind.
     if sampler.chance(0.3):
         clearcoat = sampler(clearcoat, low=0.0, high=1.0)
     metallic = 0.0
     if sampler.chance(0.06):
         metallic = sampler(0.0, low=0.3, high=0.8)
     values = {
+        # neither a mirror, whose reflections are noisy, nor completely dull
         "roughness": min(max(sampled_roughness, 0.12), 0.95),
         "metallic": metallic,
         "specular": sampler(0.5, low=0.3, high=0.7),

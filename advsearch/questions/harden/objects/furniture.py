@@ -76,7 +76,11 @@ def _post(
 
 @family(metres=0.01)
 def chair(sampler: ParameterSampler) -> Instance:
-    """Make a chair that faces +x, with its back at -x."""
+    """Make a chair that faces +x, with its back at -x.
+
+    Lengths are in centimeters, angles in degrees. `sampler(x, low=..., high=...)`
+    returns x for the canonical chair and a uniform sample for a random one.
+    """
     width = sampler(43.0, low=36.0, high=50.0)
     depth = sampler(42.0, low=36.0, high=48.0)
     seat_height = sampler(45.0, low=40.0, high=50.0)
@@ -153,6 +157,7 @@ def _chair_seat(
         cells=2,
     )
     if sampler.chance(0.35):
+        # The cushion overlaps the seat a little, so that there is no gap.
         patches += shapes.box(
             "cushion",
             (0.5, 0.0, seat_height + 1.4),
@@ -294,8 +299,8 @@ def _chair_back(
 ) -> list[Patch]:
     """Create the back of a chair: two posts, and what is between them.
 
-    That is vertical slats below a rail ("slats" with a second rail below them, "arch"
-    without), horizontal bars ("ladder"), or one board ("panel").
+    There are four styles. "slats" are vertical slats between two rails. "arch" has the
+    upper rail only. "ladder" has horizontal bars, and "panel" one board.
 
     Args:
         sampler: samples the kind and its proportions.
@@ -336,10 +341,17 @@ def _back_posts(back: _ChairBack, legs: _Legs) -> list[Patch]:
 def _slatted_back(
     sampler: ParameterSampler, back: _ChairBack, *, has_lower_rail: bool
 ) -> list[Patch]:
-    """Create vertical slats below a rail; without a lower rail they reach the seat."""
+    """Create vertical slats below a rail; without a lower rail they reach the seat.
+
+    Args:
+        sampler: samples how many slats there are, and their widths.
+        back: size and position of the back.
+        has_lower_rail: whether there is a rail below the slats.
+    """
     patches = back.make_board(
         "cross", back.top - 0.09 * back.height, back.width, 0.14 * back.height
     )
+    # 1 cm inside the seat, so that there is no gap
     low = back.bottom - 1.0
     if has_lower_rail:
         low = back.bottom + 0.22 * back.height
@@ -354,6 +366,7 @@ def _slatted_back(
             (low + high) / 2,
             back.width * sampler(0.075, low=0.05, high=0.11),
             high - low + 1.0,
+            # at equal distances from each other and from both posts
             y=back.width * ((i + 1) / (n_slats + 1) - 0.5),
         )
     return patches
@@ -414,6 +427,7 @@ def _shade(sampler: ParameterSampler, size: _ShadeSize) -> list[Patch]:
         ],
         count=14,
     )
+    # The inside is the outside, moved towards the axis and followed downwards.
     inner = (outer - np.array([wall, 0.0]))[::-1]
     pieces = [
         ("shade", shapes.subdivide(outer, longest=2.0)),
@@ -451,7 +465,14 @@ def _lamp_base(
 def _disc_base(
     sampler: ParameterSampler, height: float, foot_radius: float, stem_radius: float
 ) -> list[Patch]:
-    """Create a flat foot with a thin stem; see `_lamp_base`."""
+    """Create a flat foot with a thin stem.
+
+    Args:
+        sampler: samples the thickness of the foot.
+        height: height of the stem's end.
+        foot_radius: radius of the foot.
+        stem_radius: radius of the stem.
+    """
     thickness = sampler(2.0, low=1.2, high=3.2)
     # profiles of points (r, z)
     under = [(0.0, 0.0), (foot_radius - 0.4, 0.0)]
@@ -483,7 +504,16 @@ def _body_base(
     *,
     has_waist: bool,
 ) -> list[Patch]:
-    """Create a body on a foot ring; see `_lamp_base`."""
+    """Create the base of a lamp as a turned body on a foot ring.
+
+    Args:
+        sampler: samples radius and height of the belly.
+        height: height of the stem's end.
+        foot_radius: radius of the foot ring.
+        stem_radius: radius of the stem at the top.
+        has_waist: whether the body narrows above the belly and widens again, as a gourd
+            does.
+    """
     belly = foot_radius * sampler(1.12, low=0.95, high=1.4)
     belly_height = sampler(0.38, low=0.28, high=0.6) * height
     above_belly = [(0.45 * belly, 0.72 * height)]
@@ -563,7 +593,11 @@ def _shade_paint(
 
 @family(metres=0.01)
 def lamp(sampler: ParameterSampler) -> Instance:
-    """Make a table lamp of random proportions, shade and base."""
+    """Make a table lamp of random proportions, shade and base.
+
+    Lengths are in centimeters. `sampler(x, low=..., high=...)` returns x for the
+    canonical lamp and a uniform sample for a random one.
+    """
     total_height = sampler(48.0, low=42.0, high=58.0)
     shade_height = sampler(20.0, low=14.0, high=24.0)
     bottom_radius = sampler(16.5, low=12.0, high=19.0)

@@ -178,6 +178,8 @@ def _lid_profile(
         sampler: samples the lid's dome and the knob's radius.
         mouth, height: radius and height of the mouth.
     """
+    # A ring of the outside, then rings of the inside: `ahead` is how far each is moved
+    # along the path.
     dome = sampler(1.5, low=0.7, high=2.4)
     knob_radius = sampler(1.0, low=0.7, high=1.4)
     top = height + dome + 0.2  # of the lid

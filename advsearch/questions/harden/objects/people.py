@@ -119,7 +119,9 @@ def _smooth_normals(
     """Return normals (V, 3) that are smooth across the seams of charts.
 
     Vertices of several charts that are the same point of the body have the same normal:
-    the mean of the normals of all faces around it, weighted by area.
+    the mean of the normals of all faces around it, weighted by area. The length of a
+    face's area vector is twice its area, so the sum of area vectors is already
+    weighted.
 
     Args:
         vertices: (V, 3), chart after chart.
@@ -177,9 +179,14 @@ def _jeans(t: Texels, color: Array) -> Array:
 def _face(t: Texels, color: Array, hair: Array) -> Array:
     """Paint skin with lips, cheeks and eyebrows at the front of the head.
 
-    Their positions are those of the reference body, in metres. Shades of lips and
-    cheeks are multiples of the skin's color (3,); eyebrows have the color of the hair
-    (3,).
+    Positions are those of the reference body, in metres: z is the height, and the face
+    looks along +x. They were measured on that body. Lips and cheeks multiply the skin's
+    color by a factor for each channel; eyebrows have the color of the hair.
+
+    Args:
+        t: points to paint.
+        color: color of the skin (3,).
+        hair: color of the hair (3,).
     """
     x, y, z = t.xyz.T
     abs_y = np.abs(y)

@@ -130,7 +130,8 @@ def _round_corner(
 
     Args:
         previous, corner, following: three consecutive points (D,) of a polyline.
-        radius, steps: as of `round_corners`.
+        radius: how far from the corner the rounding begins on both edges, at most.
+        steps: edges of the rounding; it has `steps` + 1 points.
     """
     to_previous = previous - corner
     to_next = following - corner
@@ -287,6 +288,10 @@ def grid(
 ) -> Patch:
     """Create the patch of a grid of points (R, C, 3) with unit normals.
 
+    The patch has a chart, which is the rectangle of its texture. Its function `rest`
+    returns the 3-D points at chart coordinates, by bilinear interpolation. The atlas
+    calls it to paint each texel.
+
     Args:
         tag: tag of the paint.
         points: u grows from column to column, and v from row to row; the cross
@@ -300,6 +305,8 @@ def grid(
     u = np.broadcast_to(across, (rows, columns))
     v = np.broadcast_to(down[:, None], (rows, columns))
     vertices = points.reshape(-1, 3)
+    # `fill_value=None` extrapolates: texels of the gutter lie a little outside of [0,
+    # 1].
     interpolate = RegularGridInterpolator(
         (down, across), points, bounds_error=False, fill_value=None
     )
@@ -354,8 +361,7 @@ def _fan(count: int) -> assets.IntArray:
 
 
 def _profile_normals(polylines: Sequence[Array]) -> list[Array]:
-    """Return the unit normals (K, 2), as (r, z), of each of several consecutive
-    polylines.
+    """Return the unit normals (K, 2) of consecutive polylines, as (r, z).
 
     A polyline has points (r, z) and is walked with the material on its left. Its normal
     is its direction (dr, dz) turned to the right, (dz, -dr), which points outwards.
@@ -366,6 +372,7 @@ def _profile_normals(polylines: Sequence[Array]) -> list[Array]:
     for index in range(len(polylines) - 1):
         before = all_directions[index]
         after = all_directions[index + 1]
+        # A shared end is the same point up to rounding.
         gap = polylines[index][-1] - polylines[index + 1][0]
         is_joined = float(np.linalg.norm(gap)) < 1e-9
         cosine = float(before[-1] @ after[0])
@@ -421,7 +428,8 @@ def _disc(tag: str, profile: Array, normals: Array, columns: int) -> Patch:
         normals: (K, 2), as (r, z), at these points.
         columns: faces around.
     """
-    # A profile that ends on the axis faces up, one that begins there faces down.
+    # A profile that ends on the axis faces up; one that begins there faces down.
+    # 1e-9 stands for 0: the end of the profile is on the axis.
     faces_up = profile[-1, 0] < 1e-9
     from_axis = slice(None, None, -1) if faces_up else slice(None)
     curve = profile[from_axis]
@@ -438,8 +446,10 @@ def _disc(tag: str, profile: Array, normals: Array, columns: int) -> Patch:
 
     def rest(u: Array, v: Array) -> Array:
         """Return the points (N, 3) at chart coordinates (N,)."""
+        # The chart is [0, 1] x [0, 1]; here its disc has radius 1 around the pole.
         x = (2 * u - 1) * mirror
         y = 2 * v - 1
+        # The corners of the chart are outside of the disc and get the color of its rim.
         pole_distance = np.minimum(np.hypot(x, y), 1.0)
         radius = np.interp(pole_distance, radial_fraction, curve[:, 0])
         z = np.interp(pole_distance, radial_fraction, curve[:, 1])
@@ -492,7 +502,8 @@ def _disc_triangles(columns: int, curve: Array) -> assets.IntArray:
 def _wall(tag: str, profile: Array, normals: Array, columns: int) -> list[Patch]:
     """Create a piece of a surface of revolution as an unrolled band.
 
-    A band that is much wider than high is cut into 2 or 4 charts.
+    A band that is much wider than high is cut into 2 or 4 charts, because long charts
+    leave much of the texture atlas empty.
 
     Args:
         tag: tag of the paint.
@@ -592,7 +603,8 @@ def _hollow_base(
 
     Args:
         foot: (r, z) of the outer edge of the foot ring.
-        wall, floor: as of `vessel`.
+        wall: thickness of the wall.
+        floor: height of the floor inside the container.
     """
     # how far the middle of the base lies above the foot ring
     inset = min(0.35 * wall, 0.3 * floor)
@@ -732,6 +744,7 @@ def sweep(
     points = _sweep_points(section, scales, centers, first_normal, second_normal)
     ring_fraction, ring_length = _along(_repeat_first(section, axis=0))
     # nearly the largest circumference, whatever the scale is at the ends
+    # `scales.mean` is the mean of the two axes' scales at each center.
     width = ring_length * float(np.quantile(scales.mean(axis=1), 0.75))
     down = mean_lengths(points)
     patches = [
@@ -871,10 +884,12 @@ def box(
         center: center of the box.
         size: along x, y and z.
         bevel: radius of the edges.
-        steps: cells across half of an edge's rounding.
+        steps: cells across half of an edge's rounding; the other half belongs to the
+            next face.
         cells: cells across the flat part of a face, along each of its axes.
     """
     half = np.asarray(size, dtype=np.float64) / 2
+    # 0.95: a flat part, however small, must be left.
     bevel = min(bevel, 0.95 * float(half.min()))
     flat = half - bevel  # half the size of the flat parts
     coordinates = [
@@ -980,17 +995,18 @@ That avoids slivers.
 def carve_patches(
     patches: Iterable[Patch], inside: Field, tag: str | None
 ) -> list[Patch]:
-    """Cut patches along the surface where a field is 0, and give the inside another
-    tag.
+    """Cut patches along the surface where a field is 0, and tag the inside anew.
 
     Args:
         patches: smooth ones that are not transformed yet.
-        inside: the field, positive inside.
+        inside: function of points (V, 3) that returns values (V,), which are positive
+            inside the region to cut out. For example, a window in a car.
         tag: tag of the inside; None removes it.
     """
     carved_patches = []
     for patch in patches:
         value = _snap_to_vertices(patch, np.array(inside(patch.vertices)))
+        # no vertex is inside: the patch stays as it is
         if value.max() <= 0.0:
             carved_patches.append(patch)
             continue
@@ -1069,6 +1085,8 @@ def _split(patch: Patch, value: Array) -> tuple[Patch, assets.BoolArray]:
     crossed_edges = edges[value[edges[:, 0]] * value[edges[:, 1]] < 0.0]
     first, second = crossed_edges.T
     # where the value is 0, from the first vertex to the second
+    # Linear interpolation: value(first) + fraction * (value(second) - value(first)) =
+    # 0.
     fraction = (value[first] / (value[first] - value[second]))[:, None]
 
     def add_cuts(attribute: Array) -> Array:
@@ -1077,6 +1095,7 @@ def _split(patch: Patch, value: Array) -> tuple[Patch, assets.BoolArray]:
         return np.concatenate([attribute, attribute[first] + fraction * difference])
 
     normals = add_cuts(patch.normals)
+    # An interpolated normal is shorter than 1.
     cut_normals = normals[len(patch.normals) :]
     cut_normals /= np.linalg.norm(cut_normals, axis=1, keepdims=True)
     cut_of_edge = {
@@ -1133,7 +1152,13 @@ def _outline_with_cuts(
 ) -> list[tuple[int, float]]:
     """Return the vertices around a triangle, with the cuts of its edges between them.
 
-    Each is its index and its value; the value of a cut is 0.
+    An entry has the index of the vertex and its value, which is 0 at a cut.
+
+    Args:
+        face: indices of the triangle's vertices (3,).
+        value: value of each vertex (V,).
+        cut_of_edge: index of the vertex that cuts an edge, by the indices of the edge's
+            ends, the smaller one first.
     """
     outline: list[tuple[int, float]] = []
     for i in range(3):

@@ -206,7 +206,8 @@ def speckled(
 ) -> Paint:
     """Paint small irregular specks, `scale` wide, over another paint.
 
-    They take about the fraction `amount` of its area. `offset` (3,) is as of `mottled`.
+    They cover about the fraction `amount` of its area. `offset` (3,) is added to
+    positions, so that instances have different specks.
     """
     # The noise is seldom near 1, so that the threshold falls faster than `amount` grows.
     threshold = 1.0 - 1.1 * amount
@@ -240,14 +241,16 @@ def wood(
         t: points to paint.
         color: color of its light parts.
         scale: distance of the growth rings, about.
-        offset: (3,) as of `mottled`.
-        axis: axis of the fibers: 0, 1 or 2.
+        offset: (3,) added to the coordinates of the noise, so that each object has a
+            grain of its own.
+        axis: axis of the fibers: 0 is x, 1 is y, 2 is z.
         contrast: by how much the grain is darker, as a fraction.
     """
     stretch = np.full(3, 1.0 / scale)
     stretch[axis] = 0.12 / scale  # the grain is long along the axis
     grain_position = t.xyz * stretch + offset
     first_cross, second_cross = (i for i in range(3) if i != axis)
+    # The factors are chosen by eye.
     # growth rings are a slanted plane wave, bent by noise
     ring_phase = (
         grain_position[:, first_cross]
@@ -379,12 +382,16 @@ def facing(
 
 
 def sample_paint(sampler: ParameterSampler, size: float) -> Paint:
-    """Sample a paint of any kind and colors, so that textures don't give away a class.
+    """Sample a paint of any kind and colors.
+
+    A model that is trained on objects with such paints cannot recognize their class by
+    the texture alone.
 
     Args:
         sampler: sampler with a generator.
-        size: size of the instance, about.
+        size: approximate size of the object, which the patterns are scaled by.
     """
+    # with `p_random` 1 any color; "808080" is never used
     a = sampler.sample_color("808080", p_random=1.0)
     b = sampler.sample_color("808080", p_random=1.0)
     cell = size * sampler(0.1, low=0.05, high=0.2)
@@ -426,7 +433,15 @@ def sample_paint(sampler: ParameterSampler, size: float) -> Paint:
 def _sample_irregular_paint(
     sampler: ParameterSampler, kind: str, a: Color, b: Color, cell: float, offset: Array
 ) -> Paint:
-    """Sample clouds or specks of two colors, or wood, which has a color of its own."""
+    """Sample clouds or specks of two colors, or wood, which has a color of its own.
+
+    Args:
+        sampler: samples the proportions.
+        kind: "mottled", "speckled" or "wood".
+        a, b: colors (3,); wood does not use them.
+        cell: width that the pattern is scaled by.
+        offset: (3,) added to positions, so that instances differ.
+    """
     if kind == "mottled":
         contrast = sampler(2.0, low=1.0, high=4.0)
         return mottled(a, b, scale=1.5 * cell, offset=offset, contrast=contrast)

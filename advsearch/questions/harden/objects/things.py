@@ -167,12 +167,17 @@ def _star(t: Texels, radius: float) -> Array:
 
 @family(metres=0.01)
 def ball(sampler: ParameterSampler) -> Instance:
-    """Make a football, or a ball of another pattern."""
+    """Make a football, or a ball of another pattern.
+
+    Lengths are in centimeters, angles in degrees. Its pattern gets a random direction,
+    by rotations about the x and then the z axis.
+    """
     radius = 11.0
     # "random" is named twice, to be sampled twice as often
     style = sampler.pick(
         "football", "beach", "basket", "tennis", "star", "plain", "random", "random"
     )
+    # a factor along z, after the rotations, so that the ball is flat where it lies
     squash = sampler(1.0, low=0.95, high=1.03)
     about_z = shapes.rotation("z", sampler(12.0, low=0.0, high=360.0))
     about_x = shapes.rotation("x", sampler(24.0, low=0.0, high=180.0))
@@ -193,7 +198,10 @@ def ball(sampler: ParameterSampler) -> Instance:
 
 
 def _press_ball(sphere: list[Patch], style: str, radius: float) -> list[Patch]:
-    """Press the grooves of a football or a basketball into a sphere."""
+    """Press the grooves of a football or a basketball into a sphere.
+
+    Balls of other styles stay smooth.
+    """
     if style == "basket":
         return _press_seams(sphere, radius, 0.015, basketball_seams)
     if style == "football":
@@ -260,7 +268,11 @@ def _beach_colors(sampler: ParameterSampler, light: Array) -> list[Array]:
 
 @family(metres=0.01)
 def banana(sampler: ParameterSampler) -> Instance:
-    """Make a banana of random bend and ripeness."""
+    """Make a banana of random bend and ripeness.
+
+    Lengths are in centimeters, `bend` and rotations in degrees. `sampler(x, low=...,
+    high=...)` returns x for the canonical banana and a uniform sample for a random one.
+    """
     length = sampler(19.0, low=15.0, high=22.0)
     bend = sampler(105.0, low=65.0, high=130.0)
     max_radius = sampler(1.65, low=1.45, high=2.1)
@@ -318,12 +330,15 @@ def _banana_radius(
     # from 0 to 1 over a quarter of the length: from the stem, and from the tip
     rise = np.clip((position - stem_length) / (0.26 * length), 0.0, 1.0) ** 0.75
     fall = np.clip((length - position) / (0.24 * length), 0.0, 1.0) ** 0.62
+    # the tip ends with 26 % of the largest radius, not in a point
     blunt_tip = np.maximum(np.sin(0.5 * np.pi * fall), 0.26)
     body = np.sin(0.5 * np.pi * rise) * blunt_tip
     # the stem is thicker where it was cut
     neck = sampler(0.3, low=0.24, high=0.4)
     stem = neck * (1.0 + 0.25 * np.exp(-position / 0.5))
     radius = max_radius * np.maximum(stem, body)
+    # over the neighbors, so that stem and body join without an edge; `edge` repeats the
+    # ends
     # smoothed by a mean of five
     return np.convolve(np.pad(radius, 2, mode="edge"), np.ones(5) / 5, mode="valid")
 
@@ -402,7 +417,10 @@ class _BookSize(NamedTuple):
 def book(sampler: ParameterSampler) -> Instance:
     """Make a closed hardback that lies on its back cover.
 
-    The spine runs along y at -x; the pages show at the other three sides.
+    The spine runs along y at -x; the pages are visible at the other three sides.
+    Lengths are in centimeters, and 22.5 is the height of a usual hardback. `sampler(x,
+    low=..., high=...)` returns x for the canonical book and a uniform sample for a
+    random one.
     """
     width = sampler(15.5, low=12.0, high=18.0)
     height = 22.5
@@ -417,6 +435,8 @@ def book(sampler: ParameterSampler) -> Instance:
         )
     patches += shapes.box(
         "pages",
+        # Along x the pages end 0.2 + `overhang` before the covers' free edge, and at -x
+        # they begin near the inner side of the spine.
         (0.3 - overhang / 2, 0.0, size.thickness / 2),
         (
             width - overhang - 0.5,
@@ -427,6 +447,8 @@ def book(sampler: ParameterSampler) -> Instance:
         steps=1,
     )
     patches += _round_spine(size, bulge, board)
+    # -122 degrees: seen from the usual camera, the spine is at the side and the front
+    # cover is readable.
     rotated = shapes.transform_patches(
         patches, shapes.rotation("z", sampler(-122.0, low=-150.0, high=-100.0))
     )
@@ -499,7 +521,11 @@ def _page_edges(t: Texels, paper: Array, offset: Array) -> Array:
 
 @painter
 def _spine_paint(t: Texels, cloth: Paint, gold: Array, size: _BookSize) -> Array:
-    """Paint two golden bands at each end of a spine, and words in its middle."""
+    """Paint two golden bands at each end of a spine, and words in its middle.
+
+    The words are bars without letters. Fractions are of the book's height, or of its
+    thickness.
+    """
     _, y, z = t.xyz.T
     end_fraction = np.abs(y) / size.height  # 0 in the middle, 1/2 at the ends
     bands = np.maximum(
@@ -717,7 +743,7 @@ def _word_strokes(letters: str, height: float) -> list[Array]:
 
 @painter
 def _face(t: Texels, red: Array, radius: float) -> Array:
-    """Paint the plate of a stop sign around the origin, which looks along +x.
+    """Paint the plate of a stop sign, which faces +x and has its center at the origin.
 
     The word and a rim are white on red.
 
@@ -728,11 +754,13 @@ def _face(t: Texels, red: Array, radius: float) -> Array:
     """
     _, y, z = t.xyz.T
     apothem = radius * np.cos(np.pi / 8)  # from the middle of the octagon to its sides
+    # directions of the eight sides' normals, in the plane of y and z
     side_angles = np.pi * (np.arange(8) + 0.5) / 4 + np.pi / 8
     # apothem of the octagon whose outline goes through each texel
     texel_apothem = np.max(
         [y * np.cos(angle) + z * np.sin(angle) for angle in side_angles], axis=0
     )
+    # The rim is white between 91.5 % and 98.5 % of the apothem.
     rim = step(texel_apothem - 0.915 * apothem, 0.0, soft=0.006)
     rim = rim * step(0.985 * apothem - texel_apothem, 0.0, soft=0.006)
 
@@ -744,7 +772,10 @@ def _face(t: Texels, red: Array, radius: float) -> Array:
 
 @family(metres=1.0, texels=192)
 def stop_sign(sampler: ParameterSampler) -> Instance:
-    """Make a stop sign on a post."""
+    """Make a stop sign on a post.
+
+    Lengths are in metres; the angle is in degrees.
+    """
     radius = sampler(0.45, low=0.4, high=0.5)
     height = sampler(0.74, low=0.66, high=0.84)  # of the middle of the plate
     red = sampler.sample_color("b3121d", "a8161f", "c0202a", p_random=0.0)

@@ -50,6 +50,7 @@ def _claw(
     section = shapes.rectangle(2.0, 2.0, bevel=0.5, steps=2)
     patches = []
     for side in (-1.0, 1.0):
+        # The powers bend the prongs: the tips turn downwards.
         x = 0.25 * half_head - drop * t**1.8
         y = start + length * (t - 0.1 * t**2)
         z = side * half_head * (0.5 + spread * t)
@@ -94,7 +95,13 @@ def _peen(
 
 
 def _ball_peen(half_head: float, start: float, length: float) -> list[Patch]:
-    """Create a ball on a short neck; see `_peen`."""
+    """Create the back of a ball-peen hammer's head: a ball on a short neck, along +y.
+
+    Args:
+        half_head: half the width of the head.
+        start: y of the neck's root.
+        length: length along +y.
+    """
     neck = shapes.sweep(
         "head",
         _points_on_y(start - 0.3, start + 0.5 * length),
@@ -115,12 +122,15 @@ def _ball_peen(half_head: float, start: float, length: float) -> list[Patch]:
 def hammer(sampler: ParameterSampler) -> Instance:
     """Make a hammer whose handle runs along -x, and whose head lies along y.
 
-    The head is at the origin, and its striking face at -y.
+    The head is at the origin, and its striking face at -y. Lengths are in centimeters,
+    angles in degrees. `sampler(x, low=..., high=...)` returns x for the canonical
+    hammer and a uniform sample for a random one.
     """
     half_head = sampler(1.35, low=1.15, high=1.7)
     length = sampler(27.0, low=20.0, high=31.0)
     sampled_front = sampler(5.0, low=3.8, high=6.0)
     face_radius = half_head * sampler(1.1, low=1.0, high=1.35)
+    # "claw" is named twice, to be sampled twice as often
     style = sampler.pick("claw", "claw", "peen", "sledge")
     half_eye = half_head * sampler(1.25, low=1.1, high=1.5)
     front = max(sampled_front, 2.2 * half_eye)  # outside the block around the eye
@@ -185,7 +195,13 @@ def _hammer_head(
 def _sledge_block(
     sampler: ParameterSampler, front: float, face_radius: float
 ) -> list[Patch]:
-    """Create the head of a sledgehammer: a block with eight or four sides along y."""
+    """Create the head of a sledgehammer: a block with eight or four sides along y.
+
+    Args:
+        sampler: chooses the number of sides.
+        front: length from the middle to each end.
+        face_radius: radius of the face.
+    """
     section = shapes.rectangle(1.8, 1.8, bevel=0.4)
     if sampler.chance(0.5):
         section = shapes.polygon(8, bevel=0.1)
@@ -215,7 +231,15 @@ def _eye_block(half_head: float, half_eye: float) -> list[Patch]:
 def _striking_face(
     half_head: float, half_eye: float, front: float, face_radius: float
 ) -> list[Patch]:
-    """Create the round neck in front of the eye, and the face at its end (-y)."""
+    """Create the round neck in front of the eye, and the face at its end (-y).
+
+    Args:
+        half_head: half the width of the block around the eye.
+        half_eye: half the length of that block.
+        front: distance of the striking face from the middle of the eye.
+        face_radius: radius of the face.
+    """
+    # y of each ring, from the eye to the face
     path = _points_on_y(
         -half_eye * 0.9,
         -half_eye * 1.2,

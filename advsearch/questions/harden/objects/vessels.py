@@ -94,8 +94,8 @@ def _handle_curve(
     A square handle has two rounded bends; the others go through knots at three heights.
 
     Args:
-        style: as for `make_handle`.
-        bottom_root, top_root: (r, z).
+        style: "round", "ear" (widest at the top), "square" or "loop" (small).
+        bottom_root, top_root: (r, z) where the handle meets the wall.
         reach: its extent from the wall.
     """
     bottom = bottom_root[1]
@@ -105,6 +105,8 @@ def _handle_curve(
         outer = wall_radius + reach
         corners = [top_root, (outer, top), (outer, bottom), bottom_root]
         rounded = shapes.round_corners(corners, radius=0.45 * reach, steps=6)
+        # The spline distributes its points evenly; the dense polyline keeps its
+        # corners.
         return shapes.spline(
             shapes.subdivide(rounded, longest=0.8), count=HANDLE_POINTS
         )
@@ -179,13 +181,23 @@ def _ceramic_belt(
     accent: Paint,
     second_color: Array,
 ) -> Paint:
-    """Sample a decoration between two heights of a vessel; see `_ceramic`."""
+    """Sample a decoration between two heights of a vessel.
+
+    Args:
+        sampler: samples heights and colors.
+        kind: "band", "dip" (all above a height), "bands", "checks" or "zigzag".
+        height: height of the vessel.
+        glaze: paint of the rest of the vessel.
+        accent: paint of a band and of the dipped part.
+        second_color: color of the pattern of the other kinds.
+    """
     if kind == "band":
         low = sampler(0.36, low=0.1, high=0.5) * height
         high = sampler(0.72, low=0.55, high=0.9) * height
         return over(glaze, between(low, high, soft=0.12), accent)
     if kind == "dip":
         low = sampler(0.5, low=0.3, high=0.7) * height
+        # twice the height: up to the top, with some margin for the lip
         return over(glaze, between(low, 2 * height, soft=0.1), accent)
     if kind == "bands":
         bands = rings(parse_hex_color(PALE), second_color, period=0.13 * height)
@@ -203,7 +215,11 @@ def _ceramic_belt(
 
 @family(metres=0.01)
 def mug(sampler: ParameterSampler) -> Instance:
-    """Make a mug with a handle."""
+    """Make a mug with a handle.
+
+    Lengths are in centimeters. `sampler(x, low=..., high=...)` returns x for the
+    canonical mug and a uniform sample for a random one.
+    """
     height = sampler(9.4, low=7.6, high=12.0)
     wall, side, body = _mug_body(sampler, height)
 
@@ -225,6 +241,8 @@ def mug(sampler: ParameterSampler) -> Instance:
 
     paints = _mug_paints(sampler, height)
     patches = shapes.transform_patches(
+        # -108 degrees: in the usual view the handle is at the side, where it is
+        # visible.
         [*body, *shapes.transform_patches(handle, shapes.rotation("z", -108.0))],
         SEAM_ROTATION,
     )
@@ -232,6 +250,7 @@ def mug(sampler: ParameterSampler) -> Instance:
         patches,
         paints,
         sample_material(sampler, roughness=0.3, clearcoat=0.5),
+        # These parts are hardly visible, so they get fewer texels.
         texel_density={"inside": 0.8, "base": 0.6},
     )
 
@@ -265,7 +284,12 @@ def _mug_body(
 
 
 def _mug_paints(sampler: ParameterSampler, height: float) -> dict[str, Paint]:
-    """Sample the paints of a mug of a height, by the tags of its parts."""
+    """Sample the paints of a mug of a height, by the tags of its parts.
+
+    Args:
+        sampler: samples the paints; the canonical mug has a raw foot.
+        height: height of the mug.
+    """
     offset = sampler.offset()
     clay = sampler.sample_color(
         "e9dfca", "f3f1ec", "d9c7a5", "3a3f45", "8fa7a0", "b5442e", "6f8fb0"
@@ -325,6 +349,11 @@ def _bowl_paints(
 
     The canonical bowl is glazed, with a pale rim and a raw foot; the others have any
     decoration of a potter.
+
+    Args:
+        sampler: samples the paints.
+        radius: radius of the rim.
+        height: height of the rim.
     """
     offset = sampler.offset()
     clay = sampler.sample_color(
@@ -844,7 +873,7 @@ def _glass_profile(
 
     Args:
         glass: the bowl.
-        foot_radius, stem_radius: radii.
+        foot_radius, stem_radius: radii of the foot and of the stem.
     """
     inner, lip = _glass_lip(glass)
     floor = glass.bottom + 0.08 * glass.depth
@@ -877,7 +906,8 @@ def _glass_paints(
 ) -> dict[str, Paint]:
     """Sample the paints of a wine glass, which often has wine in it.
 
-    The glass is opaque: wine is a color of its outside and its inside up to a level.
+    The glass is not transparent: wine is painted on its outside and its inside, up to a
+    level.
 
     Args:
         sampler: samples the paints.
