@@ -139,9 +139,9 @@ def open_progress(
     """Return an object that displays progress, to be used in a `with` block.
 
     Args:
-        requested: True for a display wherever there is an output; None for bars in a
-            terminal only; False for none; or an object with the methods of `Progress`,
-            which is returned.
+        requested: True for a display in a notebook, a terminal or a stream of lines;
+            None for bars in a terminal only; False for no display; or an object with
+            the methods of `Progress`, which is returned.
         written: function that replaces settings in a text, such as "`steps`", by the
             form in which the reader writes them, such as "--steps".
 
