@@ -448,8 +448,9 @@ class DaskExecutor(WorkerExecutor):
                     f"no answer: {MAX_DEATHS} workers died of it"
                 ) from None
             except Exception as error:
-                # `call_on_worker` catches all errors of our functions. So this error
-                # means that the worker could not begin, for instance to import them.
+                # `run_batch` catches errors and returns them in its reply. So this
+                # error means that the worker could not begin, for instance that it
+                # could not import the function.
                 if future.status == "error" and type(error).__name__ not in NO_WORKER:
                     failed_starts += 1
                     if failed_starts == MAX_TRIES:

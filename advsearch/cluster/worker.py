@@ -307,7 +307,7 @@ def run_batch(task: WorkerTask, items: Sequence[Any], deadline: float) -> Reply:
     """
     worker = f"{platform.node()}, process {os.getpid()}"
     try:
-        # A worker of Dask may have several threads, but renders one batch at a time.
+        # If this process has several threads, they compute one batch at a time.
         with _batch_lock:
             start = time.perf_counter()
             with kill_after(LOAD_DEADLINE):

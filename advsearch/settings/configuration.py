@@ -129,7 +129,8 @@ def setting(
         metavar: name of the value in the help; "" to derive it.
         repeats: whether the flag may be used several times.
         read_texts: function that converts texts to a mapping, for settings with one.
-        switched: see `Setting`.
+        switched: what the flag does, if it is the opposite of the description; "" if
+            the description says it.
         power: function that returns what a value does beyond the run, such as to
             connect to an address; "" for nothing.
         constraints: constraints of `pydantic.Field`, such as `ge`.

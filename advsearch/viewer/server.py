@@ -827,8 +827,8 @@ def _parse_after(query: Query) -> int:
 def _describe_error(error: Exception) -> tuple[HTTPStatus, str]:
     """Return the status and the text of the response to an error.
 
-    For an unexpected error the text has only its type, since its message may reveal
-    something about this machine.
+    For an unexpected error, which is not one of advsearch's, the text has only its
+    type.
     """
     if isinstance(error, RequestRejected):
         return error.status, str(error)
