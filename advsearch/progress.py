@@ -223,7 +223,7 @@ class LineProgress:
         hint: str = "",
         at_most: bool = False,
     ) -> None:
-        """See `Progress.stage`."""
+        """Begin another stage; its first line is printed when it has lasted a while."""
         with self._lock:
             self._name = name
             self._total = total

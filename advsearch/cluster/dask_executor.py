@@ -391,7 +391,7 @@ class DaskExecutor(WorkerExecutor):
     def submit(
         self, function: Callable[..., Any], /, *args: Any, **kwargs: Any
     ) -> Future[Any]:
-        """See `Executor.submit`; for functions of modules and positional arguments."""
+        """Schedule a call of a module's function with positional arguments."""
         if kwargs:
             raise TypeError("a worker takes positional arguments only")
         call = self._call(self._client, function, args)

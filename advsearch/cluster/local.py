@@ -126,7 +126,7 @@ class LocalExecutor(WorkerExecutor):
     def submit(
         self, function: Callable[..., Any], /, *args: Any, **kwargs: Any
     ) -> Future[Any]:
-        """See `Executor.submit`; for functions of modules and positional arguments."""
+        """Schedule a call of a module's function with positional arguments."""
         if kwargs:
             raise TypeError("a worker takes positional arguments only")
         return self._threads.submit(self._call, function, args)

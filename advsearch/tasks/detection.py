@@ -462,7 +462,7 @@ class Detection(ClassTask):
         return scores.shape[1] if scores is not None and scores.ndim == 2 else None
 
     def truth(self, facts: Facts) -> DetectionTruth:
-        """See `Task.truth`: the true box, and those of other things of its classes."""
+        """Return the object's true box, and the boxes of other objects of its classes."""
         height, width = facts.mask.shape
         right_classes = self.find_right_classes(facts)
         other_boxes = []

@@ -115,7 +115,7 @@ class Rig(tasks.JointTask):
     def after_calibration(
         self, output: Sequence[tasks.Outputs], truth: tasks.Truths | None
     ) -> Rig:
-        """See `Task.after_calibration`: the first camera's image is the clean one."""
+        """Calibrate the task of the images on the clean image of the first camera."""
         first_output = output[0][0]
         first_truth = None if truth is None else truth[0]
         part = self.part.after_calibration(first_output, first_truth)

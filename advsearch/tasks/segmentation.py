@@ -341,7 +341,7 @@ class Segmentation(tasks.ClassTask):
         return is_correct.reshape(logits.shape[1:])
 
     def marks(self, output: Tensor, truth: SegmentationTruth) -> list[list[tasks.Mark]]:
-        """See `Task.marks`: the object, and the pixels that get a right class."""
+        """Return what is drawn: the object, and the pixels that get a right class."""
         name = " or ".join(self.get_class_names(truth.labels))
         true_mark = tasks.Mark(name, True, mask=truth.mask)
         return [

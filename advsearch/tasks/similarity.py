@@ -406,7 +406,7 @@ class Similarity(tasks.Classification):
     def after_calibration(
         self, output: Tensor, truth: tasks.Labels | None
     ) -> Similarity:
-        """See `Task.after_calibration`: store the features of the clean image."""
+        """Store the features of the clean image, to which others are compared."""
         if not self.calibrates:
             return self
         features = functional.normalize(output.detach().float(), dim=1)

@@ -291,7 +291,7 @@ class EnsembleTask(JointTask):
         ]
 
     def judge(self, output: Sequence[Outputs], truth: Truths) -> list[Judgement]:
-        """See `Task.judge`; the payload has those of the models by name."""
+        """Judge each image; the payload has the payload of each model by name."""
         judgements_of_models = [
             task.judge(model_output, task_truth)
             for task, model_output, task_truth in self._by_task(output, truth)
@@ -379,7 +379,7 @@ class EachThingTask(JointTask):
     def after_calibration(
         self, output: Output, truth: TruthByThing | None
     ) -> EachThingTask:
-        """See `Task.after_calibration`: with the truth of the first thing."""
+        """Calibrate the task of an object with the truth of the first object."""
         first_truth = None if truth is None else next(iter(truth.values()))
         return replace(self, part=self.part.after_calibration(output, first_truth))
 
