@@ -79,7 +79,11 @@ __all__ = sorted({*_HOMES, *_MODULES, *list_built_ins("experiment")})
 if not TYPE_CHECKING:  # else a checker would take any name
 
     def __getattr__(name: str) -> Any:
-        """Import the interface on first use (PEP 562)."""
+        """Import a name of the public interface on first use (PEP 562).
+
+        So `import advsearch` takes no time for torch and Mitsuba. The name may be a
+        module, a function or a class, or an experiment such as "attack".
+        """
         if name in _MODULES or name in _HOMES:
             import_module("advsearch.api")  # sets the threads before torch is imported
             return (

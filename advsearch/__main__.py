@@ -17,8 +17,8 @@ def start() -> int:
     from advsearch.cli.output import INTERRUPTED
 
     status = main()
-    # an interrupt inside Dr.Jit leaves it so that the interpreter would abort at its
-    # end
+    # An interrupt inside Dr.Jit leaves it in a state in which the interpreter would
+    # abort at its end. So the process ends without the interpreter's cleanup.
     if status == INTERRUPTED:
         sys.stderr.flush()
         os._exit(status)  # standard output is written out, and every file is closed

@@ -54,21 +54,22 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 def make_unexpected_error(
     function: str, keywords: Mapping[str, object], known: Sequence[str]
 ) -> TypeError | None:
-    """Return the error for the first of some keywords that a function does not have;
-    None if it has all of them.
+    """Return the error for an unknown keyword of a call; None if all are known.
 
-    The message suggests what is probably meant.
+    The error is about the first such keyword. Its message suggests the keyword that is
+    probably meant.
 
     Args:
-        function: its name.
-        keywords: keywords of the call.
-        known: the names of its parameters.
+        function: name of the function.
+        keywords: keywords of the call, by name.
+        known: names of the function's parameters.
     """
     for name in keywords:
         if name in known:
             continue
         suggestions, reason = suggest_keyword(name, known)
-        # a device is chosen by no keyword, whatever is spelled like it
+        # No keyword chooses a device. So names that are only spelled like "device" are
+        # not suggested.
         is_device = name.lower() in DEVICES
         if not suggestions and not is_device:
             suggestions = find_similar_names(name, known)[:2]
@@ -96,17 +97,17 @@ def suggest_keyword(name: str, known: Sequence[str]) -> tuple[list[str], str]:
 def check_types(
     parameters: Mapping[str, inspect.Parameter], values: Mapping[str, object]
 ) -> None:
-    """Check values against the annotations of parameters, as far as these are types and
-    classes.
+    """Check that values of arguments have the types of their annotations.
 
-    Arrays and tensors pass, since they may stand for numbers and lists.
+    Annotations that are not types or classes are not checked. Arrays and tensors always
+    pass, since they may stand for numbers and lists.
 
     Args:
         parameters: parameters by name.
-        values: values by name of the parameter; others are not checked.
+        values: arguments by name of the parameter; unknown names are not checked.
 
     Raises:
-        InputError: a value has none of the types, or `run` is an empty text.
+        InputError: a value has none of the annotated types, or `run` is an empty text.
     """
     for name, value in values.items():
         parameter = parameters.get(name)
@@ -133,11 +134,13 @@ def check_types(
 
 
 def _parse_annotation(annotation: str) -> list[str]:
-    """Return the names of the types that an annotation allows, such as ``["str",
-    "None"]``; empty if it allows what cannot be checked.
+    """Return the names of the types that an annotation allows.
+
+    ``"Sequence[str] | None"`` gives ``["Sequence", "None"]``. The list is empty if the
+    annotation allows anything, or has an alias whose types are not known here.
     """
     without_parameters = annotation
-    # remove [...], whatever a Sequence or Mapping is of
+    # Remove [...]: the elements of a Sequence or Mapping are not checked.
     n_replaced = 1
     while n_replaced:  # from the innermost brackets outwards
         without_parameters, n_replaced = re.subn(r"\[[^][]*\]", "", without_parameters)
@@ -151,8 +154,13 @@ def _parse_annotation(annotation: str) -> list[str]:
 
 
 def _has_type(kind: str, value: object) -> bool:
-    """Return whether a value is of the type or class with a name; an int is a float,
-    and 2.0 an int.
+    """Return whether a value is of the type or class with this name.
+
+    An int counts as a float, and a float without a fraction, such as 2.0, as an int.
+
+    Args:
+        kind: name such as "int", "Mapping" or "advsearch.scene.loading.Scene".
+        value: the value.
     """
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
     is_text = isinstance(value, (str, bytes))
@@ -173,8 +181,9 @@ def _has_type(kind: str, value: object) -> bool:
 
 
 def with_checked_arguments(function: Function) -> Function:
-    """Make a function reject unknown keywords (`make_unexpected_error`) and values of
-    wrong types (`check_types`).
+    """Make a function reject unknown keywords and values of wrong types.
+
+    The messages say what was probably meant (`make_unexpected_error`, `check_types`).
     """
     signature = inspect.signature(function)
     parameters = signature.parameters

@@ -535,8 +535,10 @@ BUILT_INS = (
 
 
 def is_present(module: str) -> bool:
-    """Return whether there is a module, without importing it or a package that it is
-    in.
+    """Return whether a module is installed, without importing it or its packages.
+
+    Args:
+        module: full name, such as "torchvision.models".
     """
     names = module.split(".")
     path: Sequence[str] | None = None  # where to look; None is Python's own path
@@ -550,8 +552,13 @@ def is_present(module: str) -> bool:
 
 
 def _find_spec(module: str, path: Sequence[str] | None) -> ModuleSpec | None:
-    """Return where Python would import a module from, without importing it or its
-    parents; None if it is nowhere.
+    """Return where Python would import a module from; None if it is nowhere.
+
+    Unlike with `importlib.util.find_spec`, parent packages are not imported.
+
+    Args:
+        module: full name of the module.
+        path: directories of its package; None for a module at the top.
     """
     for finder in sys.meta_path:
         try:

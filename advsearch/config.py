@@ -39,14 +39,14 @@ def read_named(value: Any, setting: str, default_name: str) -> Any:
     Args:
         value: ``NAME``, ``NAME={OPTION: VALUE}`` or a mapping; anything else is
             returned as it is.
-        setting: its name, for messages.
-        default_name: the name of a mapping without one.
+        setting: name of the setting, for messages.
+        default_name: name for a mapping that has none.
     """
     if isinstance(value, str) and "=" in value:
         name, options = written.parse_assignment(value, setting)
         if not isinstance(options, Mapping):
-            # no mapping: stored under a name that no option has, so that it is
-            # refused where options are checked
+            # A text such as "detection=3" has no names of options. It is stored under
+            # "", which no option is called, so that the check of options rejects it.
             options = {"": options}
         value = {"name": name, **options}
     if not isinstance(value, Mapping):
@@ -61,18 +61,19 @@ def read_named(value: Any, setting: str, default_name: str) -> Any:
 
 
 def read_joined(value: Any, setting: str, default_name: str) -> Any:
-    """Read one name with options as `read_named`, or several joined with + or in a
-    list.
+    """Read a setting that is one name, or several names joined with + or in a list.
 
-    Several become their names with + between them, and under each name its options:
-    ``{"name": "detection+depth", "detection": {"iou": 0.7}}``.
+    Each name may have options, as in ``detection={iou: 0.7}+depth``. The result has the
+    joined names, and under each name its options: ``{"name": "detection+depth",
+    "detection": {"iou": 0.7}}``. A single name is read by `read_named`.
 
     Args:
-        value: the value of the setting; what is no name is returned as it is.
-        setting: its name, for messages.
-        default_name: the name of a mapping without one.
+        value: value of the setting; a value of another form is returned unchanged, to
+            be checked later.
+        setting: name of the setting, for messages.
+        default_name: name for a mapping that has none.
     """
-    # at each + that is not in braces
+    # Split at each + that is not inside of braces.
     entries = re.split(r"\+(?![^{]*\})", value) if isinstance(value, str) else value
     if not isinstance(entries, (list, tuple)) or len(entries) < 2:
         return read_named(value, setting, default_name)
@@ -88,8 +89,9 @@ def read_joined(value: Any, setting: str, default_name: str) -> Any:
         names.append(name)
         if mapping:
             options[name] = mapping
-    # A command is written back as detection+depth={depth: {seek: gone}}: then the last
-    # name is followed by the options of all names.
+    # Stored commands have the form detection+depth={depth: {seek: gone}}: the options
+    # of all names follow the last name, each under its own name. They are told from
+    # options of the last name alone by their keys.
     last_name = names[-1]
     last_options = options.get(last_name, {})
     are_of_all_names = last_options.keys() <= set(names)
@@ -418,8 +420,9 @@ class SceneConfig(Config):
 
     @model_validator(mode="after")
     def _check_counts(self) -> SceneConfig:
-        """Check that settings for one name do not have several; of several tasks each
-        needs a model.
+        """Check that settings for a single name do not have several.
+
+        Several tasks, as "detection+depth", are an exception: each needs one model.
         """
         tasks = self.task_name.split(TASK_SEPARATOR)
         for setting_name in ("object", "environment", "model"):
@@ -604,8 +607,8 @@ def make_single_value_error(name: str, names: Sequence[str]) -> InputError:
     """Return the error for several names where one is expected.
 
     Args:
-        name: the setting: "object", "environment" or "model".
-        names: its names.
+        name: name of the setting: "object", "environment" or "model".
+        names: names in its value.
     """
     got = written.format_value(",".join(names))
     return InputError(
@@ -743,11 +746,15 @@ class DerivativeConfig(SceneConfig):
     @field_validator("epsilon", mode="before")
     @classmethod
     def _epsilon_from_text(cls, value: Any) -> Any:
-        """Read ``0.05``, ``0.01,0.02`` or ``texture=0.05,geometry=0.01``, and check
-        that the numbers are in range and none comes twice.
+        """Read the setting `epsilon`, and check that its numbers are in range.
 
-        The result is a single value, a tuple to be tried one after the other, or a
-        mapping by control. Texts in it stay: pydantic turns them into numbers.
+        It is ``0.05``, or ``0.01,0.02`` for values to try one after the other, or
+        ``texture=0.05,geometry=0.01`` for a value of each control. No value and no
+        control may occur twice.
+
+        Returns:
+            A single value, a tuple, or a mapping by control. Numbers that are text
+            remain text: pydantic converts them afterwards.
         """
         if isinstance(value, str):
             value = _split_epsilons(value)
@@ -777,7 +784,10 @@ class DerivativeConfig(SceneConfig):
 
 
 def _split_epsilons(text: str) -> dict[str, Any] | tuple[str, ...]:
-    """Return the values in a text by control, or without controls in order.
+    """Split a text with values of `epsilon` at its commas.
+
+    Returns:
+        For "texture=0.05,geometry=0.01" a mapping by control; for "0.01,0.02" a tuple.
 
     Raises:
         InputError: there are two values for one control.
@@ -791,10 +801,10 @@ def _split_epsilons(text: str) -> dict[str, Any] | tuple[str, ...]:
 
 
 def _parse_positive(value: Any) -> float:
-    """Return a positive number in range, given as a number or a text.
+    """Return the positive number that a number or a text stands for.
 
     Raises:
-        ValueError: it is none.
+        ValueError: it is not a number, or is out of range.
     """
     if isinstance(value, bool):
         raise ValueError("out of range")
@@ -802,7 +812,7 @@ def _parse_positive(value: Any) -> float:
         number = float(value)
     except (TypeError, ValueError, OverflowError):
         raise ValueError("not a number") from None
-    # what is smaller has no square in float32
+    # The square of a smaller number would be 0 in float32.
     if not 1e-30 < number <= MAX_EPSILON:
         raise ValueError("out of range")
     return number

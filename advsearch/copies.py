@@ -17,12 +17,12 @@ Value = TypeVar("Value")
 
 
 def copy_value(value: Value) -> Value:
-    """Return a value in which tensors (with their graphs) and arrays are copies, and so
-    are the lists, mappings and dataclasses that hold them.
+    """Copy a value together with the tensors and arrays inside of it.
 
-    Anything else stays as it is. So does a dataclass that `gives_copies` of what it
-    holds (`Facts`), and a mapping that nobody can write into and that makes its values
-    on demand.
+    Lists, tuples, mappings, namespaces and dataclasses are copied with their contents.
+    A copy of a tensor stays attached to its graph. Any other value is returned as it
+    is. So is a dataclass that hands out copies itself (its `gives_copies` is true, as
+    for `Facts`), and a mapping that is not mutable and makes its values on demand.
     """
     original: Any = value
     copied: Any = original
@@ -75,13 +75,15 @@ def is_ours(kind: type) -> bool:
 
 
 def hand_copies(kind: type, **argument_slices: slice) -> None:
-    """Make methods of a class from outside of this package get copies of their
-    arguments, so that code of others can change what it gets without harm.
+    """Make methods of a user's class get copies of their arguments.
+
+    So code of users may change its arguments in place without harm to the search.
 
     Args:
-        kind: the class; one of this package is left as it is.
-        argument_slices: the positional arguments after `self` that are copied, by the
-            name of the method. All keyword arguments are copied.
+        kind: the class, whose methods are replaced. A class of this package is not
+            changed.
+        argument_slices: by name of the method, which positional arguments after `self`
+            are copied. All keyword arguments are copied.
     """
     if is_ours(kind):
         return

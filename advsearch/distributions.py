@@ -29,12 +29,14 @@ class PythonQuantiles(dict[str, object]):
     """
 
     def __init__(self, name: str, function: Callable[[float], float]) -> None:
-        """Evaluate an inverse CDF at `QUANTILES`; values are rounded to six digits, as
-        a file has them.
+        """Evaluate an inverse CDF at the probabilities `QUANTILES`.
+
+        The values are stored in a file, with six digits.
 
         Args:
             name: name of the distribution, for the setting and for errors.
-            function: the inverse CDF.
+            function: inverse CDF: it returns the value below which the distribution has
+                a given probability.
 
         Raises:
             InputError: the function fails.
@@ -93,8 +95,8 @@ def distribution_to_setting(value: object) -> object:
             returned as it is.
 
     Raises:
-        InputError: it is of several numbers, or of integers, or a function that is no
-            inverse CDF.
+        InputError: the distribution is of vectors or of integers, or a function is not
+            an inverse CDF.
     """
     if isinstance(value, Mapping):
         return _choices_to_setting(value)
@@ -103,7 +105,7 @@ def distribution_to_setting(value: object) -> object:
     if is_of_torch and kind.__name__ in TORCH_DISTRIBUTIONS:
         name, get_parameters = TORCH_DISTRIBUTIONS[kind.__name__]
         return _make_setting(name, get_parameters(value))
-    # a frozen distribution of scipy has its family there
+    # A frozen distribution of scipy, such as norm(0, 1), has its family in `dist`.
     family = getattr(value, "dist", value)
     is_of_integers = hasattr(family, "pmf") and hasattr(family, "ppf")
     if is_of_integers:
@@ -129,8 +131,10 @@ def distribution_to_setting(value: object) -> object:
 
 
 def _choices_to_setting(value: Mapping[Any, Any]) -> object:
-    """Return choices and their weights as a setting; a mapping that is something else,
-    such as a setting already, as it is.
+    """Return choices and their weights, such as {"red": 2, "blue": 1}, as a setting.
+
+    A mapping whose values are not all numbers, or which is a setting already, is
+    returned unchanged.
     """
     # weights may be numbers of numpy or torch
     weights = [w.item() if getattr(w, "ndim", 1) == 0 else w for w in value.values()]
@@ -139,8 +143,8 @@ def _choices_to_setting(value: Mapping[Any, Any]) -> object:
     )
     is_setting = bool(value.keys() & {DISTRIBUTION, CHOICES})
     if value and are_numbers and not is_setting:
-        # an integer too large for a float is left: whoever reads the setting says what
-        # it takes
+        # An integer too large for a float raises here. Then the mapping is returned
+        # unchanged, and the check of the setting reports it.
         with suppress(OverflowError):
             return {CHOICES: list(value), WEIGHTS: list(map(float, weights))}
     return value
@@ -167,8 +171,11 @@ def _frozen_to_setting(frozen: Any) -> dict[str, object]:
 
 
 def _make_setting(name: str, parameters: Mapping[str, Any]) -> dict[str, object]:
-    """Return the setting of a distribution of scipy with its parameters, rounded to
-    twelve digits.
+    """Return the setting for a distribution of scipy with its parameters.
+
+    Args:
+        name: name of the family in scipy, such as "norm".
+        parameters: parameters by name; they are rounded to twelve digits.
 
     Raises:
         InputError: a parameter is not a single number.

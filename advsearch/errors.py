@@ -42,14 +42,16 @@ class UnknownNameError(InputError):
     def __init__(
         self, kind: str, name: str, known: Iterable[str], hint: str = ""
     ) -> None:
-        """Make the error that a name is unknown; it lists the known names, and first
-        those like it.
+        """Make the error for an unknown name.
+
+        The message lists all known names; before them it suggests up to three that are
+        similar.
 
         Args:
-            kind: what is named, such as "policy".
-            name: name that was given.
-            known: the names that there are.
-            hint: the last sentence of the message.
+            kind: kind of the named object, such as "policy".
+            name: the unknown name.
+            known: the known names.
+            hint: last sentence of the message; "" for none.
         """
         names = sorted(known)
         near = find_similar_names(name, names)[:3]
@@ -99,14 +101,13 @@ class ClusterError(AdvsearchError):
 
 
 def find_similar_names(name: str, known: Iterable[str]) -> list[str]:
-    """Return the known names that are like `name`, best first; upper and lower case are
-    the same.
+    """Return the known names that are similar to `name`, best first.
 
-    First come names with all of its words ("coffee mug" for "mug"; a plural s is no
-    difference), then those with words that begin like its words, then those that
-    contain it. Among equals, fewer other words are better, then the same last word.
-    If there are none, names are returned that are spelled nearly like it, or of which
-    a word is.
+    Upper and lower case do not matter, and neither does a plural s. Names with all
+    words of `name` come first ("coffee mug" for "mug"), then names with words that
+    begin with its words, then names that contain it. Among equals, a name with fewer
+    additional words is better, then one with the same last word. If no name is similar
+    in this way, names with a similar spelling are returned, such as "mug" for "mgu".
     """
     query_words = _split_words(name)
     names = list(dict.fromkeys(known))
@@ -133,16 +134,17 @@ def _split_words(name: str) -> list[str]:
 
 
 def _rank(query: Sequence[str], words: Sequence[str]) -> tuple[int, int, bool] | None:
-    """Return how well a name fits a query; smaller is better, None is not at all.
+    """Return how well a name fits a query, as a key for sorting; None for not at all.
 
     Args:
-        query: the words of the query.
-        words: the words of the name.
+        query: words of the query.
+        words: words of the name.
 
     Returns:
-        The kind of likeness: 0 if the name has all words of the query, 1 if each begins
-        a word of the name, 2 if the name contains the query; how many words it has
-        more; and whether its last word is another one.
+        Three numbers, of which smaller ones are better. The first is 0 if the name has
+        all words of the query, 1 if each of them begins a word of the name, and 2 if
+        the name contains the query. The second is the number of additional words. The
+        third is whether the last words differ.
     """
     if not query or not words:
         return None
@@ -158,12 +160,14 @@ def _rank(query: Sequence[str], words: Sequence[str]) -> tuple[int, int, bool] |
 
 
 def _compute_similarity(matcher: difflib.SequenceMatcher[str], name: str) -> float:
-    """Return how near the spelling of a name, or of one of its words, is to a query, in
-    [0, 1]; 0 where it is not near enough.
+    """Return how similar a name, or one of its words, is spelled to a query.
 
     Args:
-        matcher: has the query as its second sequence.
+        matcher: matcher whose second sequence is the query.
         name: name to compare.
+
+    Returns:
+        The best ratio of the matcher, in [0, 1]; 0 if it is below the threshold.
     """
     candidates = [(name.casefold(), MIN_SIMILARITY)]
     candidates += [(word, MIN_WORD_SIMILARITY) for word in _split_words(name)]
@@ -171,7 +175,7 @@ def _compute_similarity(matcher: difflib.SequenceMatcher[str], name: str) -> flo
     for text, threshold in candidates:
         matcher.set_seq1(text)
         if (
-            # upper bounds that take less time
+            # The first two are upper bounds of the ratio that take less time.
             matcher.real_quick_ratio() >= threshold
             and matcher.quick_ratio() >= threshold
             and matcher.ratio() >= threshold

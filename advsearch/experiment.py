@@ -84,13 +84,14 @@ class RunContext(ExitStack, Generic[Settings]):
         progress: Progress | None = None,
         resumed: Path | None = None,
     ) -> None:
-        """Begin to measure the time; the run directory is created by the first access to
-        `run`.
+        """Start to measure the time of an experiment.
+
+        The run directory is created later, at the first access to `run`.
 
         Args:
-            config: the settings of the experiment.
-            progress: is told how far it is; None for nobody.
-            resumed: folder of the run to go on with; None for a new run.
+            config: settings of the experiment.
+            progress: object that displays the progress; None for no display.
+            resumed: folder of the run to continue; None for a new run.
         """
         super().__init__()
         self.config = config
@@ -152,9 +153,13 @@ class RunContext(ExitStack, Generic[Settings]):
     def result(self, result_type: type[ResultType], **fields: Any) -> ResultType:
         """Return a result with the given fields and those that every result has.
 
-        These are what the settings state (`SHARED_RESULT_FIELDS`), the run, how it
-        ended, the command line, and the seconds. To `seconds` among the given fields, which
-        has those of stages, the total is added.
+        Every result has values of the settings (`SHARED_RESULT_FIELDS`), the path of
+        the run, how it ended, its command line, and its seconds.
+
+        Args:
+            result_type: class of the result.
+            fields: other fields by name. `seconds` may have the times of stages, to
+                which the total is added.
         """
         settings = self.config
         shared = {
@@ -182,11 +187,15 @@ class RunContext(ExitStack, Generic[Settings]):
 def run_and_save(
     function: Callable[[RunContext[Settings]], AnyResult], context: RunContext[Settings]
 ) -> AnyResult:
-    """Call the function of an experiment, and save its result, page and figure in the
-    directory of its run.
+    """Call the function of an experiment, and save its result.
 
-    If the function has not created the run through the context, it has saved its result
-    itself, and nothing is saved here.
+    The result, its page and its figure are written to the directory of the run. If the
+    function has not created a run through the context, it has saved the result itself,
+    for instance as a file `out`; then nothing is saved here.
+
+    Args:
+        function: function of the experiment.
+        context: its argument, with the settings.
     """
     with context:
         result = function(context)
@@ -205,11 +214,11 @@ def run_experiment(
 
     Args:
         config: settings of any experiment; `config.command` names it.
-        progress: is told how far it is.
-        resumed: the folder of a run to continue; None for a new run.
+        progress: object that displays the progress; None for no display.
+        resumed: folder of the run to continue; None for a new run.
 
     Raises:
-        InputError: a setting that the caller can correct; nothing is written then.
+        InputError: a setting is wrong; nothing is written then.
     """
     from advsearch.api.names import check_names  # imports scipy
 
@@ -240,20 +249,23 @@ def run_part(
     progress: Progress,
     run: Callable[..., Result] | None = None,
 ) -> Result:
-    """Return the result of a run that is a part of another one: start it in a folder,
-    continue it, or read its result if it has ended.
+    """Return the result of a run that is a part of another run.
+
+    The part is started, or continued if it was stopped; if it has ended, its result is
+    read. So a resumed run does not repeat its finished parts.
 
     Args:
-        folder: folder of the part; if it has begun, it goes on with its own settings.
-        config: settings for a part that has not begun.
-        progress: is told how far it is.
-        run: runs the experiment with settings; None for `run_experiment`.
+        folder: folder of the part.
+        config: settings for a new part. A part that was started has its own settings in
+            the folder.
+        progress: object that displays the progress.
+        run: function that runs an experiment with settings; None for `run_experiment`.
     """
     run = run or run_experiment
     is_started = is_run(folder) and (folder / CONFIG).is_file()
     if not is_started:
         return run(
-            # what lies there was left before the run began
+            # A folder without stored settings was left by a start that failed.
             config.model_copy(update={"run": str(folder), "overwrite": True}),
             progress=progress,
         )
@@ -355,11 +367,11 @@ class Experiment(Generic[AnyResult]):
         """Run the experiment with settings, and save its result.
 
         Args:
-            config: the settings.
-            progress: is told how far it is.
-            resumed: folder of the run to go on with; None for a new run.
-            arguments: further arguments of the experiment's function
-                (`python_arguments`).
+            config: settings of the experiment.
+            progress: object that displays the progress; None for no display.
+            resumed: folder of the run to continue; None for a new run.
+            arguments: objects that Python callers passed and that are no settings, such
+                as a scene in memory, for the function of the experiment.
         """
         return run_and_save(
             partial(self.function, **arguments), RunContext(config, progress, resumed)
@@ -378,8 +390,10 @@ class Experiment(Generic[AnyResult]):
         return self._make_python_function()
 
     def _make_python_function(self) -> Callable[..., Any]:
-        """Return the function of the experiment for Python callers, whose keywords are
-        the settings.
+        """Make the function with which Python callers run the experiment.
+
+        Its keywords are the settings. It has the name, the documentation and the
+        signature that `help` displays for the experiment.
         """
         # only Python callers need it; imports torch
         from advsearch.api.keywords import make_config, with_settings_signature
@@ -417,11 +431,13 @@ class Experiment(Generic[AnyResult]):
     def _make_signature(
         self, object_parameters: Mapping[str, inspect.Parameter]
     ) -> inspect.Signature:
-        """Return the signature of the function for Python callers, with `**settings`
-        for the settings.
+        """Return the signature of the function for Python callers.
+
+        It has the settings that may be passed by position, the parameters for objects,
+        `resume`, `progress`, and `**settings` for all other settings.
 
         Args:
-            object_parameters: parameters, by name, that take objects and are no settings
+            object_parameters: by name, parameters that take objects and are no settings
                 (`_find_python_arguments`).
         """
         make = inspect.Parameter
@@ -446,8 +462,9 @@ class Experiment(Generic[AnyResult]):
         return inspect.Signature(parameters, return_annotation=self.result.__name__)
 
     def _find_python_arguments(self) -> dict[str, inspect.Parameter]:
-        """Return the parameters, by name, by which Python callers may pass objects that
-        no setting can have.
+        """Return the parameters for objects that only Python callers can pass, by name.
+
+        A setting cannot hold such objects, since it is stored in a file.
         """
         if not self.python_arguments:
             return {}
@@ -478,11 +495,11 @@ def experiment(
     """Make an `Experiment` of a function ``(context: RunContext[NameConfig]) ->
     NameResult``.
 
-    Settings and result are read from the annotations; of a union of results the first
-    is the main one.
+    The classes of its settings and of its result are read from the annotations. If the
+    result is a union of classes, the first one is used.
 
     Args:
-        examples: lines of a shell for its help, without `advsearch`.
+        examples: examples for the help: lines of a shell, without `advsearch`.
         attributes: other attributes of `Experiment`.
     """
 

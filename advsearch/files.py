@@ -32,11 +32,10 @@ PATH_ENDINGS = (".csv", ".txt", ".tum", ".kitti")
 
 
 def split_paths(name: str) -> list[str]:
-    """Return the two parts of the name of a pair of paths, that of the camera and that
-    of the object; any other name as one part.
+    """Split the name of a pair of motion paths into those of the camera and the object.
 
     Pairs are ``camera.csv+object.csv``, ``approach+object.csv`` and
-    ``camera.csv+orbit``.
+    ``camera.csv+orbit``. Any other name is returned as a single part.
     """
     first, _, second = name.partition("+")
     if not second or os.path.isfile(name):  # the name of a file may have a + in it
@@ -44,7 +43,8 @@ def split_paths(name: str) -> list[str]:
     is_camera_file, is_object_file = (
         part.lower().endswith(PATH_ENDINGS) for part in (first, second)
     )
-    # beside the object's file, the camera's path may be a built-in one, by its name
+    # The first part may be the name of a built-in path of the camera, such as
+    # "approach"; then the second part has to be a file.
     may_be_camera_name = "/" not in first
     is_pair = is_camera_file or (is_object_file and may_be_camera_name)
     return [first, second] if is_pair else [name]

@@ -32,10 +32,14 @@ class Interrupts:
         self._last = -DUPLICATE_SECONDS
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        """Handle a signal: count it, and raise KeyboardInterrupt unless nothing is left
-        to interrupt (`ended`).
+        """Count an interrupt, and raise KeyboardInterrupt.
 
-        A signal soon after another one is the same Ctrl-C, and is ignored.
+        Nothing is raised once all work is done (`ended`). A signal soon after another
+        one comes from the same Ctrl-C, and is ignored.
+
+        Args:
+            number: number of the signal.
+            frame: frame that was interrupted; both are what Python passes to handlers.
         """
         previous = self._last
         self._last = time.monotonic()
@@ -70,16 +74,18 @@ INTERRUPTS = Interrupts()  # those of this process
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Inside the block, make sure that an interrupt ends it, even if some code has
-    swallowed it; the caller handles it.
+    """Make sure that an interrupt ends the block, even if some code has caught it.
+
+    The caller handles the KeyboardInterrupt.
 
     Raises:
-        KeyboardInterrupt: one came inside the block, or waits at its end. It replaces
-            any error, which may have come of it.
+        KeyboardInterrupt: an interrupt came inside the block. It replaces any other
+            error, since the interrupt may have caused that error.
     """
     handler = signal.getsignal(signal.SIGINT)
     is_main_thread = threading.current_thread() is threading.main_thread()
-    # in a notebook Python's own handler is in place: ours takes over, to count
+    # In a notebook Python's own handler is installed. Ours replaces it inside the
+    # block, since it counts interrupts.
     replaces_handler = is_main_thread and handler is signal.default_int_handler
     if replaces_handler:
         INTERRUPTS.mark_handled()
@@ -101,15 +107,16 @@ def interruptible() -> Iterator[None]:
 
 
 def end_at_the_second() -> None:
-    """Let a second Ctrl-C end this process at once, wherever it is, also in native
-    code.
+    """Let a second Ctrl-C end this process at once, also inside native code.
 
-    A thread waits for the signals. What is stored is kept, as when the process is
-    killed. Call it in the main thread, once.
+    Python handles signals only between its own instructions, so that a thread waits for
+    them instead. Stored results remain, as when the process is killed. Call this
+    function once, in the main thread.
     """
     reading_end, writing_end = socket.socketpair()
     writing_end.setblocking(False)
-    # Python's signal handler in C writes the number of each signal there at once
+    # Python's signal handler in C writes the number of each signal to this socket at
+    # once, without waiting for Python code.
     signal.set_wakeup_fd(writing_end.fileno(), warn_on_full_buffer=False)
     threading.Thread(
         target=_wait_for_second,
@@ -121,13 +128,14 @@ def end_at_the_second() -> None:
 
 
 def _wait_for_second(reading_end: socket.socket, writing_end: socket.socket) -> None:
-    """End the process at the second Ctrl-C; the body of a thread that waits for
-    signals.
+    """Wait for signals, and end the process at the second Ctrl-C.
+
+    This is the main function of a thread.
 
     Args:
         reading_end: socket from which the numbers of signals are read.
-        writing_end: the other end, to which they are written; it is only kept open
-            here.
+        writing_end: the other end, to which they are written. This reference keeps it
+            open as long as the thread runs.
     """
     first_time: float | None = None  # of the first Ctrl-C
     while True:

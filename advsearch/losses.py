@@ -122,11 +122,10 @@ def targeted_dlr(logits: Tensor, target: Labels) -> Tensor:
 
 
 def total_variation(colors: Tensor) -> Tensor:
-    """Return the mean step from a pixel to its right and lower neighbors, (N,), in
-    sRGB.
+    """Compute the mean difference of a pixel from its right and lower neighbors, (N,).
 
-    After Sharif et al. 2016, section 5.2.2, whose sum over pixels is a mean here, so
-    that a weight means the same at every resolution.
+    It is the total variation of Sharif et al. 2016, section 5.2.2, in sRGB. Their sum
+    over pixels is a mean here, so that a weight means the same at every resolution.
 
     Args:
         colors: (N, h, w, 3) sRGB in [0, 1], a texture or pictures; or (N, h, w, 4), of
@@ -142,7 +141,8 @@ def non_printability(colors: Tensor, palette: Tensor | None = None) -> Tensor:
     product of distances to all printable colours: it is zero at the same colours.
 
     Args:
-        colors: as for `total_variation`.
+        colors: (N, h, w, 3) sRGB in [0, 1], a texture or images; or (N, h, w, 4), of
+            which only pixels with a last channel over 0 count.
         palette: (P, 3) sRGB in [0, 1], the colours that can be printed; None for the
             125 of `printable`.
     """
@@ -158,12 +158,19 @@ nps = non_printability  # its usual short name
 
 
 def check_direction(objective: object, *, targeted: bool) -> None:
-    """Check that a loss of this module, or of torch, rises where a search is to go.
+    """Check that a loss function fits a search with or without a target.
 
-    Any other objective passes.
+    A search maximises its objective. With a target, the loss must rise towards the
+    target, and most losses fall towards it. Only losses of this module and of torch are
+    checked; any other objective passes.
+
+    Args:
+        objective: the loss function.
+        targeted: whether the search has a target.
 
     Raises:
-        InputError: it needs a target and there is none, or falls towards the target.
+        InputError: the loss needs a target and there is none, or it does not rise
+            towards the target.
     """
     function = getattr(objective, "func", objective)  # of functools.partial
     module = str(getattr(function, "__module__", None) or type(function).__module__)
@@ -197,17 +204,17 @@ def check_direction(objective: object, *, targeted: bool) -> None:
 
 
 def _by_label(loss: Callable[..., Tensor], logits: Tensor, labels: Labels) -> Tensor:
-    """Return a loss (N,) of logits (N, C) for their labels.
+    """Compute a loss of logits for their labels, (N,).
 
     Args:
-        loss: objective function (logits, images, label set) -> (N,) that does not look
-            at the images: it gets the logits in their place.
+        loss: objective function (logits, images, label set) -> (N,). It does not use
+            the images, so that it gets the logits in their place.
         logits: (N, C).
-        labels: (N,) or (1,) int64, one for each row or for all; or the indices of a
-            label set, any of which counts, for all rows.
+        labels: (N,) or (1,) int64, a label for each row or one for all rows; or the
+            indices of a label set for all rows, any of which is right.
 
     Raises:
-        InputError: labels are something else, or their number is another one.
+        InputError: the labels have another type, or do not fit the number of rows.
     """
     if not isinstance(labels, (Tensor, Sequence)):
         raise InputError(

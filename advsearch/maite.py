@@ -47,8 +47,11 @@ class _MaiteNetwork(nn.Module):
             model.eval()
 
     def forward(self, images: Tensor) -> Any:
-        """Return what the model says of images (N, 3, H, W): scores (N, classes), or
-        for detection a mapping of tensors for each image.
+        """Run the model on images (N, 3, H, W).
+
+        Returns:
+            Scores (N, classes); for detection a list with a mapping for each image, of
+            "boxes", "labels" and "scores".
         """
         targets = list(self.model(list(images)))
         if len(targets) != len(images):
@@ -64,9 +67,9 @@ class _MaiteNetwork(nn.Module):
 def _to_detections(target: Any) -> dict[str, Tensor]:
     """Convert an `ObjectDetectionTarget` to boxes (n, 4), labels (n,) and scores (n,)."""
     scores = torch.as_tensor(target.scores).float()
-    if scores.ndim == 2:  # of every class; `labels` has the likeliest
+    if scores.ndim == 2:  # (n, classes); `labels` has the class with the best score
         n_classes = scores.shape[1]
-        # `amax` needs a class
+        # `amax` fails without a class
         scores = scores.amax(dim=1) if n_classes else scores.new_zeros(len(scores))
     boxes = torch.as_tensor(target.boxes).float().reshape(-1, 4)
     return {
@@ -84,24 +87,24 @@ def load_model(
     labels: Any = None,
     **options: Any,
 ) -> models.Model:
-    """Convert a model of MAITE, an image classifier or an object detector, to a
-    `Model`.
+    """Convert an image classifier or an object detector of MAITE to a `Model`.
 
-    It is called with a list of images (3, H, W), float32 tensors. MAITE does not state
-    the size and the range of values that a model takes: give `input_size` and
-    `value_range`. If its output is no tensor with a graph back to the images, only
+    The MAITE model is called with a list of images, float32 tensors (3, H, W). It does
+    not state the size and the range of values of its images, so pass `input_size` and
+    `value_range`. If its output is not a tensor with a graph back to the images, only
     searches without gradients work (`policy="random"`, `"cmaes"`).
 
     Args:
-        model: called with a sequence of images; returns for each its scores (classes,),
-            or an `ObjectDetectionTarget`.
-        input_size: size, or (height, width), in pixels.
+        model: MAITE model. It returns for each image its scores (classes,), or an
+            `ObjectDetectionTarget`.
+        input_size: width and height, or (height, width), in pixels.
         task: "classification" or "detection".
-        labels: names by index; None takes `index2label` of its metadata.
-        options: the others of `advsearch.load_model`, such as `value_range` and `mean`.
+        labels: names of the classes by index; None for `index2label` of its metadata.
+        options: other options of `advsearch.load_model`, such as `value_range` and
+            `mean`.
 
     Raises:
-        InputError: another task, or names with gaps.
+        InputError: the task is another one.
     """
     if task not in ("classification", "detection"):
         raise InputError(
@@ -172,11 +175,21 @@ class Scenes:
         spp: int = 64,
         seed: int = 0,
     ) -> None:
-        """Sample `count` configurations of the controls; arguments are those of the
-        class.
+        """Sample `count` configurations of the controls.
+
+        Args:
+            scene: the scene, or its name or file.
+            controls: controls whose parameters are sampled.
+            count: number of images.
+            labels: names of the classes by index.
+            label: name of the object's class; None for that of the scene's object.
+            task: "classification" or "detection".
+            resolution: size of the images in pixels, or (height, width).
+            spp: samples per pixel.
+            seed: seed of the sampled configurations.
 
         Raises:
-            InputError: there is no such task, or no image is asked for.
+            InputError: the task is another one, or `count` is less than 1.
         """
         if task not in ("classification", "detection"):
             raise InputError(
@@ -211,12 +224,14 @@ class Scenes:
     def __getitem__(
         self, number: int
     ) -> tuple[Tensor, Tensor | Detections, dict[str, Any]]:
-        """Render the image of a configuration by its number, as MAITE's data sets
-        return it.
+        """Render the image of a configuration, as data sets of MAITE return it.
+
+        Args:
+            number: index of the configuration; negative ones count from the end.
 
         Returns:
-            The image (3, H, W) in [0, 1], its target, and its id with the values of the
-            parameters.
+            The image (3, H, W) in [0, 1], its target, and metadata: its id and the
+            values of the parameters.
         """
         # a range raises IndexError, which ends a loop over the images
         index = range(len(self))[number]
@@ -231,10 +246,11 @@ class Scenes:
         return image.permute(2, 0, 1).contiguous(), self._make_target(u), metadata
 
     def _make_target(self, u: Tensor) -> Tensor | Detections:
-        """Return the target of a configuration (d,): a one-hot vector of the right
-        class, or the boxes and classes of the visible things.
+        """Return the target of the image of a configuration u (d,).
 
-        Things that are of none of the classes are left out.
+        For classification it is a one-hot vector of the right class. For detection it
+        has the boxes, classes and scores (all 1) of the visible objects; objects of
+        none of the classes are left out.
         """
         right_class = self.right.indices[0]
         if self.task == "classification":

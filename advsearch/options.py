@@ -26,14 +26,18 @@ TASK_SEPARATOR = (
 
 
 def group_mitsuba_keys(controls: Mapping[str, object]) -> dict[str, object]:
-    """Return controls in which the one for Mitsuba's names has all of them:
-    ``{"mitsuba:KEY": RANGE}`` becomes ``{"mitsuba": {KEY: RANGE}}``.
+    """Collect all keys of Mitsuba's scene parameters in a single control.
 
-    A range of a single parameter becomes one of a control: ``{"pose.yaw": RANGE}``
-    becomes ``{"pose.yaw": {"yaw": RANGE}}``.
+    ``{"mitsuba:mug.bsdf.reflectance": RANGE}`` becomes ``{"mitsuba":
+    {"mug.bsdf.reflectance": RANGE}}``. A range of a single parameter of another control
+    gets the name of the parameter: ``{"pose.yaw": RANGE}`` becomes ``{"pose.yaw":
+    {"yaw": RANGE}}``.
+
+    Args:
+        controls: options or ranges by name of the control.
 
     Raises:
-        InputError: a key has no range, or two.
+        InputError: a key has no range, or has two.
     """
     plain = dict[str, object]()
     ranges = dict[str, object]()
@@ -60,8 +64,10 @@ def group_mitsuba_keys(controls: Mapping[str, object]) -> dict[str, object]:
 
 
 def _with_parameter(name: str, options: object) -> object:
-    """Return the options of a control; a range for the control "pose.yaw" becomes one
-    of the parameter "yaw".
+    """Return the options of a control, with a range stored under its parameter.
+
+    For the control "pose.yaw" the range [0, 1] becomes {"yaw": [0, 1]}. Other options
+    are returned unchanged.
     """
     _, dot, parameter = name.partition(".")
     is_class = ":" in name  # "package.module:Class", whose dot is of another kind
@@ -75,16 +81,16 @@ def _with_parameter(name: str, options: object) -> object:
 
 
 def format_things(things: object) -> str | None:
-    """Return things in a scene as the text that settings have:
-    ``car@12,3.5,heading=180; person@6,-2``.
+    """Return additional objects in a scene as the text of a setting.
 
-    Files are named by their absolute paths, so that a run may be resumed anywhere.
+    The text is, for example, ``car@12,3.5,heading=180; person@6,-2``. Paths of files in
+    it become absolute, so that a run may be resumed in any directory.
 
     Args:
-        things: a text, a mapping, or a list of such; None for none.
+        things: a text, a mapping, or a list of these; None for none.
 
     Raises:
-        InputError: it is something else.
+        InputError: the value has another type.
     """
     if isinstance(things, (list, tuple)):
         items = things
@@ -116,10 +122,13 @@ def _make_thing_absolute(thing: str) -> str:
 
 
 def _format_thing(thing: Mapping[str, Any]) -> str:
-    """Return a thing as text, ``OBJECT@X,Y,OPTION=VALUE``.
+    """Return an additional object as text, ``OBJECT@X,Y,OPTION=VALUE``.
+
+    Args:
+        thing: mapping with "object", "x", "y" and perhaps options such as "heading".
 
     Raises:
-        InputError: it has no object, or no place.
+        InputError: "object", "x" or "y" is missing.
     """
     required = ("object", "x", "y")
     if not thing.keys() >= {*required}:
@@ -144,20 +153,19 @@ def list_declared_options(kind: type[Any]) -> dict[str, Field[Any]]:
 def check_options(
     what: str, name: str, kind: type[Any], options: Mapping[str, object]
 ) -> None:
-    """Check that a dataclass has options of these names, and that the values are of
-    their types.
+    """Check the names of options of a dataclass, and the types of their values.
 
-    Ranges are checked by the class itself.
+    The class itself checks that values are in range.
 
     Args:
-        what: kind of what has the options, such as "policy", for messages.
-        name: name of the policy.
+        what: kind of the object with the options, such as "policy", for messages.
+        name: name of the object, such as "cmaes".
         kind: the dataclass.
         options: values by name.
 
     Raises:
         UnknownNameError: there is no such option.
-        InputError: a value is of another type.
+        InputError: a value has another type.
     """
     declared = list_declared_options(kind)
     for option, value in options.items():
@@ -171,8 +179,10 @@ def check_options(
 
 
 def _find_expected(option_type: str, value: object) -> str:
-    """Return what is expected of an option, if the value is something else; "" if it
-    fits, or the type is another than the four that are checked.
+    """Return a text with the expected type of an option if its value does not fit.
+
+    The result is "" if the value fits. Only the types float, int, bool and str are
+    checked; values of other types pass.
 
     Args:
         option_type: name of the type, such as "float".
@@ -181,7 +191,7 @@ def _find_expected(option_type: str, value: object) -> str:
     is_number = (
         isinstance(value, (int, float))
         and not isinstance(value, bool)
-        and abs(value) <= MAX_OPTION  # which NaN is not
+        and abs(value) <= MAX_OPTION  # false for NaN
     )
     if option_type == "float" and not is_number:
         return f"a finite number from {-MAX_OPTION} to {MAX_OPTION}"
@@ -207,7 +217,11 @@ def get_option_default(option: Field[Any]) -> Any:
 
 
 def _to_json(value: object) -> JsonValue:
-    """Return a value as a JSON value; None if it, or a part of it, has no such form."""
+    """Return a value as a JSON value.
+
+    The result is None if the value or a part of it has no JSON form, such as an
+    infinite number, a tensor, or None itself.
+    """
     if isinstance(value, Mapping):
         mapping = {
             name: _to_json(inner)
@@ -226,10 +240,10 @@ def _to_json(value: object) -> JsonValue:
 
 
 def to_setting(entry: Any) -> str | dict[str, JsonValue]:
-    """Return a policy or a task as a setting in a file: its name, with those options
-    that differ from their defaults.
+    """Return a policy or a task as a setting that a file can hold.
 
-    Options that have no JSON form are left out.
+    The setting is its name, or a mapping with its name and the options that differ from
+    their defaults. Options without a JSON form are left out.
     """
     name = str(entry.name)
     options = {}
@@ -254,16 +268,16 @@ def check_takes(what: str, function: Callable[..., object], *names: str) -> None
     """Check that a user's function takes arguments of these names by position.
 
     Args:
-        what: what is checked, for messages ("metrics: f").
+        what: setting and name of the function, for messages ("metrics: f").
         function: function to check.
         *names: names of the arguments.
 
     Raises:
-        InputError: it does not.
+        InputError: the function does not take them.
     """
     try:
         inspect.signature(function).bind(*names)
-    except ValueError:  # built in: nothing to look at
+    except ValueError:  # a built-in function without a signature cannot be checked
         return
     except TypeError as error:
         raise InputError(

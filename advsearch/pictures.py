@@ -50,7 +50,7 @@ def without_pillows_limit() -> Iterator[None]:
 def check_pixels(
     path: Path | str, width: int, height: int, limit: int = MAX_PIXELS
 ) -> None:
-    """Check that a picture has not too many pixels, before it is decoded.
+    """Check that an image does not have too many pixels, before it is decoded.
 
     Args:
         path: path of its file, for errors.
@@ -67,11 +67,11 @@ def check_pixels(
 
 
 def check_decodable(image: Image.Image, path: Path | str) -> None:
-    """Check that an opened picture can be decoded without too much time and memory.
+    """Check that an opened image can be decoded without too much time and memory.
 
     Raises:
-        FileFormatError: it has too many pixels or scans, or is of no format in
-            `FORMATS`.
+        FileFormatError: it has too many pixels, its format is not one of `FORMATS`, or
+            it is a JPEG with too many scans, each of which takes time to decode.
     """
     check_pixels(path, *image.size)
     # an MPO is a JPEG with a second picture
@@ -90,11 +90,11 @@ def check_decodable(image: Image.Image, path: Path | str) -> None:
 
 @contextlib.contextmanager
 def open_image(path: Path, limit: int) -> Iterator[Image.Image]:
-    """Open a picture file of at most `limit` bytes for the block, which may decode it.
+    """Open an image file of at most `limit` bytes for the block, which may decode it.
 
     Raises:
-        FileFormatError: it is missing, no ordinary file, no picture, too large or
-            damaged; also where decoding it in the block shows this.
+        FileFormatError: the file is missing, not an ordinary file, not an image, too
+            large or corrupt. Errors of decoding inside the block are converted too.
     """
     try:
         data = stored_files.read_bytes(path, "a picture file such as PNG", limit)
@@ -117,16 +117,19 @@ def encode_levels(levels: npt.NDArray[np.uint8]) -> bytes:
 
 
 def load_upright(path: Path, side: int) -> npt.NDArray[np.float32]:
-    """Read a picture as a viewer shows it, made smaller where its longest side has more
-    than `side` pixels.
+    """Read an image upright, and reduce it to a maximum size.
 
-    Transparency is ignored.
+    It is rotated as the camera noted in the file. Transparency is ignored.
+
+    Args:
+        path: path of the image file.
+        side: maximum of width and height in pixels; a larger image is made smaller.
 
     Returns:
         (H, W, 3) float32, display-referred in [0, 1], row 0 on top.
 
     Raises:
-        FileFormatError: as for `open_image` and `check_decodable`.
+        FileFormatError: the file is missing, not an image, too large or corrupt.
     """
     with open_image(path, MAX_FILE_BYTES) as image:
         check_decodable(image, path)
@@ -142,8 +145,15 @@ def load_upright(path: Path, side: int) -> npt.NDArray[np.float32]:
 
 
 def to_8bit_levels(image: Image.Image, *, alpha: bool) -> npt.NDArray[np.uint8]:
-    """Return the colors of a decoded picture in 8 bits, (H, W, 3); with alpha (H, W,
-    4), opaque where the picture has none.
+    """Return the colors of a decoded image in 8 bits.
+
+    Args:
+        image: image of any mode; "F" is a gray image with white at 1.0, and modes that
+            begin with "I" are gray with white at 65535.
+        alpha: whether to return the alpha channel. An image without one is opaque.
+
+    Returns:
+        (H, W, 3) uint8, or (H, W, 4) with alpha.
     """
     is_float = image.mode == "F"
     is_16bit = image.mode.startswith("I")
@@ -165,8 +175,10 @@ def to_8bit_levels(image: Image.Image, *, alpha: bool) -> npt.NDArray[np.uint8]:
 
 
 def _count_scans(image: Image.Image) -> int:
-    """Return how many scans the file of a JPEG has; each may take as long to decode as
-    a picture. The file stays at its position.
+    """Count the scans in the file of a JPEG.
+
+    A progressive JPEG has several, and each may take as long to decode as an image. The
+    position in the file is restored.
     """
     file = getattr(image, "fp", None)
     if file is None:  # decoded already

@@ -29,14 +29,15 @@ class Progress(Protocol):
         hint: str = "",
         at_most: bool = False,
     ) -> None:
-        """End the stage before and begin another; by default this does nothing.
+        """End the previous stage and begin another; by default this does nothing.
 
         Args:
-            name: what is being done, in a user's words: "searching", say.
-            total: steps that it has; None where nothing counts them.
-            hint: what it consists of, and in backticks the setting that shortens it:
-                "40 pictures; lower `steps`".
-            at_most: `total` is an upper bound: the stage may end before.
+            name: name of the stage for the user, such as "searching".
+            total: number of its steps; None if they are not counted.
+            hint: what the stage consists of, and in backticks the setting that makes it
+                shorter, such as "40 pictures; lower `steps`".
+            at_most: whether `total` is an upper bound, so that the stage may end
+                earlier.
         """
         return
 
@@ -79,9 +80,12 @@ class Stages:
         """End the current stage, and begin another.
 
         Args:
-            name: name under which its seconds are counted; those of one name add up.
-            title: what the user reads: `name` of `Progress.stage`.
-            total, hint, at_most: as for `Progress.stage`.
+            name: name under which its seconds are stored. Stages of the same name add
+                up.
+            title: name of the stage for the user, such as "searching".
+            total: number of its steps; None if they are not counted.
+            hint: what the stage consists of, and the setting that makes it shorter.
+            at_most: whether `total` is an upper bound.
         """
         self.end()
         self._name = name
@@ -132,15 +136,17 @@ so far that they are at least.
 def open_progress(
     requested: ProgressOption, written: Callable[[str], str] = str
 ) -> AbstractContextManager[Progress]:
-    """Return the progress that a call asked for, to be used in a `with` block.
+    """Return an object that displays progress, to be used in a `with` block.
 
     Args:
-        requested: see `ProgressOption`.
-        written: turns a text that names settings into how the reader writes them, such
-            as flags.
+        requested: True for a display in a notebook, a terminal or a stream of lines;
+            None for bars in a terminal only; False for no display; or an object with
+            the methods of `Progress`, which is returned.
+        written: function that replaces settings in a text, such as "`steps`", by the
+            form in which the reader writes them, such as "--steps".
 
     Raises:
-        InputError: something else was asked for.
+        InputError: `requested` is something else.
     """
     if requested not in (None, True, False):
         if not callable(getattr(requested, "stage", None)):
@@ -154,7 +160,8 @@ def open_progress(
         return NotebookProgress(written)
     stream = sys.stderr  # None in a process without a terminal or a pipe
     if requested is not False and stream is not None and stream.isatty():
-        # the stream of the terminal itself, since a `Screen` would escape the bars
+        # A `Screen` around the terminal would escape the control characters of bars, so
+        # they are written to the stream inside of it.
         return BarProgress(getattr(stream, "stream", stream), written)
     if requested and stream is not None:
         return LineProgress(stream, written)
@@ -186,12 +193,13 @@ class LineProgress:
         written: Callable[[str], str] = str,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Write lines to a stream.
+        """Display progress as lines of text.
 
         Args:
-            stream: the stream.
-            written: turns settings that texts name into how the reader writes them.
-            clock: returns seconds; another one in tests.
+            stream: stream to which the lines are written.
+            written: function that replaces settings in a text, such as "`steps`", by
+                the form in which the reader writes them, such as "--steps".
+            clock: function that returns the time in seconds; tests pass another one.
         """
         self._stream = stream
         self._format_names = written
@@ -203,7 +211,7 @@ class LineProgress:
         self._info = ""
         self._total: int | None = None
         self._printed_at: float | None = None  # None: the stage was not announced yet
-        self._at_most = False
+        self._at_most = False  # whether `_total` is an upper bound
         self._done = 0
         self._stage_started = clock()
 
@@ -215,7 +223,7 @@ class LineProgress:
         hint: str = "",
         at_most: bool = False,
     ) -> None:
-        """See `Progress.stage`."""
+        """Begin another stage; its first line is printed when it has lasted a while."""
         with self._lock:
             self._name = name
             self._total = total
@@ -256,8 +264,9 @@ class LineProgress:
                 self._print(f"{self._name}: {self._format_state()}")
 
     def _format_state(self) -> str:
-        """Return how far it is: ``12 of at most 40, 10 s, at most 25 s left, best
-        0.31``.
+        """Return the state of the stage as text.
+
+        An example is ``12 of at most 40, 10 s, at most 25 s left, best 0.31``.
         """
         done = self._done
         total = self._total
@@ -270,8 +279,8 @@ class LineProgress:
             texts.append(f"{done} done")
         times = _seconds(elapsed)
         if total and 0 < done < total:
-            # most stages with an upper bound end long before it: of these nothing is said
-            # of what is left below a tenth
+            # Most stages with an upper bound end long before it. So the remaining time
+            # is only printed after a tenth of the steps.
             is_unsure = self._at_most and 10 * done < total
             if not is_unsure:
                 times += f", {limit}{_seconds(elapsed / done * (total - done))} left"
@@ -331,10 +340,14 @@ class BarProgress:
     """
 
     def __init__(self, terminal: IO[str], written: Callable[[str], str] = str) -> None:
-        """Show bars in a terminal; `written` turns settings that texts name into how
-        the reader writes them.
+        """Display progress as bars in a terminal.
+
+        Args:
+            terminal: stream of the terminal.
+            written: function that replaces settings in a text, such as "`steps`", by
+                the form in which the reader writes them, such as "--steps".
         """
-        # late, so that --help answers at once
+        # imported late, so that --help answers at once
         from rich import progress as bars
         from rich.console import Console
 
@@ -359,14 +372,22 @@ class BarProgress:
         hint: str = "",
         at_most: bool = False,
     ) -> None:
-        """See `Progress.stage`: the bar of the stage before is full now, and only the
-        newest bars stay visible.
+        """End the previous stage and begin another with a new bar.
+
+        The bar of the previous stage becomes full. Only the newest `MAX_BARS` bars stay
+        visible.
+
+        Args:
+            name: name of the stage for the user, such as "searching".
+            total: number of its steps; None if they are not counted.
+            hint: what the stage consists of, printed above the bars.
+            at_most: whether `total` is an upper bound.
         """
         if self.bars.tasks:
             last_bar = self.bars.tasks[-1]
             steps = max(last_bar.completed, 1)
             self.bars.update(last_bar.id, total=steps, completed=steps)
-        # one less than there may be, since another one is added below
+        # Hide all but the last MAX_BARS - 1, since another bar is added below.
         for bar in self.bars.tasks[: -(MAX_BARS - 1)]:
             self.bars.update(bar.id, visible=False)
         if hint:

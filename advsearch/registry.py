@@ -45,11 +45,15 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
     imports: bool = False
 
     def __getitem__(self, name: str) -> Entry:
-        """Return an entry, imported if it is not yet.
+        """Return the entry of a name, and import it if that was not done yet.
+
+        Args:
+            name: name of a built-in entry or of an installed entry point, or
+                "package.module:Class".
 
         Raises:
-            InputError: it cannot be imported, is something else, or is code that only a
-                file names (`check_import`).
+            InputError: the entry cannot be imported or has the wrong type, or only a
+                file names this code and the user has not allowed it (`check_import`).
         """
         if self.names_class(name):
             return self._import_class(name)
@@ -65,7 +69,8 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         """Import "package.module:Class" from the Python path or the current directory.
 
         Raises:
-            InputError: it must not be imported, cannot be, or is something else.
+            InputError: the class must not or cannot be imported, or it is no entry of
+                this registry.
         """
         check_import(name)
         try:
@@ -81,12 +86,12 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         return entry
 
     def __contains__(self, name: object) -> bool:
-        """Return whether there is an entry.
+        """Return whether there is an entry of this name.
 
-        Only a class that is named by its module is imported for that.
+        Nothing is imported for that, unless the name is "package.module:Class".
 
         Raises:
-            InputError: as for `__getitem__`, for such a class.
+            InputError: such a class cannot be imported.
         """
         if not isinstance(name, str):
             return False
@@ -122,8 +127,10 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         return usable
 
     def names_class(self, name: str) -> bool:
-        """Return whether a name is that of a class to import ("package.module:Class"),
-        and not that of an instance of an entry ("light:Key").
+        """Return whether a name stands for a class to import.
+
+        "package.module:Class" does. "light:Key" does not if "light" is an entry: then
+        it names an instance of that entry.
         """
         module, _, attribute = name.partition(":")
         is_class_name = attribute[:1].isupper() and attribute.isidentifier()
@@ -139,10 +146,10 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         return {point.name: point for point in entry_points(group=self.group)}
 
     def _load_installed(self, name: str) -> Entry:
-        """Import what an entry point of another package names.
+        """Import the object of an entry point of another package.
 
         Raises:
-            InputError: it can't be imported, or is something else than expected.
+            InputError: the object cannot be imported, or has the wrong type.
         """
         point = self._installed[name]
         where = f"entry point {name} = {point.value} of group {self.group}"

@@ -84,17 +84,18 @@ IntArray = npt.NDArray[np.int64]
 
 
 def make_table(rows: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
-    """Return the rows of a sweep as a table: factors, whether the model was right, and
-    units.
+    """Make a table of factors and right predictions from the rows of a sweep.
 
     Args:
-        rows: rows of a sweep (`runs.tables.make_sweep_frame`); a prediction that was
+        rows: rows of a sweep (`runs.tables.make_sweep_frame`). A prediction that was
             not judged counts as not right.
-        names: names of parameters; those that vary, and that all rows have, become
-            factors.
+        names: names of parameters. A parameter becomes a factor if it varies and all
+            rows have a value of it.
 
     Returns:
-        The table as the module describes it, with `outcome` if rows have it.
+        A column for each factor, "correct" (whether the prediction is right), "unit"
+        (rows of one unit may depend on each other), and "outcome" if the rows have it.
+        `attrs["units"]` has the units of measurement by factor.
     """
     columns = dict[str, pd.Series]()
     units = dict[str, str]()
@@ -102,7 +103,7 @@ def make_table(rows: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
         column = rows[name]
         has_names = column.dtype == "category"
         if has_names:
-            # in alphabetical order, whatever order the rows came in
+            # alphabetical, so that the order of the rows does not change the result
             column = column.cat.set_categories(sorted(column.unique()))
         if column.nunique() > 1 and not column.isna().any():
             columns[name] = column
@@ -122,8 +123,9 @@ def is_in_view(rows: pd.DataFrame) -> Mask:
 
 
 def count_wrong_outcomes(rows: pd.DataFrame) -> dict[str, int] | None:
-    """Return how many rows that are not right have each outcome (`Outcome`), by name;
-    None if there are none.
+    """Count the wrong rows by their outcome, such as "missed" or "wrong class".
+
+    The result is None if the rows have no outcomes, or none is wrong.
     """
     if "outcome" not in rows:
         return None
@@ -158,12 +160,12 @@ def count_per_unit(table: pd.DataFrame) -> tuple[FloatArray, FloatArray]:
 
 
 def merge_repeats(table: pd.DataFrame) -> pd.DataFrame:
-    """Return a table in which units with a row of the same configuration are one unit.
+    """Merge units that have a row with the same configuration.
 
-    Such rows are the same draw, made twice, if independent draws are never the same by
-    chance. That is so if some factor is a number with at least half as many values as
-    there are rows. Otherwise the table stays: values of a grid, and names, repeat in
-    independent draws.
+    Such rows are no independent samples, but the same sample twice, if equal samples do
+    not occur by chance. That is assumed if some numerical factor has at least half as
+    many values as there are rows. Otherwise the table is returned unchanged: values of
+    a grid, and names, also repeat in independent samples.
     """
     factors = list(table.attrs["units"])
     is_continuous = any(
@@ -172,7 +174,7 @@ def merge_repeats(table: pd.DataFrame) -> pd.DataFrame:
     )
     if not is_continuous:
         return table
-    # the same number for rows with the same values of all factors
+    # Rows with the same values of all factors get the same number.
     configuration = (
         table.groupby(factors, sort=False, observed=True).ngroup().to_numpy()
     )
@@ -186,10 +188,16 @@ def merge_repeats(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def find_connected(first: IntArray, second: IntArray) -> IntArray:
-    """Return the group (n,) of each row, where rows are in one group if they have the
-    same `first` or the same `second` number, or are linked by other rows.
+    """Find the connected components of rows that share a number.
 
-    Both are (n,) with numbers from 0. A group has the lowest `first` number in it.
+    Two rows are connected if they have the same `first` number or the same `second`
+    number, or if other rows connect them.
+
+    Args:
+        first, second: (n,) numbers from 0 of each row.
+
+    Returns:
+        The group of each row (n,), named by the lowest `first` number in it.
     """
     group = first
     # the lowest number of a group spreads from row to row until nothing changes
@@ -208,12 +216,14 @@ def find_connected(first: IntArray, second: IntArray) -> IntArray:
 def split_in_halves(
     table: pd.DataFrame, seed: int
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return two random halves of a table, with whole units: rules are chosen on the
-    first and tested on the second.
+    """Split a table into two random halves; no unit is split.
+
+    Rules are chosen on the first half and tested on the second. So the test does not
+    depend on the choice.
 
     Args:
-        table: the table.
-        seed: root seed of the choice.
+        table: table from `make_table`.
+        seed: root seed of the random split.
     """
     table = merge_repeats(table)
     units, unit_index = np.unique(table["unit"], return_inverse=True)
@@ -247,7 +257,11 @@ class RuleCondition:
     turn: float = 0.0
 
     def holds(self, table: pd.DataFrame) -> Mask:
-        """Return in which rows (n,) it holds."""
+        """Return in which rows the condition holds, (n,) bool.
+
+        A condition on an angle may hold from 350 to 10 degrees, through zero; then its
+        low bound is over its high bound.
+        """
         column = table[self.factor]
         if self.options is not None:
             return np.asarray(column.isin(self.options))
@@ -263,10 +277,10 @@ class RuleCondition:
 
     @property
     def arcs(self) -> tuple[tuple[float, float], ...]:
-        """The arcs of a full turn in which it holds, (start, end) in degrees; none for
-        a factor that is no angle.
+        """The arcs in which a condition on an angle holds, (start, end) in degrees.
 
-        With a `turn` of 180 there are two arcs, opposite each other.
+        With a `turn` of 180 the condition repeats after 180 degrees, so that there are
+        two arcs, opposite each other. A factor that is no angle has none.
         """
         if not self.turn:
             return ()
@@ -353,23 +367,28 @@ class CountedRule:
         return self.gap >= MIN_GAP and self.p_value <= SIGNIFICANCE
 
     def find_needed_factor(self) -> float | None:
-        """Return how many times as many rows, with the same rates of right ones, would
-        show the rule; None if no number of rows up to `MAX_NEEDED` would.
+        """Return by which factor the number of rows has to grow to show the rule.
+
+        The rates of right rows are assumed to stay the same. The result is None if no
+        number of rows up to `MAX_NEEDED` is enough.
         """
         has_gap = self.gap >= MIN_GAP
-        if not has_gap:  # no number of rows makes it larger
+        if not has_gap:  # the rates do not change, so more rows do not help
             return None
         factor = 1.0
         n_rows = len(self.inside) + len(self.elsewhere)
         while n_rows * factor <= MAX_NEEDED:
             if self._compute_p_value(factor) <= SIGNIFICANCE:
                 return factor
-            factor *= 1.05
+            factor *= 1.05  # precise to 5 %
         return None
 
     def _compute_p_value(self, factor: float) -> float:
-        """Return the p-value of the rule if there were `factor` times as many rows with
-        the same rates of right ones.
+        """Return the p-value of the rule for a larger number of rows.
+
+        Args:
+            factor: how many times as many rows there would be, with the same rates of
+                right rows; 1 for the present ones.
         """
         units = np.concatenate([self.inside["unit"], self.elsewhere["unit"]])
         is_right = np.concatenate([self.inside["correct"], self.elsewhere["correct"]])
@@ -399,12 +418,13 @@ class FoundRules:
 def find_rules(choosing: pd.DataFrame, counting: pd.DataFrame, seed: int) -> FoundRules:
     """Find rules under which the model is wrong more often.
 
-    Each rule is chosen on some rows and tested on others; the rows that it covers are
-    left out for the next rule. The search ends at the first rule that does not hold.
+    Each rule is chosen on some rows and tested on others. The rows that it covers are
+    left out when the next rule is chosen. The search ends at the first rule that the
+    test does not confirm.
 
     Args:
-        choosing: rows to choose rules on.
-        counting: rows to test rules on.
+        choosing: table of the rows on which rules are chosen.
+        counting: table of the rows on which rules are tested.
         seed: seed of the trees.
 
     Raises:
@@ -430,14 +450,20 @@ def find_rules(choosing: pd.DataFrame, counting: pd.DataFrame, seed: int) -> Fou
 
 
 def find_best_conditions(table: pd.DataFrame, seed: int) -> RuleConditions:
-    """Return the conditions with the best score (`ConditionScorer`), without those that
-    add little to it, and with adjusted bounds.
+    """Find the combination of conditions that selects wrong predictions best.
 
-    There are none if too few rows are left, or no conditions are better than chance.
+    Trees suggest combinations, and `ConditionScorer` scores them. From the best one,
+    conditions that add little are removed, and its bounds are adjusted. The result is
+    empty if too few rows are left, or if no combination is better than chance.
+
+    Args:
+        table: table of the rows.
+        seed: seed of the trees.
     """
     n_wrong = int((~table["correct"].to_numpy()).sum())
     min_rows = find_min_rows(table)
     has_both_answers = 0 < n_wrong < len(table)
+    # Both sides of a condition need `min_rows` rows.
     if len(table) < 2 * min_rows or not has_both_answers:
         return ()
     scorer = ConditionScorer(table, min_rows)
@@ -484,8 +510,10 @@ class ConditionScorer:
 def shorten_conditions(
     conditions: RuleConditions, scorer: ConditionScorer
 ) -> RuleConditions:
-    """Return conditions without those that add little to their score, left out one at
-    a time.
+    """Remove conditions that add little to the score, one at a time.
+
+    In each step the condition is removed whose removal costs least. The steps end when
+    the loss exceeds a fraction of the score and its own standard error.
     """
     table = scorer.table
     score = scorer.score(conditions)
@@ -498,7 +526,8 @@ def shorten_conditions(
         shorter = max(candidates, key=scorer.score)
         is_added = find_covered(shorter, table) & ~find_covered(conditions, table)
         n_added = int(is_added.sum())
-        # a loss within its standard error may be chance
+        # A loss below its standard error may be chance. It depends on the rows that the
+        # shorter conditions cover in addition.
         standard_error = math.sqrt(n_added * variance) / len(table)
         loss = score - scorer.score(shorter)
         if loss > max((1.0 - RETAINED_ACCURACY) * score, standard_error):
@@ -510,8 +539,10 @@ def shorten_conditions(
 def adjust_bounds(
     conditions: RuleConditions, scorer: ConditionScorer
 ) -> RuleConditions:
-    """Return conditions with bounds at which their score is larger: one bound is
-    adjusted after the other, and all of them several times.
+    """Adjust the bounds of conditions so that their score increases.
+
+    One bound after the other is moved to the best quantile of its factor (coordinate
+    descent). All of them are adjusted several times, since they depend on each other.
     """
     for _ in range(N_ADJUSTMENTS):
         for index in range(len(conditions)):
@@ -519,7 +550,8 @@ def adjust_bounds(
                 (*conditions[:index], condition, *conditions[index + 1 :])
                 for condition in list_adjusted(conditions[index], scorer.table)
             ]
-            # the present ones first: `max` returns the first of equally good ones
+            # The present conditions come first, since `max` returns the first of
+            # several with the best score.
             conditions = max([conditions, *adjusted], key=scorer.score)
     return conditions
 
@@ -527,11 +559,15 @@ def adjust_bounds(
 def list_adjusted(
     condition: RuleCondition, table: pd.DataFrame
 ) -> Iterator[RuleCondition]:
-    """Yield a condition with one of its bounds at other quantiles of the factor; none
-    for a condition on names.
+    """Yield copies of a condition with one bound moved to a quantile of its factor.
 
-    A tree chooses a bound together with those that it has chosen before; once these are
-    adjusted, another bound may be better.
+    A tree chooses each bound for the bounds that it chose before. After these were
+    adjusted, another bound may be better. A condition on names has no bounds, and
+    nothing is yielded for it.
+
+    Args:
+        condition: condition on a factor.
+        table: table with the values of the factor.
     """
     if condition.options is not None:
         return
@@ -582,8 +618,11 @@ class TreeColumn(NamedTuple):
         return values
 
     def to_factor(self, condition: RuleCondition) -> RuleCondition:
-        """Return a condition on the column as one on the factor: bounds of an angle are
-        measured from 0 again, and not from `zero`.
+        """Convert a condition on the column to a condition on its factor.
+
+        A column of an angle measures it from `zero`, such as 90 degrees, so that the
+        bounds of an arc through 0 degrees are ordered there. The bounds of the result
+        are measured from 0 degrees.
         """
         turn = self.full_condition.turn
         if not turn:
@@ -591,7 +630,7 @@ class TreeColumn(NamedTuple):
         low = max(condition.low, 0.0) + self.zero
         high = min(condition.high, turn) + self.zero
         end = high % turn
-        if end == 0.0:  # of an arc that ends with the full turn
+        if end == 0.0:  # the arc ends at the full turn, which modulo makes 0
             end = turn
         return replace(condition, low=low % turn, high=end)
 
@@ -599,7 +638,16 @@ class TreeColumn(NamedTuple):
 def find_candidates(
     table: pd.DataFrame, min_rows: int, seed: int
 ) -> Iterator[RuleConditions]:
-    """Yield the conditions that lead to the nodes of trees, each once."""
+    """Yield combinations of conditions that may describe wrong predictions.
+
+    They are the conditions on the paths from the roots of trees to their nodes. Equal
+    combinations are yielded once.
+
+    Args:
+        table: table of the rows.
+        min_rows: minimum number of rows in a node.
+        seed: seed of the trees.
+    """
     # the root has no conditions, and is left out
     yielded_conditions: set[RuleConditions] = {()}
     for tree, columns in grow_trees(table, min_rows, seed):
@@ -613,14 +661,14 @@ def find_candidates(
 def _list_rules_of_node(
     node: Mapping[TreeColumn, RuleCondition], factors: Iterable[str]
 ) -> Iterator[RuleConditions]:
-    """Yield the conditions that lead to a node, with one for each factor at most.
+    """Yield the conditions that lead to a node, with at most one for each factor.
 
-    A node may have conditions on several columns of one angle. A rule takes one of
-    them, so each is tried; its bounds are adjusted later.
+    A path may have conditions on several columns of the same angle. A rule can have
+    only one of them, so each is tried; its bounds are adjusted later.
 
     Args:
-        node: the conditions that lead to it, by column.
-        factors: names of all factors, in the order that conditions have.
+        node: conditions on the path to the node, by column.
+        factors: names of all factors; they determine the order of the conditions.
     """
     conditions_of_factor: dict[str, list[RuleCondition]] = {
         name: [] for name in factors
@@ -631,11 +679,12 @@ def _list_rules_of_node(
 
 
 def list_columns(table: pd.DataFrame) -> list[TreeColumn]:
-    """Return the columns of data for trees: one for each factor of numbers, and one for
-    each name of a factor of names.
+    """Return the columns of data for trees.
 
-    An angle that goes all the way round has further columns, each measured from another
-    zero (`ARCS`).
+    A numerical factor has one column, and a factor of names has one for each name. A
+    tree splits a column at a threshold, which cannot select an arc through 0 degrees.
+    So an angle that covers nearly a full turn has further columns, each measured from
+    another zero (`ARCS`).
     """
     columns = []
     for factor, unit in table.attrs["units"].items():
@@ -658,11 +707,18 @@ def list_columns(table: pd.DataFrame) -> list[TreeColumn]:
 def grow_trees(
     table: pd.DataFrame, min_rows: int, seed: int
 ) -> list[tuple[Any, list[TreeColumn]]]:
-    """Return trees of scikit-learn that predict whether the model is right, each with
-    the columns of its data.
+    """Fit trees of scikit-learn that predict whether the model is right.
 
-    They are one tree of all columns, those of a random forest, and one for each column
-    of an angle with a `turn`, of that column alone.
+    They are one tree on all columns, the trees of a random forest, and for each column
+    of an angle that is measured from another zero a tree on that column alone.
+
+    Args:
+        table: table of the rows.
+        min_rows: minimum number of rows in a leaf.
+        seed: seed of the trees.
+
+    Returns:
+        Each tree (`tree_` of scikit-learn) with the columns of its data.
     """
     make_tree = import_library("sklearn.tree").DecisionTreeClassifier
     make_forest = import_library("sklearn.ensemble").RandomForestClassifier
@@ -670,7 +726,7 @@ def grow_trees(
     data = np.stack([column.read_values(table) for column in columns], axis=1)
     is_right = table["correct"].to_numpy()
     shape = {"max_depth": MAX_CONDITIONS, "min_samples_leaf": min_rows}
-    random_state = seed % 2**32
+    random_state = seed % 2**32  # scikit-learn takes 32 bits
     single_tree = make_tree(**shape, random_state=random_state).fit(data, is_right)
     forest = make_forest(
         N_TREES, **shape, max_features=0.6, random_state=random_state
@@ -689,13 +745,13 @@ def grow_trees(
 def walk_tree(
     tree: Any, columns: list[TreeColumn]
 ) -> Iterator[dict[TreeColumn, RuleCondition]]:
-    """Yield the conditions that lead to each node of a tree, by column.
+    """Yield the conditions on the path to each node of a tree, by column.
 
-    The columns of the names of one factor share a condition, so that it stands under
-    the column without its name.
+    A factor of names has a column for each name, but a single condition, which lists
+    the names that remain. It is stored under the column with the name None.
 
     Args:
-        tree: `tree_` of scikit-learn.
+        tree: `tree_` of scikit-learn, which has arrays with the split of each node.
         columns: columns of its data, by index.
     """
     open_nodes: list[tuple[int, dict[TreeColumn, RuleCondition]]] = [(0, {})]

@@ -36,27 +36,26 @@ def assert_right(
     run: str | Path | None = None,
     **settings: Any,
 ) -> SuiteResult:
-    """Assert that a model is right in at least a share of the pictures that the
-    controls span.
+    """Assert that a model is right in at least a fraction of images.
 
-    Pictures are sampled until that is shown or refuted at the stated confidence.
+    The images are sampled from all that the controls can produce, until the claim is
+    shown or refuted at the stated confidence.
 
     Args:
-        object: object from `load_scene`, or the name of an object, or a file of one.
-        model: model from `load_model`, or what that takes.
-        at_least: the share, over 0 and under 1.
-        pictures: maximum number of pictures.
-        confidence: probability with which an assertion that passes, or fails, does so
-            rightly.
+        object: scene from `load_scene`, or the name or the file of an object.
+        model: model from `load_model`, or its name.
+        at_least: the fraction, over 0 and under 1.
+        pictures: maximum number of images.
+        confidence: probability that an assertion that passes or fails is correct.
         seed: root of all random numbers.
-        run: where the run is kept.
-        **settings: settings of a scene and its pictures, as `sweep` takes them, and
+        run: name or folder of the run; None for a new name.
+        **settings: settings of a scene and its images, as `sweep` takes them, and
             `controls`.
 
     Raises:
-        AssertionError: the share is shown to be smaller, or so many pictures do not
+        AssertionError: the fraction is shown to be smaller, or `pictures` images do not
             decide it.
-        InputError: anything that the caller can put right.
+        InputError: a setting is wrong.
     """
     __tracebackhide__ = True
     claim = {"claim": "right", "at_least": at_least, "pictures": pictures}
@@ -75,16 +74,20 @@ def assert_not_broken(
 ) -> SuiteResult:
     """Assert that a search finds no configuration that a model gets wrong.
 
-    That it finds none is no proof that there is none.
+    If it finds none, that is no proof that there is none.
 
     Args:
-        object, model, seed, run: as for `assert_right`.
-        **settings: as for `attack`: `controls`, `epsilon`, `steps`, `policy`, ...
+        object: scene from `load_scene`, or the name or the file of an object.
+        model: model from `load_model`, or its name.
+        seed: root of all random numbers.
+        run: name or folder of the run; None for a new name.
+        **settings: settings as `attack` takes them: `controls`, `epsilon`, `steps`,
+            `policy`, ...
 
     Raises:
-        AssertionError: the search found one that was verified, or the model is wrong on
-            the clean scene already.
-        InputError: anything that the caller can put right.
+        AssertionError: the search found a configuration that was verified, or the model
+            is wrong on the clean scene already.
+        InputError: a setting is wrong.
     """
     __tracebackhide__ = True
     claim = {"claim": "not_broken"}
@@ -106,18 +109,26 @@ def assert_no_worse(
     run: str | Path | None = None,
     **settings: Any,
 ) -> SuiteResult:
-    """Assert that a model is right at most so many percentage points less often than
-    another, on the same pictures.
+    """Assert that a model is not much worse than another on the same images.
+
+    It may be right at most `points` percentage points less often.
 
     Args:
-        object, model, pictures, confidence, seed, run, **settings: as for
-            `assert_right`.
+        object: scene from `load_scene`, or the name or the file of an object.
+        model: model from `load_model`, or its name.
         than: the other model.
         points: percentage points, over 0 and under 100.
+        pictures: maximum number of images.
+        confidence: probability that an assertion that passes or fails is correct.
+        seed: root of all random numbers.
+        run: name or folder of the run; None for a new name.
+        **settings: settings of a scene and its images, as `sweep` takes them, and
+            `controls`.
 
     Raises:
-        AssertionError: it is shown to be worse, or so many pictures do not decide it.
-        InputError: anything that the caller can put right.
+        AssertionError: the model is shown to be worse, or `pictures` images do not
+            decide it.
+        InputError: a setting is wrong.
     """
     __tracebackhide__ = True
     claim = {"claim": "no_worse", "points": points, "pictures": pictures}
@@ -127,17 +138,16 @@ def assert_no_worse(
 
 
 def assert_suite(suite: str | Path, **settings: Any) -> SuiteResult:
-    """Assert that all claims of a suite hold, or are as expected when it was last
-    updated.
+    """Assert that all claims of a suite hold, or have the results that it expects.
 
     Args:
-        suite: a YAML file.
+        suite: path of a YAML file with the claims.
         **settings: settings of `advsearch test`: `model`, `only`, `seed`, `fresh`,
             `seconds`, `run`, ...
 
     Raises:
-        AssertionError: one failed, or is undecided.
-        InputError: anything that the caller can put right.
+        AssertionError: a claim failed or is undecided.
+        InputError: a setting is wrong.
     """
     __tracebackhide__ = True
     # late: torch takes long to import
@@ -170,15 +180,19 @@ def _assert_claim(
 ) -> SuiteResult:
     """Run a suite with one claim, and assert that it holds.
 
+    A suite refers to scenes, models and controls by name. So the objects of the caller
+    get names in the suite, and are passed to it separately.
+
     Args:
-        claim: as in a suite, without models.
-        object: object of the scene, or the scene.
-        models: models by the settings that name them: "model" of the suite, and "than"
-            of the claim.
+        claim: the claim in the form of a suite's file, without models; "claim" is its
+            kind, such as "not_broken".
+        object: the scene, or the name or the file of its object.
+        models: models by setting: "model" of the suite, and perhaps "than" of the
+            claim.
         settings: settings of the suite.
         confidence: confidence of the test.
-        seed: seed of the images.
-        run: where the run is stored.
+        seed: root of all random numbers.
+        run: name or folder of the run; None for a new name.
 
     Raises:
         AssertionError: the claim is shown to be wrong, or undecided.
@@ -203,7 +217,8 @@ def _assert_claim(
                 claim_settings[key] = model_name
             if not isinstance(model, (str, Path)):
                 objects["model", model_name] = model
-        # what no file can name: the call itself, and models of this session
+        # The stored run lists what no file can name, so that nobody expects to repeat
+        # it from the file: the call itself, and models that exist in this session only.
         python_only = [
             workbench.PythonOnly("call", f"of {title}"),
             *(
@@ -245,11 +260,11 @@ def _describe_repeat() -> str:
 def _name_objects(
     object: str | Path | workbench.Scene, settings: Mapping[str, Any]
 ) -> tuple[dict[str, Any], dict[tuple[str, str], Any]]:
-    """Replace the objects among settings by names, as a file has them.
+    """Replace the scene and the controls among settings by names, as files have them.
 
     Args:
-        object: the scene, or the name of its object.
-        settings: may have controls that are objects.
+        object: the scene, or the name or the file of its object.
+        settings: settings, in which controls may be instances.
 
     Returns:
         The settings with names; and the objects (scene and controls) by (role, name),

@@ -37,12 +37,15 @@ _chosen: int | None = None
 
 
 def count_cores(quota: Path = _CPU_MAX) -> int:
-    """Return how many cores this process may use: those that it is pinned to, but no
-    more than a container's quota allows.
+    """Return how many cores this process may use.
+
+    They are the cores to which it is pinned, but no more than the quota of a container
+    allows.
 
     Args:
-        quota: the file with quota and period in microseconds (control groups, version
-            2).
+        quota: file of Linux's control groups (version 2) with two numbers: the
+            processor time that is allowed in each period, and the period, both in
+            microseconds.
     """
     if hasattr(os, "sched_getaffinity"):
         allowed = len(os.sched_getaffinity(0))
@@ -57,8 +60,11 @@ def count_cores(quota: Path = _CPU_MAX) -> int:
 
 
 def read_processor_name(cpu_info: Path = _CPU_INFO) -> str:
-    """Return the name of the processor, from Linux's description of it or else from
-    Python.
+    """Return the name of the processor; "unknown" if the system does not state it.
+
+    Args:
+        cpu_info: file in which Linux describes the processor. If it has no name, Python
+            is asked.
     """
     try:
         for line in cpu_info.read_text(encoding="utf-8", errors="replace").splitlines():
@@ -78,17 +84,17 @@ MAX_THREADS_PER_CORE = 4
 def configure(threads: int | None = None, *, rendering: bool = True) -> int:
     """Set the threads of Dr.Jit and torch, and return how many Dr.Jit gets.
 
-    Torch gets half as many, or all where nothing is rendered. For a library that is not
-    imported yet they are set when it is.
+    Torch gets half as many, or as many if nothing is rendered. For a library that is
+    not imported yet, the number takes effect when it is imported.
 
     Args:
-        threads: threads for Dr.Jit, `MAX_THREADS_PER_CORE` for each core at most; None
-            for what OMP_NUM_THREADS said when this module was imported, and without it
-            all cores of this process.
-        rendering: something is rendered.
+        threads: number of threads for Dr.Jit, at most `MAX_THREADS_PER_CORE` for each
+            core. None stands for the value of OMP_NUM_THREADS when this module was
+            imported; if it was not set, for the number of cores.
+        rendering: whether images are rendered.
 
     Raises:
-        InputError: fewer than one thread was asked for.
+        InputError: `threads` is less than 1.
     """
     global _chosen
     if threads is not None and threads < 1:
@@ -100,8 +106,8 @@ def configure(threads: int | None = None, *, rendering: bool = True) -> int:
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(for_torch)
     else:
-        # read when torch is imported later; not otherwise, because child processes
-        # would inherit it
+        # Torch reads the variable when it is imported. It is only set before that,
+        # because child processes inherit it.
         os.environ["OMP_NUM_THREADS"] = str(for_torch)
     if "drjit" in sys.modules:
         apply_to_drjit()
@@ -110,8 +116,9 @@ def configure(threads: int | None = None, *, rendering: bool = True) -> int:
 
 @contextmanager
 def restore_threads() -> Iterator[None]:
-    """After the block, give torch and Dr.Jit the threads that they had before it,
-    whatever is configured inside; the default, if they were imported inside.
+    """Restore the numbers of threads of torch and Dr.Jit after the block.
+
+    A library that was imported inside of the block gets the default number.
     """
     global _chosen
     chosen_before = _chosen

@@ -61,15 +61,18 @@ MAX_DARK_BRIGHTNESS = 0.35
 
 
 def draw_chart_page(title: str, paper: tuple[float, float], convert: Any) -> Figure:
-    """Draw the colour chart on a page, centered from left to right, for `write_sheets`.
+    """Draw the color chart on a page, centered horizontally.
+
+    The chart has 125 patches of color, and a black square outside of each corner, by
+    which a photograph of it is aligned.
 
     Args:
         title: title of the run.
         paper: (width, height) of the page in millimetres.
-        convert: the colour transform of PIL to the printer's profile; None for none.
+        convert: color transform of PIL to the printer's profile; None for none.
     """
     figure, axes = make_blank_page(paper)
-    # the upper left corner of the patches; the black squares are outside of it
+    # upper left corner of the patches, on the page
     left = (paper[0] - CHART_SIZE[0]) / 2.0
     top = MARGIN + 2.0 * CORNER_SIZE
 
@@ -103,12 +106,12 @@ def draw_chart_page(title: str, paper: tuple[float, float], convert: Any) -> Fig
 
 @with_checked_arguments
 def measured_palette(photograph: str | Path) -> Tensor:
-    """Measure the colors that a printer makes of the 125 of `printable`.
+    """Measure how a printer reproduces the 125 colors of `printable`.
 
     Args:
-        photograph: a file: the full chart that `advsearch export RUN --format print`
-            ends with, upright, in even light and without gloss, as the camera's usual
-            sRGB.
+        photograph: file of a photograph of the printed chart, the last page of
+            `advsearch export RUN --format print`. It has to be complete, upright, in
+            even light and without gloss, in the camera's usual sRGB.
 
     Returns:
         (125, 3), sRGB in [0, 1] where bare paper is white, for
@@ -140,7 +143,8 @@ def measured_palette(photograph: str | Path) -> Tensor:
         paper_light = [
             measure(center + crossing + paper_offsets) for crossing in crossings
         ]
-        # relative to the paper around it, so that uneven light cancels out
+        # The light is divided by that of the paper around the patch, so that uneven
+        # light cancels out. 1e-4 prevents a division by zero.
         colors.append(patch_light / np.maximum(np.mean(paper_light, axis=0), 1e-4))
     return torch.from_numpy(linear_to_srgb(np.array(colors, np.float32)))
 
@@ -151,17 +155,20 @@ def _make_pairs(values: Iterable[float]) -> Floats:
 
 
 def _find_corners(light: Floats, photograph: str | Path) -> Floats:
-    """Find the centers (4, 2) of the black squares, x and y in pixels, in reading
-    order.
+    """Find the centers of the four black squares at the corners of the chart.
 
-    They are the outermost of all dark, filled squares.
+    They are the outermost of all dark, filled squares, since other dark patches are
+    inside of the chart.
 
     Args:
-        light: (H, W, 3), linear.
-        photograph: its file, for messages.
+        light: light of the photograph, (H, W, 3), linear.
+        photograph: file of the photograph, for messages.
+
+    Returns:
+        (4, 2) x and y in pixels, in reading order.
 
     Raises:
-        InputError: there are no such squares.
+        InputError: the squares are not found.
     """
     not_found = InputError(
         f"{photograph}: expected a photograph of the whole colour chart, upright, with "
@@ -178,7 +185,8 @@ def _find_corners(light: Floats, photograph: str | Path) -> Floats:
         int(np.argmin(x_sign * x + y_sign * y))
         for y_sign, x_sign in itertools.product((1, -1), repeat=2)
     ]
-    # the four squares are of one size; the camera may see it a little askew
+    # The squares have the same size on paper. In perspective their areas may differ,
+    # but by no more than a factor of 3.
     areas = area[outermost]
     if len({*outermost}) < 4 or areas.max() > 3.0 * areas.min():
         raise not_found

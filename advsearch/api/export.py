@@ -180,12 +180,12 @@ def _load_object_scene(config: AttackConfig) -> Scene:
 def make_printable_pieces(run: str | Path, size: float) -> list[Piece]:
     """Return the printable pieces of the adversarial scene of a run of `attack`.
 
-    A patch is one piece. A texture has a piece for each connected part of the unwrapped
-    surface, stretched along both axes to the mean size of its texels on the object; the
-    distortion that remains within a piece is part of its name.
+    A patch is one piece. A texture has a piece for each connected part of its unwrapped
+    surface. A piece is scaled along both axes to the mean size of its texels on the
+    object. Texels within it may still differ in size; then its name says by how much.
 
     Args:
-        run: its name or folder.
+        run: name or folder of the run.
         size: longest side of the real object in millimetres.
 
     Raises:
@@ -251,8 +251,15 @@ def _make_texture_pieces(
 def _get_relative_patch_size(
     control: Control, config: AttackConfig, summary: AttackSummary
 ) -> float:
-    """Return the size of a patch as a fraction of the object's: what the search found,
-    what the settings fix, or the default.
+    """Return the size of a patch as a fraction of the object's size.
+
+    It is the size that the search found, if it searched for one; otherwise the size in
+    the settings, or the default.
+
+    Args:
+        control: control of the patch.
+        config: settings of the run.
+        summary: result of the run.
     """
     found = (summary.configuration or {}).get(f"{control.name}.size")
     size: Any
@@ -274,15 +281,17 @@ def _get_relative_patch_size(
 def _find_charts(
     name: str, texture: Float32Array, mesh: Mesh, faces: IntArray | None, scale: float
 ) -> Iterator[Piece]:
-    """Yield the charts of an unwrapped texture (its connected parts) as pieces, seen
-    from outside, the largest first.
+    """Yield the charts of an unwrapped texture as pieces, the largest first.
+
+    A chart is a connected part of the texture. Pieces are oriented as seen from outside
+    of the object, so that they can be glued on it.
 
     Args:
         name: name of the texture.
-        texture: (h, w, 3).
+        texture: image of the texture, (h, w, 3).
         mesh: mesh with the texture coordinates.
-        faces: indices of the faces whose parts are printed; None for all.
-        scale: millimetres per mesh unit.
+        faces: indices of the faces to print; None for all.
+        scale: millimetres per unit of the mesh.
     """
     uv_areas = compute_doubled_areas(mesh.uvs[mesh.faces].astype(np.float64))
     raster = rasterize_charts(mesh, (texture.shape[0], texture.shape[1]))
@@ -297,7 +306,7 @@ def _find_charts(
             continue
         texel_size, distortion = measured
         image = _extend_inside(texture[box], inside)
-        # texture coordinates that run backwards have negative areas
+        # A chart whose texture coordinates are mirrored has a negative signed area.
         is_mirrored = uv_areas[np.unique(raster.face[box][inside])].sum() < 0.0
         if is_mirrored:
             image = image[:, ::-1]
@@ -364,14 +373,16 @@ def _measure_texel_size(
 def _make_piece(
     name: str, image: Float32Array, pixel_size: tuple[float, float], inside: Mask | None
 ) -> Piece:
-    """Return a piece to print, with pixels divided until they are fine enough, and a
-    margin of bleed.
+    """Return a piece to print, with fine pixels and a margin.
+
+    Pixels are subdivided until they are no larger than `MAX_PIXEL_SIZE`. The edge is
+    repeated in a margin (bleed), so that no paper shows after an imprecise cut.
 
     Args:
         name: name of the piece.
         image: (h, w, 3), sRGB in [0, 1].
         pixel_size: (width, height) of a pixel in millimetres.
-        inside: (h, w) bool, what is cut out; None for the full image.
+        inside: (h, w) bool, the part that is cut out; None for the full image.
     """
     subdivisions = _count_subdivisions(max(pixel_size))
     if subdivisions > 1:
@@ -391,11 +402,11 @@ def _make_piece(
 
 
 def _count_subdivisions(pixel_size: float) -> int:
-    """Return into how many parts a pixel is divided along each axis, so that none is
-    larger than `MAX_PIXEL_SIZE`; 1 if it need not be.
+    """Return into how many parts a pixel is divided along each axis.
 
-    The number is odd, so that the center of a texel keeps its own color, and at most
-    `MAX_SUBDIVISIONS`.
+    No part is larger than `MAX_PIXEL_SIZE`, unless that needs more than
+    `MAX_SUBDIVISIONS` parts. The number is odd, so that one part is at the center of
+    the pixel and has exactly its color.
 
     Args:
         pixel_size: longer side of the pixel in millimetres.

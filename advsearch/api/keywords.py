@@ -126,11 +126,14 @@ ConfigType = TypeVar("ConfigType", bound=Config)
 
 
 def with_settings_signature(config: type[Config]) -> Callable[[Function], Function]:
-    """Return a decorator for a function that takes settings as `**settings`: it gives
-    the function their signature and docstring.
+    """Return a decorator that documents the settings of a function with `**settings`.
 
-    Every setting becomes a keyword with its declared default, and a line among the
-    arguments. A setting that is a parameter of the function already stays as it is.
+    Every setting becomes a keyword in the signature, with its default, and a line among
+    the arguments in the docstring. A setting that is a parameter of the function
+    already is not changed.
+
+    Args:
+        config: class with the settings.
     """
 
     def decorate(function: Function) -> Function:
@@ -152,7 +155,7 @@ def with_settings_signature(config: type[Config]) -> Callable[[Function], Functi
         signature = _Signature(
             parameters, return_annotation=declared_signature.return_annotation
         )
-        signature.short = declared_signature  # what `help` shows
+        signature.short = declared_signature  # `help` displays this shorter one
         wrapper = _wrap_call(function, signature)
         wrapper.__doc__ = _make_docstring(
             function.__doc__ or "", names, config.command, setting_lines
@@ -174,11 +177,14 @@ def _make_parameter(
 
 
 def _wrap_call(function: Function, signature: _Signature) -> Function:
-    """Return a function that checks its arguments, turns them into plain Python values
-    and calls another one, with the lock of the process and with progress.
+    """Wrap a function of the Python interface.
+
+    The wrapper checks the arguments, and converts numbers and arrays of numpy and torch
+    to Python's. Then it calls the function with a display of its progress, and with a
+    lock, so that two threads do not render at the same time.
 
     Args:
-        function: the function that is called.
+        function: function to call.
         signature: signature with all settings.
     """
     declared = signature.short.parameters
@@ -186,7 +192,7 @@ def _wrap_call(function: Function, signature: _Signature) -> Function:
     @wraps(function)
     def wrapper(*args: Any, **keywords: Any) -> Any:
         _check_call(function.__name__, signature, args, keywords)
-        # numbers of numpy and torch become Python's
+        # Values that are nested too deeply are not converted: the settings reject them.
         plain_keywords = {
             key: value
             if key in UNCONVERTED_ARGUMENTS or not is_shallow(value)
@@ -232,7 +238,7 @@ def _check_call(
     error = make_unexpected_error(name, keywords, list(signature.parameters))
     if error:
         raise error
-    # settings check their values themselves, but for `run`, which is checked here
+    # The configuration checks the values of settings. `run` is checked here already.
     declared = signature.short.parameters
     positional = dict(zip(declared, args, strict=False))
     check_types({**declared, **RUN}, {**positional, **keywords})
@@ -244,11 +250,17 @@ def _check_call(
 
 
 def _check_is_name(function_name: str, key: str, value: object) -> None:
-    """Check that a function that takes no object for a setting gets a name, or a
-    mapping with one.
+    """Check that a setting has a name, or a mapping with one, and is no object.
+
+    Most functions cannot pass objects on, such as a task of the user.
+
+    Args:
+        function_name: name of the function, for the message.
+        key: name of the setting, such as "task".
+        value: value of the setting.
 
     Raises:
-        InputError: it is an object.
+        InputError: the value is an object.
     """
     if not isinstance(value, (str, Mapping, type(None))):
         raise InputError(
@@ -284,9 +296,12 @@ def make_hint(field: str, kind: Any) -> str:
     """Return the annotation of a setting for Python callers.
 
     Args:
-        field: the setting.
-        kind: its declared type. For a text a path is allowed too, and for several
-            names a list.
+        field: name of the setting.
+        kind: its declared type. Where this allows a text, Python callers may also pass
+            a path, or a list of names if the setting takes several.
+
+    Returns:
+        Text such as "str | Path | None".
     """
     text = inspect.formatannotation(kind)
     text = text.replace("typing.", "").replace("NoneType", "None")
@@ -300,7 +315,7 @@ def make_hint(field: str, kind: Any) -> str:
     if optional:
         types = [optional[1], "None"]
     else:
-        # at each | that is not in brackets
+        # Split at each | that is not inside of brackets.
         types = re.split(r" \| (?![^\[]*\])", text)
     string_hint = "Path | Names" if field in PYTHON_LIST_SETTINGS else "str | Path"
     hints = []
@@ -320,9 +335,9 @@ def _make_docstring(
     """Complete the docstring of an experiment's function.
 
     Args:
-        text: its own docstring: what it does, and arguments that `SHARED_ARGUMENTS`
-            does not have.
-        names: names of its own arguments.
+        text: docstring of the function. It says what the function does, and describes
+            arguments that are not in `SHARED_ARGUMENTS`.
+        names: names of the function's arguments that are no settings.
         command: command of the experiment.
         setting_lines: a line for each setting.
     """
@@ -332,7 +347,7 @@ def _make_docstring(
             "\n\nAll other arguments are the settings of `advsearch "
             f"{command}`. {RUN_STORED}"
         )
-    # "NAME: text", which may go on in further lines
+    # An entry is "NAME: text", and the text may continue on further lines.
     entries = re.split(r"(?m)^(?=\w+: )", textwrap.dedent(argument_text))
     described = {entry.partition(":")[0]: entry.rstrip() for entry in entries if entry}
     lines = [
@@ -343,12 +358,18 @@ def _make_docstring(
 
 
 def make_config(config: type[ConfigType], **keywords: Any) -> ConfigType:
-    """Return a configuration from settings as Python callers pass them; None counts as
-    not passed.
+    """Create a configuration from settings as Python callers pass them.
 
-    A scene, a model and controls may be objects. Then the settings have their names,
-    and the configuration holds the objects (`Config.python_object`) and notes which of
-    them exist in this session only.
+    A scene, a model and controls may be objects. In the configuration the settings have
+    their names, since it is stored in a file; the objects are attached to it
+    (`Config.python_object`). It also lists the objects that exist in this session only.
+
+    Args:
+        config: class of the configuration.
+        keywords: settings by name; None counts as not passed.
+
+    Raises:
+        InputError: a setting is wrong, or contradicts an object.
     """
     settings = {name: value for name, value in keywords.items() if value is not None}
     objects: dict[tuple[str, str], Any] = {}
@@ -356,6 +377,7 @@ def make_config(config: type[ConfigType], **keywords: Any) -> ConfigType:
 
     scene = settings.get("object")
     model = settings.get("model")
+    # Workers are other processes, to which these objects cannot be sent.
     if isinstance(scene, loading.Scene) or isinstance(model, (Model, nn.Module)):
         check_no_worker_settings(settings)
     if isinstance(model, (Model, nn.Module)):
@@ -364,6 +386,7 @@ def make_config(config: type[ConfigType], **keywords: Any) -> ConfigType:
         if is_session_only(model):
             python_only.append(PythonOnly("model", settings["model"]))
     if isinstance(scene, loading.Scene):
+        # The scene was loaded already, so that its settings come too late.
         check_no_scene_settings(
             {name: value for name, value in settings.items() if name != "object"}
         )
@@ -389,12 +412,15 @@ def make_config(config: type[ConfigType], **keywords: Any) -> ConfigType:
 
 
 def _name_controls(settings: dict[str, Any], name: str) -> Sequence[Any]:
-    """Replace the controls in a setting, which may be objects, by their names and
-    options, and return those that are objects.
+    """Replace controls that are objects in a setting by their names and options.
 
     Args:
-        settings: settings by name, which are changed.
-        name: name of the setting, "controls" or "over".
+        settings: settings by name; the setting is changed in place.
+        name: name of the setting: "controls" for those that are searched, or "over" for
+            those that vary at random.
+
+    Returns:
+        The objects that were replaced.
     """
     controls: Any = settings.get(name)
     instances = loading.list_control_instances(controls)

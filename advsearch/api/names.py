@@ -38,15 +38,16 @@ they are complete.
 
 
 def check_names(values: Mapping[str, Any]) -> None:
-    """Check that names in settings are those of something that exists, so that a slip
-    is found before anything is loaded.
+    """Check that the names in settings exist, before anything is loaded.
+
+    So a misspelled name is reported at once.
 
     Args:
         values: values of the settings, by name.
 
     Raises:
-        UnknownNameError: nothing has such a name.
-        InputError: a run or a file is not there.
+        UnknownNameError: a name is unknown.
+        InputError: a run or a file is missing.
     """
     _check_scene(values)
     _check_controls(values)
@@ -63,8 +64,10 @@ def check_names(values: Mapping[str, Any]) -> None:
 
 
 def _check_models(values: Mapping[str, Any]) -> None:
-    """Check names of models that are like "reference", the only bundled one; others may
-    be files or code of the user.
+    """Check names of models that are similar to "reference".
+
+    This is the only bundled model; a name that is not similar may be a file or code of
+    the user.
     """
     names_like_reference = [
         name
@@ -101,8 +104,12 @@ def _check_runs(values: Mapping[str, Any]) -> None:
 
 
 def _check_scene(values: Mapping[str, Any]) -> None:
-    """Check the names of objects and environments, and that of the thing to judge."""
-    # a text: "car@12,3.5,name=taxi; person@6,-2"
+    """Check the names of objects and environments, and of the object to judge.
+
+    Args:
+        values: values of the settings, by name. "things" are additional objects, as in
+            "car@12,3.5,name=taxi; person@6,-2".
+    """
     things = [
         part.strip()
         for part in str(values.get("things") or "").split(";")
@@ -131,21 +138,22 @@ def _check_scene(values: Mapping[str, Any]) -> None:
         MAP_HINT,
     )
     judge = values.get("judge")
-    # a scene in a file may have further things, whose names are not known here
+    # A scene in a file may have further objects, whose names are not known here.
     if things and judge and objects[0] in list_objects():
         _check_judge(judge, things, thing_objects)
 
 
 def _check_judge(judge: str, things: Iterable[str], objects: Iterable[str]) -> None:
-    """Check that the thing to judge is one of the things in the scene.
+    """Check that the object to judge is one of the objects in the scene.
 
     Args:
-        judge: its name; of several things with one name, the second ends in -2, ...
-        things: as in the setting, ``car@12,3.5,name=taxi``.
-        objects: the objects of these things, which are their names by default.
+        judge: its name. If several objects have one name, the second is called NAME-2,
+            and so on.
+        things: additional objects as the setting has them, ``car@12,3.5,name=taxi``.
+        objects: kind of each of them, such as "car", which is its name by default.
 
     Raises:
-        UnknownNameError: it is none of them.
+        UnknownNameError: no object has this name.
     """
     names = []
     for thing, object_name in zip(things, objects, strict=True):
@@ -161,8 +169,9 @@ def _check_judge(judge: str, things: Iterable[str], objects: Iterable[str]) -> N
 
 
 def _check_controls(values: Mapping[str, Any]) -> None:
-    """Check that names of controls that are like one of a built-in control are one;
-    others may be code of the user.
+    """Check names of controls that are similar to built-in controls.
+
+    A name that is not similar may be code of the user.
     """
     controls = {**(values.get("controls") or {}), **(values.get("over") or {})}
     names = []
@@ -204,16 +213,18 @@ def _check_suite(suite: str) -> None:
 
 
 def _check_entries(kind: str, names: Iterable[str], group: str) -> None:
-    """Check words as `_check_words` does: they have to be built-in entries of a kind,
-    or those of other packages.
+    """Check that names are built-in entries of a kind, or entries of other packages.
+
+    A name that is no plain word, such as "package.module:Class", is not checked.
 
     Args:
         kind: kind of the entries, such as "policy".
         names: names to check.
-        group: entry points of other packages: "policies" for "advsearch.policies".
+        group: group of entry points of other packages, such as "policies" for
+            "advsearch.policies".
 
     Raises:
-        UnknownNameError: a word is none of them.
+        UnknownNameError: a name is unknown.
     """
     words = [name for name in names if _is_word(name)]
     if not words:  # then no other packages are looked for
@@ -226,17 +237,19 @@ def _check_entries(kind: str, names: Iterable[str], group: str) -> None:
 def _check_words(
     kind: str, names: Iterable[str], known: Iterable[str], hint: str = ""
 ) -> None:
-    """Check that words are known names; a path of an existing file, or what is no word,
-    passes.
+    """Check that plain words are known names.
+
+    The path of an existing file passes, and so does a name that is no plain word, such
+    as "package.module:Class".
 
     Args:
-        kind: what is named, for messages.
+        kind: kind of the named object, for messages.
         names: names to check.
-        known: the names that there are.
-        hint: the end of the message.
+        known: the known names.
+        hint: end of the message; "" for none.
 
     Raises:
-        UnknownNameError: a word is none of them.
+        UnknownNameError: a word is unknown.
     """
     known_names = list(known)
     for name in names:

@@ -56,21 +56,21 @@ if TYPE_CHECKING:
 
 @with_checked_arguments
 def load_run(run: str | Path) -> AttackResult | SweepResult | Result:
-    """Return the result of a run from its folder, of the type that the function of its
-    question returns.
+    """Load the result of a run from its folder.
 
-    An attack's is an `AttackResult`, a sweep's a `SweepResult`, and so on; of several
-    objects, epsilons or models, which only a command attacks, it is the table of them.
-    `search` of a loaded attack is None: `rows("search")` has its steps. Nothing is
-    rendered, and no scene or model is loaded before `render` asks for them.
+    It has the type that the function of the experiment returns, such as `AttackResult`
+    or `SweepResult`. An attack of several objects, epsilons or models by the command
+    line has a table as its result. `search` of a loaded attack is None; its steps are
+    in `rows("search")`. Nothing is rendered, and the scene and the model are not loaded
+    before `render` needs them.
 
     Args:
-        run: its name, which stands for runs/NAME, or its folder.
+        run: name of the run, which stands for runs/NAME, or its folder.
 
     Raises:
         UnknownNameError: there is no such run.
-        InputError: it is neither a name nor a folder.
-        FileFormatError: it has not ended, or its files are damaged.
+        InputError: `run` is neither a name nor a folder.
+        FileFormatError: the run has not ended, or its files are corrupt.
     """
     if not isinstance(run, (str, Path)):
         raise InputError(
@@ -86,7 +86,12 @@ def load_run(run: str | Path) -> AttackResult | SweepResult | Result:
 
 
 def _load_attack(summary: AttackSummary, path: Path) -> AttackResult:
-    """Return the result of an attack with its pictures, from the folder of its run."""
+    """Load the images and artifacts of an attack from the folder of its run.
+
+    Args:
+        summary: stored result of the attack.
+        path: folder of the run.
+    """
     clean, adversarial = (
         read_png(path / IMAGES / f"{name}.png") for name in ("clean", "adversarial")
     )
@@ -104,7 +109,7 @@ def _load_attack(summary: AttackSummary, path: Path) -> AttackResult:
         adversarial=torch.from_numpy(adversarial),
         artifacts=artifacts,
         search=None,
-        # loaded when they are needed first
+        # The scene and the model are loaded when they are needed for the first time.
         parts=cache(partial(load_parts_of_run, path)),
     )
 
@@ -134,7 +139,12 @@ def load_model(
 ) -> Model:
     """Load a model as `advsearch.models.load_model` does, for a task by name.
 
-    The code that `spec` names may run, since whoever calls this wrote it.
+    Code that `spec` names is allowed to run, since the caller typed it.
+
+    Args:
+        spec: name, file, address or code of a model, or a network.
+        task: task for which the model is loaded; None for classification.
+        options: other options of `advsearch.models.load_model`.
     """
     allow_named({"model": spec})
     return models.load_model(
@@ -153,12 +163,18 @@ render = allow_code_of_call(
 def render_picture_file(
     config: RenderConfig, *, progress: Progress | None = None
 ) -> RenderResult:
-    """Render what a configuration describes, write the file, and return what is known
-    about the picture.
+    """Render the scene of a configuration, and write the image to a file.
+
+    Args:
+        config: settings of the scene, the model and the image.
+        progress: object that displays the progress; None for no display.
+
+    Returns:
+        The names of the written files, the predictions and the warnings.
 
     Raises:
-        InputError: as for `render`, or the file would replace one that is read.
-        StorageError: it could not be written.
+        InputError: a setting is wrong, or the file would replace one that is read.
+        StorageError: the file cannot be written.
     """
     progress = progress or NullProgress()
     out = check_image_path(config.out, config.around or 1)
@@ -196,10 +212,10 @@ def render_picture_file(
 
 
 def _check_replaces_no_input(config: RenderConfig, out: Path) -> None:
-    """Check that a file to write is none of those that the settings name.
+    """Check that the file to write is not one that is read.
 
     Raises:
-        InputError: it is one.
+        InputError: a setting names the same file as an input, such as its object.
     """
     if not out.exists():
         return

@@ -75,13 +75,16 @@ class RenderedRow:
 
 
 def render_rows(run: str, *, every: bool, progress: Progress) -> Iterator[RenderedRow]:
-    """Render the images of a run of `sweep` or `attack`, or of one with such parts (a
-    suite, a study).
+    """Render the images of a run again.
+
+    The run is of `sweep` or `attack`, or it consists of such runs, as a suite or a
+    study does.
 
     Args:
-        run: its name or folder.
-        every: render all images; otherwise only those about which a model is wrong.
-        progress: reports the number of images.
+        run: name or folder of the run.
+        every: whether to render all images; otherwise only those about which a model is
+            wrong.
+        progress: object that displays the number of images.
 
     Raises:
         InputError: the scene of the run does not exist any more.
@@ -91,8 +94,16 @@ def render_rows(run: str, *, every: bool, progress: Progress) -> Iterator[Render
 
 
 def _render_run(folder: Path, every: bool, progress: Progress) -> Iterator[RenderedRow]:
-    """Yield the rendered images of the run in a folder, or of its parts; see
-    `render_rows`.
+    """Yield the rendered images of the run in a folder, or of its parts.
+
+    Args:
+        folder: folder of the run.
+        every: whether to render all images; otherwise only those about which a model is
+            wrong.
+        progress: object that displays the number of images.
+
+    Raises:
+        InputError: the run is of another command, or needs objects of a Python session.
     """
     parts = [path for path in sorted((folder / PARTS).glob("*")) if is_run(path)]
     if parts:
@@ -106,7 +117,8 @@ def _render_run(folder: Path, every: bool, progress: Progress) -> Iterator[Rende
             f"{folder}: expected a run of {' or '.join(RENDERERS)}, or one with such "
             f"parts, got one of {command}"
         )
-    # objects of the Python session, but for those that only a search needs
+    # Objects that existed only in the Python session of the run, and that rendering
+    # needs. Others, such as a policy, were needed by the search only.
     missing = [
         part.text
         for part in read_python_only(folder)
@@ -134,7 +146,7 @@ def _render_sweep(
         FileFormatError: the run has rows of images that its settings do not make.
     """
     config = SweepConfig.from_yaml(folder / CONFIG)
-    # metrics are not computed again
+    # Metrics are left out, since they are not computed again.
     scenes = load_scenes_of_sweep(config.model_copy(update={"metrics": {}}))
     job = scenes.job
     rows_of_image = _read_sweep_rows(folder, len(job.models))
@@ -144,7 +156,7 @@ def _render_sweep(
         if every or not all(row.correct for row in rows)
     )
     n_images = job.images_per_scene * len(job.scenes)
-    # they are sorted, so that the first and the last one show it for all
+    # The indices are sorted, so that checking the first and the last one is enough.
     if images and not 0 <= images[0] <= images[-1] < n_images:
         raise FileFormatError(
             f"{folder / NAME}: expected rows of its {n_images} pictures, got one of "
@@ -164,8 +176,9 @@ def _render_sweep_image(
 
     Args:
         scenes: scenes of the sweep.
-        image: the index of the image.
-        rows: the predictions of all models for it.
+        image: index of the image.
+        rows: stored predictions of all models for it; the rendered image is judged
+            again and compared with the first model's.
     """
     job = scenes.job
     view, queries = scenes.make_queries(image)
@@ -204,23 +217,25 @@ def _read_sweep_rows(folder: Path, n_models: int) -> dict[int, list[Row]]:
 def _render_attack(
     folder: Path, every: bool, progress: Progress
 ) -> Iterator[RenderedRow]:
-    """Yield the rendered trials of an attack's adversarial scene and of the clean one.
+    """Yield rendered trials of an attack's clean scene and of its adversarial scene.
 
-    Where no condition varies, trials differ in noise alone, and only the first of each
-    is rendered.
+    A trial is a verification render. If no condition varies at random, such as the
+    camera, trials differ in noise only, and one trial of each scene is rendered.
 
     Args:
         folder: folder of the run.
-        every: render all trials; otherwise only those in which the model is wrong.
-        progress: reports the number of images.
+        every: whether to render all trials; otherwise only those in which the model is
+            wrong.
+        progress: object that displays the number of images.
     """
     summary = load_attack_summary(folder)
     parts = load_parts_of_run(folder)
     problem, _ = make_problem_with_warnings(parts)
-    # kinds of rows, each with the configuration that its trials have
+    # the configuration u of the trials, by the kind of their rows
     configuration_of_kind = dict.fromkeys(CLEAN_KINDS, problem.domain.start)
     if summary.adversarial is not None:
-        # with `answer_from` the answer is a baseline's, and not the search's
+        # If `answer_from` is set, a baseline found the adversarial scene, and not the
+        # search.
         kind = "baseline verification" if summary.answer_from else "verification"
         configuration_of_kind[kind] = read_stored_configuration(folder, problem)
     rows = list[Row]()
@@ -232,7 +247,7 @@ def _render_attack(
         u = configuration_of_kind[row.kind]
         seed = max(0, row.seed or 0)  # a row may lack it
         picture = problem.picture(u, seed, row.spp or problem.spp)
-        # with the conditions that the seed draws
+        # `u` followed by the conditions that the seed samples
         full_u = problem.add_conditions(u, seed)
         is_right = problem.judge(picture, full_u).right
         yield RenderedRow(
@@ -258,14 +273,13 @@ def _read_trials(folder: Path, kind: str, every: bool) -> list[Row]:
 
 
 def make_object_facts(scene: Scene, name: str, config: SceneConfig) -> Facts:
-    """Return the facts about the object of a scene, also where the run judges another
-    thing.
+    """Return the ground truth about the object of a scene.
 
     Args:
         scene: the scene.
         name: name of the object.
-        config: settings of the run. Their label is that of the judged thing, so it is
-            left out where that is not the object.
+        config: settings of the run. Their label belongs to the object that the run
+            judges. So it is ignored if the run judges an additional object.
     """
     judges_object = config.judge not in scene.description.things
     label = config.label if judges_object else None

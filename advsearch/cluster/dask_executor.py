@@ -97,8 +97,9 @@ class ClusterSite:
 
 
 def make_file_plugin(contents: Mapping[str, bytes]) -> Any:
-    """Return a plugin that makes each worker of Dask, also one that comes later, write
-    the files of a task.
+    """Return a plugin of Dask with which each worker writes the files of a task.
+
+    Workers that connect later run it too.
 
     Args:
         contents: contents of the files, by path.
@@ -108,7 +109,8 @@ def make_file_plugin(contents: Mapping[str, bytes]) -> Any:
 
     class SentFiles(WorkerPlugin):
         def setup(self, worker: Any) -> None:
-            # a worker that lacks files says so with its next call
+            # An error is ignored here: a worker that lacks files reports that when the
+            # next call needs them.
             with suppress(OSError):
                 write_files(contents, make_private_directory() / INPUTS)
 
@@ -138,9 +140,9 @@ class DaskExecutor(WorkerExecutor):
         """Connect to the scheduler, or start the cluster.
 
         Args:
-            site: where the workers run.
+            site: the scheduler or the cluster on which the workers run.
             contents: contents of the task's files, by path, for workers that lack them.
-            tell: takes messages for the user.
+            tell: function that is called with messages for the user.
 
         Raises:
             ClusterError: no scheduler answers.
@@ -155,15 +157,17 @@ class DaskExecutor(WorkerExecutor):
         self._client: Any = None
         self._cluster: Any = None
         self._connection: Any = None
-        self._sending: asyncio.Future[Any] | None = None  # of the files
+        # ends when the files were sent; None before that is begun
+        self._sending: asyncio.Future[Any] | None = None
         self._calls: set[Future[Any]] = set()
-        # addresses of workers that are given calls
+        # addresses of workers that get calls
         self._fit: frozenset[str] = frozenset()
-        # why other workers are given none, by their addresses
+        # why other workers get none, by their addresses
         self._refused: dict[str, str] = {}
-        # when the workers were last looked up: never, so that the first count does it
+        # When the workers were last looked up. -inf stands for never, so that the first
+        # count looks them up.
         self._looked_at = float("-inf")
-        # when workers were last counted, and since when there has been none that is fit
+        # when workers were last counted, and since when no fit worker is connected
         self._counted_at = self._alone_since = time.monotonic()
         try:
             self._open(CONNECT_SECONDS)
@@ -172,8 +176,10 @@ class DaskExecutor(WorkerExecutor):
             raise
 
     def _open(self, seconds: float) -> None:
-        """Start the cluster if there is one to start, and connect to its scheduler; try
-        again for so many seconds.
+        """Start the cluster if the site has one, and connect to its scheduler.
+
+        Args:
+            seconds: how long a failed connection is tried again.
 
         Raises:
             ClusterError: no scheduler answers.
@@ -209,20 +215,19 @@ class DaskExecutor(WorkerExecutor):
                     ) from error
                 time.sleep(LOOK_SECONDS)
         self._connection = self._client.scheduler_comm
-        # what Dask draws its pages with
+        # Dask draws its pages with bokeh; without it the link leads to an error.
         has_pages = importlib.util.find_spec("bokeh") is not None
         self.link = str(self._client.dashboard_link or "") if has_pages else ""
         if self.link:
             self._tell(f"Dask shows its workers at {self.link}")
 
     def _connect(self, security: Any, deadline: float) -> Any:
-        """Start the cluster, unless it runs or there is none to start, and return a client
-        of the scheduler.
+        """Return a client of the scheduler; start the cluster first if that is due.
 
         Args:
-            security: Dask's `Security`, or None.
-            deadline: time (`time.monotonic`) until which the scheduler may answer; it has
-                one second at least.
+            security: Dask's `Security` with the certificates; None for no encryption.
+            deadline: time (`time.monotonic`) until which the scheduler may answer; at
+                least one second from now is allowed.
         """
         import distributed  # late: an optional package, and it takes a second
 
@@ -244,10 +249,10 @@ class DaskExecutor(WorkerExecutor):
     # ---- who is there
 
     def count_workers(self) -> int:
-        """Return how many workers are given calls now.
+        """Return how many workers can get calls now.
 
-        The workers are looked up every `LOOK_SECONDS`; if the connection was lost, it is
-        made again first.
+        The scheduler is asked for the workers every `LOOK_SECONDS`. If the connection
+        was lost, this method connects again first.
 
         Raises:
             ClusterError: there has been no such worker for too long.
@@ -262,11 +267,13 @@ class DaskExecutor(WorkerExecutor):
             )
             if not is_connected:
                 self._reconnect()
-            # a scheduler that is slow, or about to end: the next look will tell
+            # A scheduler that does not answer is slow or about to end. The next look
+            # will show which, so the old count is used until then.
             with suppress(OSError, TimeoutError, asyncio.TimeoutError):
                 self._look()
             self._looked_at = time.monotonic()
-        # Nobody looked for workers while nobody counted them: that time does not count.
+        # Workers are only looked for when they are counted. A long time without a count
+        # is no time without workers.
         was_long_ago = now - self._counted_at > LESS_PATIENCE
         if self._fit or was_long_ago:
             self._alone_since = now
@@ -277,8 +284,9 @@ class DaskExecutor(WorkerExecutor):
     def _look(self) -> None:
         """Ask the scheduler which workers are connected, and sort them.
 
-        Workers that have gone are counted as lost. New ones are fit if they have the
-        same advsearch, else they are refused with the reason.
+        Workers that have disconnected are counted as lost. New workers get calls if
+        they have the same version of advsearch. Otherwise they are refused, and the
+        reason is stored.
         """
         client = self._client
         connected = frozenset(
@@ -305,12 +313,13 @@ class DaskExecutor(WorkerExecutor):
         self._fit = fit - set(self._refused)
 
     def _refuse_version(self, address: str, version: Any) -> None:
-        """Refuse a worker that has another advsearch, or none.
+        """Refuse a worker that has another version of advsearch, or none.
 
         Args:
             address: address of the worker.
-            version: its version, or the error that it had instead. By any other error it
-                is about to end, or does not answer yet: the next look will tell.
+            version: its version, or the error that reading the version raised. An
+                ImportError or AttributeError means that advsearch is missing or old.
+                After another error, as of a slow worker, the next look asks again.
         """
         if isinstance(version, str):
             self._refuse(
@@ -342,9 +351,13 @@ class DaskExecutor(WorkerExecutor):
             self._tell(f"{address} is given nothing: {reason}")
 
     def _check_hope(self, now: float) -> None:
-        """Raise ClusterError if there has been no worker that is fit for too long.
+        """Raise ClusterError if there has been no fit worker for too long.
 
-        That is sooner where there are workers, but all were refused.
+        If workers are connected but all were refused, the wait is shorter, since these
+        will not become fit.
+
+        Args:
+            now: time (`time.monotonic`) of this check.
         """
         patience = LESS_PATIENCE if self._refused else PATIENCE
         if now - self._alone_since > patience:
@@ -357,8 +370,10 @@ class DaskExecutor(WorkerExecutor):
             )
 
     def _reconnect(self) -> None:
-        """Connect to the scheduler again, as at first; what was known of the workers is
-        forgotten.
+        """Connect to the scheduler again.
+
+        It may be a new scheduler with other workers. So the fit and the refused workers
+        are forgotten, and files will be sent again.
         """
         self._tell(
             f"{self.description}: the scheduler has gone; what was under way will be "
@@ -376,7 +391,7 @@ class DaskExecutor(WorkerExecutor):
     def submit(
         self, function: Callable[..., Any], /, *args: Any, **kwargs: Any
     ) -> Future[Any]:
-        """See `Executor.submit`; for functions of modules and positional arguments."""
+        """Schedule a call of a module's function with positional arguments."""
         if kwargs:
             raise TypeError("a worker takes positional arguments only")
         call = self._call(self._client, function, args)
@@ -390,7 +405,12 @@ class DaskExecutor(WorkerExecutor):
     ) -> Any:
         """Run a function on a worker and return its result.
 
-        It is run again if the result was lost, or the worker turns out to be unfit.
+        It is run again if the result was lost, or if the worker turned out to be unfit.
+
+        Args:
+            client: client of the connection that is open now.
+            function: function to call.
+            args: its positional arguments.
 
         Raises:
             WorkerDiedError: too many workers died of it.
@@ -419,8 +439,8 @@ class DaskExecutor(WorkerExecutor):
                     if not await self._is_refused(client, address, value):
                         return value
             except asyncio.CancelledError:
-                # Dask cancels the future of a lost worker, and asyncio this call where
-                # nobody wants it any more: only the latter ends it
+                # Dask cancels the future of a lost worker: then the call is repeated.
+                # If asyncio cancels this call, nobody needs its result any more.
                 if future.status != "cancelled":
                     raise
             except KilledWorker:
@@ -428,7 +448,9 @@ class DaskExecutor(WorkerExecutor):
                     f"no answer: {MAX_DEATHS} workers died of it"
                 ) from None
             except Exception as error:
-                # nothing of ours raises, so the worker could not even begin
+                # `run_batch` catches errors and returns them in its reply. So this
+                # error means that the worker could not begin, for instance that it
+                # could not import the function.
                 if future.status == "error" and type(error).__name__ not in NO_WORKER:
                     failed_starts += 1
                     if failed_starts == MAX_TRIES:
@@ -446,8 +468,14 @@ class DaskExecutor(WorkerExecutor):
         return ClusterError(f"{self.description}: a worker cannot begin ({text})")
 
     async def _wait(self, future: Any, workers: list[str]) -> tuple[str, Any] | None:
-        """Return the address and the value that a future of Dask ends with; None if
-        none of the `workers` that may run it is left.
+        """Wait for a future of Dask, as long as a worker that may run it is left.
+
+        Args:
+            future: the future.
+            workers: addresses of the workers that may run it.
+
+        Returns:
+            The address of the worker and the value; None if all workers are gone.
         """
 
         async def fetch() -> tuple[str, Any]:
@@ -466,20 +494,22 @@ class DaskExecutor(WorkerExecutor):
             fetching.cancel()
 
     async def _is_refused(self, client: Any, address: str, value: Any) -> bool:
-        """Return whether a call has to be run again: on another worker, or after its files
-        were sent, which is done here.
+        """Return whether a call has to be run again because its worker could not do it.
+
+        If the worker lacks files that were not sent yet, they are sent here. Otherwise
+        a worker that is unfit or lacks files is refused, and another one gets the call.
 
         Args:
             client: client of the connection that was used.
             address: address of the worker.
-            value: what it returned, a `Reply` for batches.
+            value: value that the call returned, a `Reply` for batches.
         """
         failure = value.failure if isinstance(value, Reply) else None
         were_files_sent = self._sending is not None and self._sending.done()
         if failure is Failure.MISSING_FILES and not were_files_sent:
             await self._send_files(client)
             return True
-        # unfit, or without files although they were sent
+        # The worker is unfit, or could not write the files that were sent.
         if failure in (Failure.UNFIT, Failure.MISSING_FILES):
             self._refuse(address, value.error)
             return True
@@ -501,8 +531,10 @@ class DaskExecutor(WorkerExecutor):
         await client.unregister_worker_plugin(name=self._plugin_name)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = True) -> None:
-        """End all calls, remove the files that were sent, and disconnect; workers that
-        this executor started end.
+        """End all calls, remove the files that were sent, and disconnect.
+
+        Workers that this executor started end; others stay. The arguments are those of
+        `concurrent.futures.Executor`, and are not used.
         """
         for call in list(self._calls):
             call.cancel()
@@ -544,14 +576,16 @@ code that the file runs.
 def open_dask(
     task: WorkerTask, workers: int | None, cluster: str, tell: Callable[[str], None]
 ) -> tuple[DaskExecutor, WorkerTask]:
-    """Return an executor on a cluster, and the task with the digests of its files, by
-    which workers check that they have the same.
+    """Return an executor on a cluster, and the task with the digests of its files.
+
+    By the digests a worker checks that it has the same files.
 
     Args:
-        task: what the workers do.
-        workers: how many to start; None for the default.
-        cluster: the address of a scheduler, or the path of a YAML file.
-        tell: takes messages for the user.
+        task: function and settings that the workers load.
+        workers: number of workers to start; None for the default.
+        cluster: address of a scheduler, or path of a YAML file that describes the
+            cluster.
+        tell: function that is called with messages for the user.
     """
     site = parse_site(workers, cluster)
     if importlib.util.find_spec("distributed") is None:
@@ -565,16 +599,16 @@ def open_dask(
 
 
 def parse_site(workers: int | None, cluster: str) -> ClusterSite:
-    """Return where workers run.
+    """Return the scheduler or the cluster on which workers run.
 
     Args:
-        workers: how many to start; None for the default.
-        cluster: the address of a scheduler, or the path of a YAML file that describes
-            the cluster.
+        workers: number of workers to start; None for the default.
+        cluster: address of a scheduler, such as "tcp://10.0.0.1:8786", or path of a
+            YAML file that describes the cluster.
 
     Raises:
-        InputError: it is neither, or `workers` is given for a scheduler that has its
-            own.
+        InputError: `cluster` is neither, or `workers` is set although the scheduler has
+            workers already.
     """
     if cluster.startswith(ADDRESS_SCHEMES):
         site = ClusterSite(cluster, address=cluster)
@@ -622,8 +656,13 @@ def _read_site(path: Path, workers: int | None) -> ClusterSite:
 
 
 def _read_security(path: Path, entries: dict[str, Any]) -> dict[str, object] | None:
-    """Return the keywords of Dask's `Security` that a cluster file has, None if it has
-    none; the paths in them are relative to the file.
+    """Return the keywords of Dask's `Security` in a cluster file; None for none.
+
+    Paths of certificates and keys are relative to the file, and become full paths.
+
+    Args:
+        path: path of the cluster file.
+        entries: its content.
     """
     security = {**(entries.get("security") or {})}
     for name in (
@@ -643,8 +682,14 @@ def _read_scheduler(
 ) -> ClusterSite:
     """Return the scheduler that a cluster file names by its address.
 
+    Args:
+        path: path of the cluster file, for errors.
+        entries: its content.
+        security: keywords of Dask's `Security`; None for none.
+
     Raises:
-        FileFormatError: it is no address, or the file has a number of workers, too.
+        FileFormatError: the address has another form, or the file also has a number of
+            workers.
     """
     address = str(entries["address"])
     if not address.startswith(ADDRESS_SCHEMES):
@@ -659,11 +704,13 @@ def _read_scheduler(
 
 
 def _check_entries(path: Path, entries: dict[str, Any]) -> None:
-    """Check that a cluster file has the entries that belong together, and mappings
-    where they are needed.
+    """Check the names and types of the entries of a cluster file.
+
+    A file has either "address" (of a scheduler that runs), or "class" (of a cluster to
+    start); "security" and "arguments" are mappings.
 
     Raises:
-        FileFormatError: it has not.
+        FileFormatError: an entry is unknown, missing or of another type.
     """
     known = {"address", "class", "arguments", "workers", "security"}
     unknown = sorted(set(entries) - known)

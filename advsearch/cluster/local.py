@@ -38,10 +38,12 @@ class WorkerProcess:
     """One worker, which does one call at a time."""
 
     def __init__(self) -> None:
-        """Start the process; calls go to its standard input, results come from its
-        standard output.
+        """Start the process.
+
+        Calls are written to its standard input, and results are read from its standard
+        output.
         """
-        # one thread each, since the processes share the cores
+        # one thread for each process, since the processes share the cores
         environ = {**os.environ, "OMP_NUM_THREADS": "1", SERVE_VARIABLE: "1"}
         command = [sys.executable, "-c", START_CODE, *sys.path]
         self._popen = subprocess.Popen(
@@ -49,15 +51,19 @@ class WorkerProcess:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env=environ,
-            # so that Ctrl-C in the terminal does not reach it
+            # Ctrl-C in the terminal must not reach it: this process ends the workers.
             start_new_session=True,
         )
 
     def call(self, function: Callable[..., Any], *args: Any) -> Any:
-        """Run a function of a module in the process, and return its result.
+        """Run a function in the process, and return its result.
+
+        Args:
+            function: function at the top level of a module, so that it can be pickled.
+            args: its positional arguments.
 
         Raises:
-            WorkerDiedError: if the process ends before.
+            WorkerDiedError: the process ends before it returns.
         """
         assert self._popen.stdin is not None and self._popen.stdout is not None
         request = pickle.dumps((function, args))
@@ -90,7 +96,9 @@ class LocalExecutor(WorkerExecutor):
     """
 
     def __init__(self, count: int) -> None:
-        """Make an executor of `count` processes, each started when it is needed first.
+        """Make an executor of `count` processes.
+
+        A process is started when it is needed for the first time.
 
         Raises:
             InputError: this process is a worker itself.
@@ -105,7 +113,7 @@ class LocalExecutor(WorkerExecutor):
         self.description = f"{count} workers on this machine"
         self.stats = WorkerStats()
         self._count = count
-        # a thread for each process, which waits for its results
+        # Each thread waits for the results of one process.
         self._threads = ThreadPoolExecutor(count, "worker")
         self._lock = Lock()
         self._idle: list[WorkerProcess] = []
@@ -118,14 +126,16 @@ class LocalExecutor(WorkerExecutor):
     def submit(
         self, function: Callable[..., Any], /, *args: Any, **kwargs: Any
     ) -> Future[Any]:
-        """See `Executor.submit`; for functions of modules and positional arguments."""
+        """Schedule a call of a module's function with positional arguments."""
         if kwargs:
             raise TypeError("a worker takes positional arguments only")
         return self._threads.submit(self._call, function, args)
 
     def _call(self, function: Callable[..., Any], args: tuple[Any, ...]) -> Any:
-        """Run a function in a process and return its result; if the process dies, run it
-        again in another one.
+        """Run a function in a process and return its result.
+
+        If the process dies, for instance for lack of memory, the function is run again
+        in another one.
 
         Raises:
             WorkerDiedError: `MAX_DEATHS` processes died of it.
@@ -144,7 +154,7 @@ class LocalExecutor(WorkerExecutor):
         raise WorkerDiedError(f"no answer: {MAX_DEATHS} workers died of it")
 
     def _take_process(self) -> WorkerProcess:
-        """Return a process that is idle, or a new one; it counts as busy then.
+        """Return an idle process, or start one if none is idle; it is marked as busy.
 
         Raises:
             WorkerDiedError: the executor was shut down.

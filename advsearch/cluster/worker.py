@@ -51,8 +51,10 @@ MachineInfo = dict[str, str]
 
 @cache
 def describe_machine() -> MachineInfo:
-    """Return what the last bits of renders and predictions depend on: the processor,
-    LLVM and the versions of `PACKAGES`.
+    """Return the properties of this machine on which last bits of results depend.
+
+    Renders and predictions on two machines are equal in every bit only if the
+    processor, LLVM and the versions of `PACKAGES` are the same.
 
     Raises:
         EnvironmentSetupError: there is no libLLVM.
@@ -114,11 +116,19 @@ class MissingFilesError(Exception):
 
 
 def read_files(task: WorkerTask) -> dict[str, bytes]:
-    """Return the contents, by path, of the files that a task's settings name, and of
-    the files next to them that those may refer to.
+    """Read the files that a task needs, to send them to workers on other machines.
+
+    These are the files that its settings name, and the files next to them to which they
+    may refer, such as the textures of a mesh.
+
+    Args:
+        task: the task; `task.files` are the settings that name files.
+
+    Returns:
+        Contents by absolute path.
 
     Raises:
-        InputError: they are too large to be sent.
+        InputError: the files together are too large to be sent.
     """
     contents: dict[str, bytes] = {}
     for name in task.files:
@@ -147,7 +157,7 @@ def _read_with_neighbors(setting: str, path: Path) -> dict[str, bytes]:
     """
     suffix = path.suffix.lower()
     suffixes: tuple[str, ...] = REFERRED_SUFFIXES.get(suffix, ())
-    # a YAML file refers to other files only where it is an environment
+    # A YAML file of an environment refers to other files; other YAML files do not.
     if setting == "environment" and suffix in (".yaml", ".yml"):
         suffixes = ENVIRONMENT_SUFFIXES
     contents = {str(path): path.read_bytes()}
@@ -155,7 +165,7 @@ def _read_with_neighbors(setting: str, path: Path) -> dict[str, bytes]:
         return contents
     for file in sorted(path.parent.rglob("*")):
         may_be_named = file.suffix.lower() in (*suffixes, *PICTURE_SUFFIXES)
-        # a link may lead out of the directory
+        # A link to a file outside of the directory is not followed.
         if may_be_named and file.is_file() and is_inside(file, path.parent):
             contents[str(file)] = file.read_bytes()
     return contents
@@ -167,12 +177,17 @@ def compute_digests(contents: Mapping[str, bytes]) -> dict[str, str]:
 
 
 def locate_sent_files(digests: Mapping[str, str], folder: Path) -> dict[str, Path]:
-    """Return where files that were sent are stored on a worker, by their original
-    paths.
+    """Return where files that were sent are stored on a worker, by original path.
 
-    Each set of files, known by its digests, has a directory of its own below `folder`;
-    in it they lie as on the sending machine.
+    Each set of files has a separate directory below `folder`, named by a digest of the
+    set. The files have the same paths below it as on the sending machine, so that
+    relative names in them stay valid.
+
+    Args:
+        digests: digests of the files by their original paths.
+        folder: directory for all files that were sent.
     """
+    # 32 hexadecimal digits are 128 bits, enough for no two sets to have one name.
     name = hashlib.sha256(json.dumps(sorted(digests.items())).encode()).hexdigest()[:32]
     return {
         path: folder / name / Path(path).relative_to(Path(path).anchor)
@@ -196,11 +211,15 @@ def write_files(contents: Mapping[str, bytes], folder: Path) -> None:
 def resolve_files(task: WorkerTask, folder: Path) -> WorkerTask:
     """Return the task with paths that are valid on this machine.
 
-    They are its own if all of its files exist here, else those below `folder`, to
-    which files are sent.
+    If all files of the task exist here under their original paths, the task is returned
+    unchanged. Otherwise its paths become those of the files that were sent.
+
+    Args:
+        task: the task, with the digests of its files.
+        folder: directory for files that were sent.
 
     Raises:
-        MissingFilesError: if a file is in neither.
+        MissingFilesError: a file is missing in both places, or has other content.
     """
     if all(_has_digest(Path(path), digest) for path, digest in task.digests.items()):
         return task
@@ -212,7 +231,7 @@ def resolve_files(task: WorkerTask, folder: Path) -> WorkerTask:
     for name in task.files:
         value = settings.get(name)
         if isinstance(value, str):
-            # what is no path, such as a comma, stays
+            # A part that is no path, such as a comma, is not changed.
             parts = [str(local_paths.get(part, part)) for part in _split_paths(value)]
             settings[name] = "".join(parts)
     return replace(task, settings=settings)
@@ -224,11 +243,10 @@ def _has_digest(path: Path, digest: str) -> bool:
 
 
 def _split_paths(value: str) -> Iterator[str]:
-    """Split the value of a setting into paths and what stands between them; all parts
-    together are the value again.
+    """Split the value of a setting into paths and the text between them.
 
     ``/a.glb#NODE,/b.obj`` gives ``/a.glb``, ``#NODE``, ``,`` and ``/b.obj``. Another
-    example is ``/camera.csv+/object.csv``.
+    example is ``/camera.csv+/object.csv``. Joined, the parts are the value again.
     """
     for part in re.split("(,)", value):
         path, mark, node = part.strip().partition("#")
@@ -278,13 +296,18 @@ class Reply:
 def run_batch(task: WorkerTask, items: Sequence[Any], deadline: float) -> Reply:
     """Compute a batch of a task, and return the result with its times, or the failure.
 
-    The task is loaded if it is not cached. The process ends itself after `deadline`
-    seconds of computing, or `LOAD_DEADLINE` of loading, even if native code hangs, and
-    writes a traceback to its error output.
+    The task is loaded if it is not cached. If loading takes over `LOAD_DEADLINE`
+    seconds, or computing over `deadline`, the process writes a traceback to its error
+    output and ends itself, even if native code hangs.
+
+    Args:
+        task: function and settings.
+        items: items of the batch, such as configurations to render.
+        deadline: seconds that computing may take.
     """
     worker = f"{platform.node()}, process {os.getpid()}"
     try:
-        # one batch at a time
+        # If this process has several threads, they compute one batch at a time.
         with _batch_lock:
             start = time.perf_counter()
             with kill_after(LOAD_DEADLINE):
@@ -300,8 +323,9 @@ def run_batch(task: WorkerTask, items: Sequence[Any], deadline: float) -> Reply:
 
 
 def _describe_failure(error: Exception) -> tuple[Failure, str]:
-    """Return the kind of a failure by its error, and the text for the user; call it
-    where the error is handled.
+    """Return the kind of a failure, and the text for the user.
+
+    Call it in the `except` block of the error, since it may format the traceback.
     """
     if isinstance(error, MissingFilesError):
         return Failure.MISSING_FILES, f"it lacks {error}"
@@ -325,17 +349,20 @@ def kill_after(seconds: float) -> Iterator[None]:
 
 
 def load_task(task: WorkerTask) -> BatchFunction:
-    """Return the function that computes batches of a task, loaded or cached.
+    """Return the function that computes batches of a task, from the cache if possible.
+
+    Loading reads the scene and the model, and sets the number of threads.
 
     Raises:
-        MissingFilesError: if this machine lacks files of the task.
+        MissingFilesError: this machine lacks files of the task.
     """
     key = _make_task_key(task)
     if key in _loaded:
         _loaded.move_to_end(key)
         return _loaded[key]
     folder = make_private_directory()
-    # compiled kernels are shared by all workers of the user, unless the user says where
+    # All workers of a user share one cache of compiled kernels, unless the user chose
+    # its directory.
     if "DRJIT_CACHE_DIR" not in os.environ:
         (folder / KERNELS).mkdir(exist_ok=True)
         os.environ["DRJIT_CACHE_DIR"] = str(folder / KERNELS)
@@ -344,7 +371,8 @@ def load_task(task: WorkerTask) -> BatchFunction:
     task = resolve_files(task, folder / INPUTS)
     threads.configure(task.threads)
     make_function: Callable[[Any], BatchFunction] = load_attribute(task.function)
-    # the least recently used one goes before another is loaded, for the memory's sake
+    # The least recently used function is dropped before another is loaded, so that both
+    # do not need memory at the same time.
     while len(_loaded) >= MAX_LOADED:
         _loaded.popitem(last=False)
     _loaded[key] = make_function(task.settings)
@@ -366,8 +394,9 @@ def _make_task_key(task: WorkerTask) -> str:
 def make_private_directory() -> Path:
     """Return a directory on this machine that only this user can write to.
 
-    It is the same for all workers of the user and outlives them; if somebody else has
-    made it, there is a new one.
+    All workers of the user have the same one, and it stays after they end. If somebody
+    else created it first, or can write to it, a new directory is created instead: files
+    and kernels in it would not be safe.
     """
     folder = Path(tempfile.gettempdir()) / f"advsearch-{os.getuid()}"
     folder.mkdir(mode=0o700, exist_ok=True)
@@ -375,7 +404,7 @@ def make_private_directory() -> Path:
     is_private = (
         stat.S_ISDIR(status.st_mode)
         and status.st_uid == os.getuid()
-        and not status.st_mode & 0o022
+        and not status.st_mode & 0o022  # neither the group nor others may write
     )
     return folder if is_private else Path(tempfile.mkdtemp(prefix="advsearch-"))
 
@@ -385,15 +414,14 @@ SERVE_VARIABLE = "ADVSEARCH_WORKER"
 
 
 def serve() -> None:
-    """Run the calls that the parent process sends, until it ends; the body of a worker
-    process.
+    """Run the calls that the parent process sends, until the parent ends.
 
-    A call is a pickled pair (function, arguments) on standard input; its pickled result
-    goes to standard output. Other code here sees an empty input, and what it prints
-    goes to the error output.
+    This is the main function of a worker process. A call is a pickled pair (function,
+    arguments) on standard input; its pickled result is written to standard output.
     """
-    # the pipes of the calls; then other code gets an empty input (0), and what it
-    # prints (1) goes to the error output (2)
+    # The pipes of the calls get new descriptors. Then other code reads an empty input
+    # (0), and its output (1) goes to the error output (2), so that it cannot disturb
+    # the calls.
     calls = os.fdopen(os.dup(0), "rb")
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)

@@ -63,10 +63,10 @@ class PoolWorkers:
         """Make workers for a task.
 
         Args:
-            executor: runs calls on its workers.
-            task: what the workers do.
-            tell: takes messages for the user.
-            clock: returns seconds; another one in tests.
+            executor: executor that runs calls on its workers.
+            task: function and settings that the workers load.
+            tell: function that is called with messages for the user.
+            clock: function that returns the time in seconds; tests pass another one.
         """
         self.stats: WorkerStats = executor.stats
         self._executor = executor
@@ -77,15 +77,19 @@ class PoolWorkers:
         self._dead_starts = 0
 
     def compute(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
-        """See `Workers.compute`.
+        """Compute batches on the workers, and yield results in the order of their ends.
 
-        A batch whose workers die is split into its items, and a single item whose
-        workers die gives a result without a value.
+        If the workers of a batch die, the batch is split into its items, to find the
+        item that kills them. A single item whose workers die gives a result without a
+        value.
+
+        Args:
+            batches: items of each batch; a batch is taken when a worker is free.
         """
         queued = _BatchQueue(batches)
         running = dict[Future[Reply], Sequence[Any]]()
         ended: queue.SimpleQueue[Future[Reply]] = queue.SimpleQueue()
-        # of the last batches, for the deadline of the next
+        # seconds per item of the last batches, for the deadline of the next
         item_seconds = deque[float](maxlen=MEDIAN_WINDOW)
         counted_at = self._clock()
         try:
@@ -125,19 +129,21 @@ class PoolWorkers:
     def _handle_loss(
         self, items: Sequence[Any], error: BaseException, queued: _BatchQueue
     ) -> Iterator[BatchResult]:
-        """Put a batch without a reply back into the queue; yield a result without a value
-        for a single item of which its workers died.
+        """Put a batch without a reply back into the queue, or give it up.
+
+        A batch of several items is put back as single items if its workers died. For a
+        single item whose workers died, a result without a value is yielded.
 
         Args:
             items: items of the batch.
-            error: why there is no reply.
-            queued: the batches to be given out.
+            error: error that came instead of a reply.
+            queued: queue of batches that wait for a worker.
 
         Raises:
             BaseException: `error`, if neither the executor nor a worker was lost.
         """
         if isinstance(error, BrokenExecutor):
-            # the executor was lost, not the batch: do it again
+            # The connection to the workers was lost; the batch itself is fine.
             self.stats.retried += 1
             queued.put_back(items)
             return
@@ -166,13 +172,15 @@ class PoolWorkers:
         return bool(waiting)
 
     def _deadline(self, n_items: int, item_seconds: Sequence[float]) -> float:
-        """Return after how many seconds a batch counts as hanging: then its worker ends
-        itself.
+        """Return the seconds after which a batch counts as hanging.
+
+        Its worker ends itself then. The deadline is a multiple of the time that the
+        items would take at the median speed of the last batches. Before there are
+        `MIN_BATCHES` of them, it is `LOAD_DEADLINE`.
 
         Args:
             n_items: number of items of the batch.
-            item_seconds: seconds per item of the last batches; a few are needed for an
-                estimate.
+            item_seconds: seconds per item of the last batches.
         """
         if len(item_seconds) < MIN_BATCHES:
             deadline = LOAD_DEADLINE
@@ -184,8 +192,11 @@ class PoolWorkers:
         return max(deadline, self._task.seconds or 0.0)
 
     def _read_reply(self, items: Sequence[Any], reply: Reply) -> BatchResult:
-        """Return the result in a worker's reply; add its times and its machine to the
-        counts.
+        """Return the result in a worker's reply, and count its times and its machine.
+
+        Args:
+            items: items of the batch.
+            reply: reply of the worker.
 
         Raises:
             RuntimeError: the worker's code raised an unexpected error.
@@ -208,12 +219,11 @@ class PoolWorkers:
         return BatchResult(items, reply.value, reply.worker, machine)
 
     def _note_machine(self, machine: str, reply: Reply) -> None:
-        """Remember and report a machine that differs from this one, the first time that it
-        replies.
+        """Store and report a machine that differs from this one, at its first reply.
 
         Args:
-            machine: its digest.
-            reply: the reply, which describes it.
+            machine: digest of the machine's properties.
+            reply: its reply, which has these properties.
         """
         if machine in self.stats.machines:
             return
@@ -225,11 +235,13 @@ class PoolWorkers:
         )
 
     def _count_dead_start(self) -> None:
-        """Count a death of a worker, and give up if all die from the beginning, for
-        example while loading.
+        """Count the death of a worker, and give up if no worker ever finished a batch.
+
+        Workers that die from the beginning, for example while loading a scene that is
+        too large, would otherwise be restarted without end.
 
         Raises:
-            ClusterError: `MAX_DEAD_STARTS` died, and no batch was ever finished.
+            ClusterError: `MAX_DEAD_STARTS` workers died, and no batch was finished.
         """
         self._dead_starts += 1
         if self._dead_starts >= MAX_DEAD_STARTS and not self.stats.batches:
@@ -290,15 +302,16 @@ def open_workers(
     """Open workers for a task, and end them after the block.
 
     Args:
-        task: what the workers do.
-        workers: number of processes; None for the default, on this machine one a core.
-        cluster: the address of a scheduler, a YAML file, or "local" or None for this
-            machine.
-        tell: takes messages for the user.
+        task: function and settings that the workers load.
+        workers: number of processes; None for the default, which is one for each core
+            on this machine.
+        cluster: address of a scheduler, or path of a YAML file that describes a
+            cluster; "local" or None for this machine.
+        tell: function that is called with messages for the user.
 
     Yields:
         The workers; None if neither `workers` nor `cluster` is set: then this process
-        computes all.
+        computes everything itself.
     """
     if workers is None and cluster is None:
         yield None

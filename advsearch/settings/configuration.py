@@ -120,9 +120,20 @@ def setting(
 
     Args:
         default: the default value, or a function that creates it.
+        group: group of settings in the help.
+        description: what the setting is, for the help.
+        expects: the values that it takes, in words; "" to derive them from the type.
+        unit: unit of measurement; "" for none.
+        otherwise: what None as a value means, for the help.
+        flag: flag of the command line; "" to derive it from the name of the field.
+        metavar: name of the value in the help; "" to derive it.
+        repeats: whether the flag may be used several times.
+        read_texts: function that converts texts to a mapping, for settings with one.
+        switched: what the flag does, if it is the opposite of the description; "" if
+            the description says it.
+        power: function that returns what a value does beyond the run, such as to
+            connect to an address; "" for nothing.
         constraints: constraints of `pydantic.Field`, such as `ge`.
-        group, description, expects, unit, otherwise, flag, metavar, repeats,
-            read_texts, switched, power: see `Setting`.
     """
     declared = Setting(
         default,
@@ -186,8 +197,8 @@ class Clash(NamedTuple):
 def settings(config: type[Config]) -> tuple[Setting, ...]:
     """Return every setting of a configuration, in the order of the help.
 
-    What their declarations leave empty is completed from fields, types and
-    constraints.
+    Attributes that a declaration leaves empty, such as the flag, are derived from the
+    name, the type and the constraints of the field.
     """
     completed = []
     for field, info in config.model_fields.items():
@@ -219,7 +230,10 @@ def settings(config: type[Config]) -> tuple[Setting, ...]:
 
 
 def _describe_expected(info: FieldInfo) -> str:
-    """Return what values a field takes, in words, from its type and constraints."""
+    """Describe the values that a field takes, such as "a whole number from 1 to 100".
+
+    The text is derived from the field's type and constraints.
+    """
     types = [
         value_type
         for value_type in get_args(info.annotation) or (info.annotation,)
@@ -232,7 +246,7 @@ def _describe_expected(info: FieldInfo) -> str:
     is_optional_literal = get_origin(types[0]) is Literal  # a Literal or None
     if is_optional_literal:
         return _join_choices(get_args(types[0]))
-    # of pydantic's constraints: at least, greater than, at most
+    # Constraints of pydantic: ge is "at least", gt is "greater than", le "at most".
     limits = {
         name: getattr(constraint, name)
         for constraint in info.metadata
@@ -241,7 +255,7 @@ def _describe_expected(info: FieldInfo) -> str:
     }
     is_integer = types == [int]
     number = "a whole number" if is_integer else "a number"
-    # 1e6 instead of 1e+06
+    # Python writes 1e+06; users read and write 1e6.
     upper = limits["le"] if is_integer else f"{limits['le']:g}".replace("e+0", "e")
     if "gt" in limits:
         return f"{number} greater than {limits['gt']:g} and at most {upper}"
@@ -323,14 +337,18 @@ class Config(BaseModel):
     )
 
     def __init__(self, **data: Any) -> None:
-        """Check the settings and create the configuration; numpy and torch values
-        become Python's first.
+        """Check the settings and create the configuration.
+
+        Numbers and arrays of numpy and torch become Python's first.
+
+        Args:
+            data: values of settings by name.
 
         Raises:
             InputError: a value is wrong; the message names the setting.
         """
         _check_shallow(type(self), data)
-        # checked again afterwards: texts are read as values, which may be nested
+        # The depth is checked again below, since texts are parsed to nested values.
         values = _read_mappings(type(self), written.to_python(data))
         _check_shallow(type(self), values)
         try:
@@ -362,8 +380,10 @@ class Config(BaseModel):
 
     @model_validator(mode="after")
     def _without_clashes(self) -> Self:
-        """Check that no setting is set that the command does not have (`without`), or that
-        contradicts others (`clashes`).
+        """Check that all settings exist for this command and do not contradict each other.
+
+        A command does not have the settings in `without`, although its class inherits
+        them. `clashes` lists the settings that contradict others.
         """
         for name in self.without:
             field = type(self).model_fields[name]
@@ -387,18 +407,20 @@ class Config(BaseModel):
     ) -> Self:
         """Load the configuration that a YAML file describes.
 
-        The file has one mapping from settings to values; `schema`, `command` and `base`
-        may stand next to them (see `read_yaml`). A setting in the file that does more than
-        decide what happens in the run, such as where it connects (`powers`), is not taken
-        over; `left_out` lists it.
+        The file has a mapping from settings to values, which may also have `schema`,
+        `command` and `base` (see `read_yaml`). A setting in the file that affects more
+        than the run, such as an address to connect to (`powers`), is ignored, since
+        somebody else may have written the file; `left_out` lists it.
 
         Args:
             path: path of the file.
-            overrides: settings by name that a person has requested. A dotted name
-                reaches inside: ``set.camera.azimuth``, ``controls.pose.yaw``.
+            overrides: settings by name that the user has requested. A dotted name
+                stands for a value inside of a mapping, such as
+                ``set.camera.azimuth`` or ``controls.pose.yaw``.
 
         Raises:
-            FileFormatError, InputError: as for the class; the message names the file.
+            FileFormatError: the file is missing or has another form.
+            InputError: a setting is wrong; the message names the file.
         """
         data = dict(written.read_yaml(path))
         data.pop("command", None)
@@ -407,12 +429,12 @@ class Config(BaseModel):
         for name, value in overrides.items():
             written.set_dotted(data, name, value)
         try:
-            # a first configuration, only to ask for its powers
+            # This first configuration only serves to find its powers.
             left_out = [
                 power for power in cls(**data).powers if power.name not in overrides
             ]
             for power in left_out:
-                # a setting may stand there under either name
+                # The file may use the name of the setting or of its field.
                 data.pop(power.name, None)
                 data.pop(power.field, None)
             config = cls(**data)
@@ -423,8 +445,9 @@ class Config(BaseModel):
 
     @property
     def powers(self) -> tuple[OmittedSetting, ...]:
-        """The settings whose values do more than decide what happens in the run
-        (`trust.powers`), each with what it does.
+        """The settings whose values affect more than the run, with what they do.
+
+        An example is an address to which images are sent (`trust.powers`).
         """
         powers = []
         for setting in settings(type(self)):
@@ -451,11 +474,12 @@ class Config(BaseModel):
 
     @property
     def session_settings(self) -> dict[str, Any]:
-        """The settings that the parts of a run (the attacks of a study) get from this
-        session, and not from their own files, by name.
+        """The settings that the parts of a run get from this session, by name.
 
-        They are those that affect more than the run, such as where it connects, if they
-        affect none of its numbers (`free`).
+        The parts, such as the attacks of a study, read their other settings from their
+        own files. But settings that affect more than the run, such as an address to
+        connect to, are never read from files. They are passed on if the numbers of the
+        run do not depend on them (`free`).
         """
         return {
             setting.name: getattr(self, setting.field)
@@ -466,14 +490,16 @@ class Config(BaseModel):
         }
 
     def check_powers(self, where: str) -> None:
-        """Check that no setting does more than decide what happens in the run, for a file
-        about which no person can be asked.
+        """Check that no setting of a file affects more than the run.
+
+        It is for files about which the user cannot be asked.
 
         Args:
-            where: the file, for messages.
+            where: name of the file, for messages.
 
         Raises:
-            InputError: a setting does; the message names the first one.
+            InputError: a setting does, such as an address to connect to; the message
+                names the first one.
         """
         if self.powers:
             power = self.powers[0]
@@ -484,10 +510,10 @@ class Config(BaseModel):
 
     @classmethod
     def get_shared_settings(cls, other: Config) -> dict[str, object]:
-        """Return the settings of another configuration that this command has, too.
+        """Return the settings of another configuration that this command also has.
 
-        They are those of the nearest common class, but for where the run is stored and
-        which workers compute it.
+        They are the settings of the nearest common class, except for the location of
+        the run and the workers that compute it.
         """
         # the first one that fits: `__mro__` has the nearest class first
         common_class = next(
@@ -576,8 +602,10 @@ class Config(BaseModel):
         return (self.command,)
 
     def make_repeatable(self) -> Self:
-        """Return the settings that `run.yaml` stores: with absolute paths of files, and
-        without where the run is stored, which a repetition decides for itself.
+        """Return the settings in the form that `run.yaml` stores.
+
+        Paths of files are absolute. The location of the run is left out, since a
+        repetition gets its own.
         """
         absolute = {}
         for name in FILES:
@@ -603,10 +631,10 @@ class Config(BaseModel):
         return [part.text for part in self._python_only_parts]
 
     def get_deciding_settings(self) -> JsonObject:
-        """Return the settings that the numbers of a run depend on, as JSON values: all
-        that are not `free`.
+        """Return the settings on which the numbers of a run depend, as JSON values.
 
-        Of a file only the name is returned, since it may have been moved.
+        They are all settings that are not in `free`. A file is represented by its name
+        without directories, since it may have been moved.
         """
         values = {
             name: value
@@ -639,8 +667,9 @@ def _check_shallow(config: type[Config], data: Mapping[str, Any]) -> None:
 
 
 def _read_mappings(config: type[Config], data: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values of settings, with those that are mappings read from the text or
-    the texts in which they were given.
+    """Convert texts of settings that are mappings, such as "pose.yaw=3", to mappings.
+
+    A text or a list of texts is converted; other values are returned unchanged.
 
     Raises:
         SettingsError: a text cannot be read.
@@ -683,13 +712,14 @@ def format_python_only(parts: Sequence[str]) -> str:
 
 
 def _make_settings_error(config: type[Config], errors: Sequence[Any]) -> AdvsearchError:
-    """Return one error for pydantic's errors, in the words of the settings; of each
-    setting it has the first one only.
+    """Convert pydantic's errors to one error in the words of the settings.
+
+    Only the first error of each setting is reported.
 
     Args:
-        config: the class with the settings.
-        errors: pydantic's errors. "loc" is the name of the setting, perhaps with that
-            of an entry of its mapping; "input" the value.
+        config: class with the settings.
+        errors: errors of pydantic. "loc" is the name of the setting, perhaps followed
+            by the name of an entry of its mapping; "input" is the wrong value.
     """
     declared = settings(config)
     known = {setting.name: setting for setting in declared}
@@ -713,11 +743,10 @@ def _make_settings_error(config: type[Config], errors: Sequence[Any]) -> Advsear
 
 
 def _make_absolute(name: str) -> str:
-    """Return a name with the path of its file made absolute; what is no file stays as
-    it is.
+    """Make the path of a file in a setting absolute.
 
-    Of two files as in ``camera.csv+object.csv`` each gets its path, and the node in
-    ``scene.glb#NODE`` stays.
+    In ``camera.csv+object.csv`` both paths become absolute. The node in
+    ``scene.glb#NODE`` is kept. A name that is no file is returned unchanged.
     """
     paths = split_paths(name)
     if len(paths) > 1:

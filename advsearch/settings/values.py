@@ -24,12 +24,11 @@ MAX_INTEGER = 2**63 - 1
 
 
 def to_python(value: Any) -> Any:
-    """Return a value with the numbers and arrays of numpy and torch in it turned into
-    Python's.
+    """Convert numbers and arrays of numpy and torch inside of a value to Python's.
 
-    It must not be nested too deeply (`is_shallow`).
+    The value must not be nested too deeply (`is_shallow`), since this is recursive.
     """
-    # a mapping that also holds a function, which a plain one would lose
+    # This mapping also holds a function, which a plain dict would lose.
     if isinstance(value, PythonQuantiles):
         return value
     if isinstance(value, Mapping):
@@ -92,10 +91,10 @@ def unique_names_validator(*names: str) -> Any:
 
 
 def are_all_finite(value: Any) -> bool:
-    """Return whether all numbers in a value are finite, and integers at most
-    `MAX_INTEGER` in size.
+    """Return whether all numbers in a value are finite and not too large.
 
-    It must not be nested too deeply (`is_shallow`).
+    Integers are at most `MAX_INTEGER` in size. The value must not be nested too deeply
+    (`is_shallow`), since this is recursive.
     """
     if isinstance(value, Mapping):
         return all(are_all_finite(inner) for inner in value.values())
@@ -119,10 +118,16 @@ def parse_number_or_text(value: Any) -> Any:
 
 
 def parse_assignment(text: str, where: str) -> tuple[str, Any]:
-    """Parse ``NAME=VALUE``; the value is read as YAML, or as plain text if it is none.
+    """Parse ``NAME=VALUE``, such as "camera.azimuth=130".
+
+    The value is parsed as YAML; if that fails, it is plain text.
+
+    Args:
+        text: the text.
+        where: setting or flag for the message, such as "--set".
 
     Raises:
-        InputError: there is no ``=``, or the name is empty; it names `where` ("--set").
+        InputError: there is no ``=``, or the name is empty.
     """
     name, separator, value = text.partition("=")
     if not (separator and name.strip()):
@@ -157,11 +162,16 @@ FOR_ALL = "*"  # the name of the choice for everything without a choice of its o
 
 
 def parse_choices(texts: Iterable[str], setting: str) -> dict[str, object]:
-    """Parse texts ``NAME=VALUE`` into a mapping; a text without a name becomes the
-    value of `FOR_ALL`.
+    """Parse texts ``NAME=VALUE`` into a mapping.
+
+    A text without "=" is a value for all names, and is stored under `FOR_ALL`.
+
+    Args:
+        texts: the texts.
+        setting: name of the setting, for messages.
 
     Raises:
-        InputError: there are two values for one name; it names the setting.
+        InputError: there are two values for one name.
     """
     pairs = [
         parse_assignment(text, setting) if "=" in text else (FOR_ALL, text)
@@ -172,15 +182,19 @@ def parse_choices(texts: Iterable[str], setting: str) -> dict[str, object]:
 
 
 def parse_controls(texts: Iterable[str], where: str) -> dict[str, object]:
-    """Parse controls with their settings: ``texture,pose``, ``texture={resolution:
-    64}``, ``pose={...},x={...}``.
+    """Parse controls with their settings into a mapping.
+
+    Texts are ``texture,pose``, ``texture={resolution: 64}`` or ``pose={...},x={...}``.
 
     Args:
-        texts: the texts; several controls in one have commas between them.
-        where: the setting or flag, for errors.
+        texts: texts, each with one control or with several between commas.
+        where: setting or flag, for errors.
+
+    Returns:
+        Settings by control; {} for a control without settings.
 
     Raises:
-        InputError: settings are no mapping, or a control comes twice.
+        InputError: braces do not contain a mapping, or a control occurs twice.
     """
     controls: list[tuple[str, Any]] = []
     for text in texts:
@@ -191,7 +205,7 @@ def parse_controls(texts: Iterable[str], where: str) -> dict[str, object]:
                 controls.append((entry.strip(), {}))
                 continue
             name, settings = parse_assignment(entry, where)
-            # braces that YAML could not read were left as text
+            # A value in braces that is not YAML remains a text.
             if isinstance(settings, str) and settings.startswith("{"):
                 raise InputError(
                     f"{where}: expected {{PARAMETER: VALUE or [LOW, HIGH], ...}} for "
@@ -205,9 +219,9 @@ def parse_controls(texts: Iterable[str], where: str) -> dict[str, object]:
 
 
 def _split_outside_brackets(text: str) -> list[str]:
-    """Split a text at its commas, but not at those inside of brackets.
+    """Split a text at its commas, except those inside of brackets or braces.
 
-    A bracket that is quoted inside of brackets is none.
+    Brackets in quotes do not count, if the quotes are inside of brackets.
     """
     entries = [""]
     depth = 0  # how many brackets are open
@@ -276,15 +290,16 @@ NAME_SETTINGS = (
 def read_yaml(path: str | Path, above: tuple[Path, ...] = ()) -> dict[str, object]:
     """Read the mapping in a YAML file, merged over the files that its `base` names.
 
-    A base is a file, relative to this one, or a list of files, of which a later one
-    overrides an earlier one.
+    `base` is a file, relative to this one, or a list of files. A later file overrides
+    the earlier ones, and this file overrides all of them.
 
     Args:
         path: path of the file.
-        above: the files that name this one as their base.
+        above: files that name this one as their base, directly or not; by these a file
+            that is a base of itself is found.
 
     Raises:
-        FileFormatError: it is missing, not YAML or no mapping from names.
+        FileFormatError: the file is missing, not YAML, or not a mapping from names.
     """
     data = parse_text(
         path,
@@ -320,11 +335,11 @@ def _read_bases(path: str | Path, value: Any, depth: int) -> list[str]:
 
     Args:
         path: path of the file, for errors.
-        value: the value of `base`; None or empty for no file.
-        depth: how many files name this one as their base, directly or not.
+        value: value of `base`: a file or a list of files; None or empty for no file.
+        depth: number of files that name this one as their base, directly or not.
 
     Raises:
-        FileFormatError: it is something else, or there are too many files.
+        FileFormatError: the value has another type, or there are too many files.
     """
     bases = value or []
     if isinstance(bases, str):
@@ -359,16 +374,16 @@ def merge_mappings(
 
 
 def set_dotted(data: dict[str, object], name: str, value: object) -> None:
-    """Set the value of a dotted name in nested mappings: ``controls.pose.yaw`` is
-    ``data["controls"]["pose"]["yaw"]``.
+    """Set the value of a dotted name in nested mappings.
 
-    A text or a list on the way becomes a mapping first. What follows ``set.`` or
-    ``grid.`` is a single name, since names of parameters have dots.
+    ``controls.pose.yaw`` sets ``data["controls"]["pose"]["yaw"]``. A text or a list at
+    one of these names becomes a mapping first. The text after ``set.`` or ``grid.`` is
+    a single name, since names of parameters have dots themselves.
 
     Args:
-        data: the mapping, which is changed.
+        data: mapping of settings, which is changed in place.
         name: the dotted name.
-        value: the value.
+        value: the new value.
     """
     first, _, rest = name.partition(".")
     if not rest:

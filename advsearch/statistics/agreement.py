@@ -34,11 +34,18 @@ MAX_CORRELATION = 0.9999  # up to which Fisher's z is computed
 
 
 def compute_kappa(first: npt.ArrayLike, second: npt.ArrayLike) -> float:
-    """Compute Cohen's kappa of two outcomes (n,) bool: agreement beyond chance.
+    """Compute Cohen's kappa of two outcomes: how much they agree beyond chance.
 
-    (p - e) / (1 - e) with p the rate at which they agree and e that of independent
-    outcomes (Cohen 1960, "A coefficient of agreement for nominal scales"). NaN if both
-    are constant, or there are no rows.
+    It is (p - e) / (1 - e), where p is the rate at which they agree, and e is the rate
+    at which independent outcomes with the same frequencies would agree (Cohen 1960, "A
+    coefficient of agreement for nominal scales").
+
+    Args:
+        first, second: (n,) bool, whether each outcome happens in each row.
+
+    Returns:
+        Kappa, 1 for full agreement and 0 for agreement by chance; NaN if both outcomes
+        are constant and equal, or there are no rows.
     """
     first = np.asarray(first, dtype=bool)
     second = np.asarray(second, dtype=bool)
@@ -54,10 +61,17 @@ def compute_kappa(first: npt.ArrayLike, second: npt.ArrayLike) -> float:
 
 
 def compute_rank_correlation(first: npt.ArrayLike, second: npt.ArrayLike) -> float:
-    """Compute Spearman's rank correlation of two measurements (n,), ties by mean ranks.
+    """Compute Spearman's rank correlation of two measurements.
 
-    Spearman 1904, "The proof and measurement of association between two things". NaN
-    with fewer than three rows, or if one of the measurements is constant.
+    It is the correlation of their ranks; equal values get the mean of their ranks
+    (Spearman 1904, "The proof and measurement of association between two things").
+
+    Args:
+        first, second: (n,) measurements of the same rows.
+
+    Returns:
+        The coefficient in [-1, 1]; NaN with fewer than three rows, or if one of the
+        measurements is constant.
     """
     first_rank = rankdata(first)
     second_rank = rankdata(second)
@@ -77,14 +91,14 @@ def correlation_interval(
 ) -> tuple[float, float] | None:
     """Return the 95 % interval of a coefficient of two measurements of the same rows.
 
-    Rows come in units, such as the drives that frames are from: rows of one unit may
-    depend on each other, units do not. The interval is that of the jackknife, which
-    leaves out one unit at a time, on the scale of Fisher's z (atanh), on which the
-    coefficient is nearly normally distributed.
+    Rows are grouped in units, such as the drives that frames come from. Rows of one
+    unit may depend on each other, but units are independent. The variance comes from
+    the jackknife: the coefficient is computed again without each unit. Its values are
+    transformed by Fisher's z = atanh(r) first, which makes them nearly normal.
 
     Args:
-        statistic: returns the coefficient, in [-1, 1], of both measurements of some
-            rows: `compute_kappa` or `compute_rank_correlation`.
+        statistic: function that computes the coefficient, in [-1, 1], from both
+            measurements: `compute_kappa` or `compute_rank_correlation`.
         first, second: (n,) measurements.
         units: (n,) unit of each row.
 
@@ -109,8 +123,9 @@ def correlation_interval(
     if not math.isfinite(value) or not np.isfinite(values_without_unit).all():
         return None
     z = _to_fisher_z(values_without_unit)
+    # variance by the jackknife (Efron and Stein 1981)
     variance = (n_units - 1) / n_units * float(((z - z.mean()) ** 2).sum())
-    probability = (1.0 + CONFIDENCE) / 2.0  # below the upper end of the interval
+    probability = (1.0 + CONFIDENCE) / 2.0  # 0.975 lies below the upper bound
     half_width = float(stdtrit(n_units - 1, probability)) * math.sqrt(variance)
     center = float(_to_fisher_z(np.array(value)))
     # tanh turns Fisher's z into a coefficient again
@@ -133,15 +148,16 @@ def estimate_rate(
 ) -> tuple[float, tuple[float, float]]:
     """Return the rate of an event over all rows, and its 95 % interval over units.
 
-    Rows of one unit may depend on each other, units do not. The interval is Clopper and
-    Pearson's of as many independent rows as would have the variance over units (Korn
+    Rows of one unit may depend on each other, but units are independent. First the
+    effective number of rows is computed: so many independent rows would give the rate
+    the same variance. Then the interval is Clopper and Pearson's for that number (Korn
     and Graubard 1998, "Confidence intervals for proportions with small expected number
     of positive counts estimated from survey data"). If the event happens in all rows or
-    in none, each unit counts as one row.
+    in none, there is no variance, and each unit counts as one row.
 
     Args:
-        happens: (n,) bool, n > 0.
-        units: (n,) unit of each row.
+        happens: (n,) bool, whether the event happens in each row; n > 0.
+        units: (n,) unit of each row, such as the drive of a frame.
 
     Raises:
         InputError: there are no rows.
@@ -154,7 +170,8 @@ def estimate_rate(
     n_units = len(np.unique(units))
     if n_units == n_rows:
         return rate, clopper_pearson(int(event.sum()), n_rows)
-    # the variance of the rate, by the residuals of independent units
+    # The sums of residuals over units are independent, so their squares add up to the
+    # variance of the rate. m / (m - 1) corrects for the estimated mean of m units.
     unit_residual = sum_per_unit(event - rate, units)
     variance = float((unit_residual**2).sum()) / n_rows**2
     variance *= n_units / max(n_units - 1, 1)
@@ -167,13 +184,19 @@ def estimate_rate(
 def _count_effective_rows(
     rate: float, variance: float, n_rows: int, n_units: int
 ) -> float:
-    """Return how many independent rows would have the variance of a rate over units, no
-    more than there are rows.
+    """Return how many independent rows would give a rate the same variance.
 
-    n independent rows have the variance rate (1 - rate) / n. The ratio of the quantiles
-    makes up for the variance being estimated from few units.
+    The rate of n independent rows has the variance rate (1 - rate) / n, which is solved
+    for n. The squared ratio of Student's quantiles makes n smaller, since the variance
+    is estimated from few units (Korn and Graubard 1998).
+
+    Args:
+        rate: rate of the event over all rows.
+        variance: variance of this rate, estimated over units.
+        n_rows: number of rows, which is also the maximum of the result.
+        n_units: number of units.
     """
-    probability = (1.0 + CONFIDENCE) / 2.0  # below the upper end of the interval
+    probability = (1.0 + CONFIDENCE) / 2.0  # 0.975 lies below the upper bound
     quantile_ratio = float(
         stdtrit(n_rows - 1, probability) / stdtrit(n_units - 1, probability)
     )
@@ -182,8 +205,10 @@ def _count_effective_rows(
 
 
 def _make_beta_interval(successes: float, trials: float) -> tuple[float, float]:
-    """Return Clopper and Pearson's 95 % interval of a rate (`clopper_pearson`) for
-    numbers of successes and trials that need not be whole.
+    """Return Clopper and Pearson's 95 % interval of a success rate.
+
+    Unlike in `clopper_pearson`, successes and trials need not be integers. The bounds
+    are quantiles of beta distributions.
     """
     tail = (1.0 - CONFIDENCE) / 2.0
     failures = trials - successes

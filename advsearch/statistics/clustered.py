@@ -50,8 +50,10 @@ def sum_per_unit(values: npt.ArrayLike, units: IntArray) -> FloatArray:
 
 
 def mean_rate(counted: npt.ArrayLike, rows: npt.ArrayLike) -> float:
-    """Return the mean over units (groups of rows) of the rate of an event in each; NaN
-    if none has a row.
+    """Return the mean over units of the rate of an event in each unit.
+
+    A unit is a group of rows, such as the frames of one drive. All units have equal
+    weights. The result is NaN if no unit has a row.
 
     Args:
         counted: (n,) number of rows of each unit in which the event happens.
@@ -72,10 +74,10 @@ def mean_rate(counted: npt.ArrayLike, rows: npt.ArrayLike) -> float:
 def rate_interval(
     counted: npt.ArrayLike, rows: npt.ArrayLike, confidence: float = CONFIDENCE
 ) -> tuple[float, float]:
-    """Return the interval of the mean rate over units (`mean_rate`).
+    """Return the confidence interval of the mean rate over units (`mean_rate`).
 
-    It holds for any number of units. Where each has a single row, it is Clopper and
-    Pearson's.
+    It is valid for any number of units. If each unit has a single row, it is Clopper
+    and Pearson's; otherwise it comes from bets on the rates of the units.
 
     Args:
         counted: (n,) number of rows of each unit in which the event happens.
@@ -101,15 +103,21 @@ def rate_interval(
 
 
 def _betting_interval(samples: FloatArray, confidence: float) -> tuple[float, float]:
-    """Return the interval of the mean of independent samples (n,) in [0, 1], by bets.
+    """Return the interval of the mean of independent samples in [0, 1], by betting.
 
-    A number is left out if bets that the mean is larger, or that it is smaller, have
-    made more than is likely by chance (`ConfidenceSequence`).
+    For each candidate mean, a gambler bets that the true mean is larger, and another
+    that it is smaller. If the candidate is the true mean, neither gains on average. So
+    a candidate is excluded if one of them has gained too much (Waudby-Smith and Ramdas
+    2024, "Estimating means of bounded random variables by betting").
+
+    Args:
+        samples: (n,) samples.
+        confidence: between 0 and 1.
     """
     values, counts = np.unique(samples, return_counts=True)
-    # The capital of each side begins with 1. By chance it reaches 2 / (1 - confidence)
-    # with a probability of (1 - confidence) / 2 at most (Markov), for both sides
-    # together with 1 - confidence.
+    # Each gambler starts with the capital 1. By Markov's inequality the probability
+    # that chance turns it into 2 / (1 - confidence) is at most (1 - confidence) / 2,
+    # and at most 1 - confidence for the two together.
     winning_log_capital = np.log(2.0 / (1.0 - confidence))
 
     def is_not_too_small(mean: float) -> bool:
@@ -131,9 +139,9 @@ def mean_interval(
     """Return the 95 % interval of the mean of independent values (n,) in a range.
 
     Args:
-        values: the values.
-        low, high: bounds of the range. They have to be known before the values are:
-            the smallest and the largest value are none.
+        values: (n,) values in the range.
+        low, high: bounds of the range. They must be known before the values are
+            sampled. So do not use the smallest and the largest value.
     """
     samples = np.asarray(values, dtype=np.float64)
     if high <= low:
@@ -156,17 +164,17 @@ def compare_paired(
 ) -> tuple[float, tuple[float, float], float]:
     """Compare two outcomes of the same rows, which are clustered in units.
 
-    All units weigh the same (`mean_rate`). Where each has a single row, the exact
-    tests of Newcombe and McNemar are used.
+    All units have equal weights (`mean_rate`). If each unit has a single row, the
+    interval of Newcombe and the exact test of McNemar are used, otherwise bets.
 
     Args:
         first, second: (n,) bool, whether each outcome happens.
         units: (n,) unit of each row.
 
     Returns:
-        How much more often the second outcome happens; the 95 % interval of that; and
-        the p-value, in (0, 1], of the hypothesis that none happens more often. The
-        interval is without 0 where the p-value is at most 0.05.
+        The rate of the second outcome minus that of the first; the 95 % interval of
+        this difference; and the p-value, in (0, 1], of the hypothesis that neither
+        happens more often. If the p-value is at most 0.05, the interval excludes 0.
     """
     first = np.asarray(first, dtype=bool)
     second = np.asarray(second, dtype=bool)
@@ -174,7 +182,8 @@ def compare_paired(
     if len(np.unique(units)) == n_rows:
         return _compare_independent_rows(first, second)
     unit_rows = sum_per_unit(np.ones(n_rows), units)
-    # of each row: 0 where only the first happens, 1 where only the second does, else 1/2
+    # The value of a row is 0 if only the first outcome happens, 1 if only the second
+    # does, and 1/2 otherwise. So it lies in [0, 1], as the bets need it.
     advantage = (1.0 + second - 1.0 * first) / 2.0
     unit_advantage = sum_per_unit(advantage, units) / unit_rows
     lower, upper = _betting_interval(unit_advantage, CONFIDENCE)
@@ -186,12 +195,16 @@ def compare_paired(
 
 
 def _paired_p_value(unit_advantage: FloatArray) -> float:
-    """Return the p-value, in (0, 1], of the hypothesis that of two outcomes none
-    happens more often, by bets.
+    """Return the p-value of the hypothesis that two outcomes happen equally often.
+
+    It comes from bets that the mean advantage is over 1/2, and that it is under 1/2.
 
     Args:
-        unit_advantage: (m,) of each unit, in [0, 1]: over 1/2 if the second outcome
-            happens more often in it.
+        unit_advantage: (m,) advantage of the second outcome in each unit, in [0, 1];
+            1/2 means that both happen equally often there.
+
+    Returns:
+        The two-sided p-value, in (0, 1].
     """
     counts = np.ones(len(unit_advantage))  # each value counts once
     # bets that the second outcome happens more often, and that the first does
@@ -199,18 +212,22 @@ def _paired_p_value(unit_advantage: FloatArray) -> float:
         log_capital(0.5, unit_advantage, counts),
         log_capital(0.5, 1.0 - unit_advantage, counts),
     )
-    # one over the capital (Markov), twice as there are two sides
+    # By Markov's inequality one over the capital is a p-value. It is doubled, since the
+    # better one of two bets was chosen.
     return float(min(1.0, 2.0 * np.exp(-max_log_capital)))
 
 
 def _compare_independent_rows(
     first: npt.NDArray[np.bool_], second: npt.NDArray[np.bool_]
 ) -> tuple[float, tuple[float, float], float]:
-    """Compare two outcomes (n,) of independent rows by the tests of Newcombe and
-    McNemar.
+    """Compare two outcomes of independent rows by Newcombe's interval and McNemar's test.
+
+    Args:
+        first, second: (n,) bool, whether each outcome happens.
 
     Returns:
-        As `compare_paired`.
+        The rate of the second outcome minus that of the first, its 95 % interval, and
+        the p-value of the hypothesis that neither happens more often.
     """
     n_both = int((first & second).sum())
     n_first = int((first & ~second).sum())
@@ -235,21 +252,23 @@ def one_sided_p_value(
 ) -> float:
     """Return the one-sided p-value of fewer right predictions inside a rule.
 
-    Predictions come in units, such as the frames of a drive, which are independent of
-    each other and weigh the same. The hypothesis is that the rate of right predictions
-    is the same outside. The test is
+    A rule is a condition on the scene, such as "distance > 10"; predictions for scenes
+    that fulfil it are inside. They are grouped in units, such as the frames of a drive,
+    which are independent of each other and have equal weights. The null hypothesis is
+    that the rate of right predictions is the same inside and outside. The test is
 
-    - Fisher's exact one, where each unit has a single prediction;
-    - a permutation of units, where all have equally many and each lies inside or
-      outside;
-    - bets (`_betting_p_value`), which give a bound, elsewhere.
+    - Fisher's exact test if each unit has a single prediction;
+    - a permutation test of units if all units have equally many predictions and each
+      unit lies either inside or outside;
+    - a bound by bets (`_betting_p_value`) otherwise.
 
     Args:
         n_right_inside: (n,) right predictions of each unit inside.
         n_inside: (n,) predictions of each unit inside.
         n_right_outside: (n,) right predictions of each unit outside.
         n_outside: (n,) predictions of each unit outside.
-        copies: how many copies there are of each of these units.
+        copies: number by which all units are multiplied, to predict the p-value of a
+            larger sample; it need not be an integer.
     """
     right_inside = np.asarray(n_right_inside, dtype=np.float64)
     rows_inside = np.asarray(n_inside, dtype=np.float64)
@@ -300,13 +319,15 @@ def _fisher_p_value(
     """Return the one-sided p-value of Fisher's exact test.
 
     It is the probability that at most `right_inside` right predictions are inside, if
-    chance decides which predictions are.
+    chance decides which of all predictions are inside.
 
     Args:
-        right_inside, inside: right predictions inside, and all there.
-        right_outside, outside: likewise outside.
+        right_inside: number of right predictions inside.
+        inside: number of all predictions inside.
+        right_outside: number of right predictions outside.
+        outside: number of all predictions outside.
     """
-    # takes half a second, and a search needs none of it
+    # The import takes half a second, and a search does not need it.
     from scipy.stats import hypergeom
 
     n_predictions = inside + outside
@@ -317,17 +338,18 @@ def _fisher_p_value(
 def _permutation_p_value(
     unit_right: FloatArray, *, n_inside: int, n_right_inside: float, times: float
 ) -> float:
-    """Return the one-sided p-value of a permutation test over units of equal size: how
-    often chance puts at most as many right predictions inside.
+    """Return the one-sided p-value of a permutation test over units of equal size.
 
-    Units with equally many right predictions are the same, so that only their numbers
-    are sampled.
+    A permutation chooses by chance which units are inside. The p-value is the fraction
+    of permutations with at most `n_right_inside` right predictions inside. Units with
+    equally many right predictions are interchangeable, so that only the number of units
+    of each kind is sampled.
 
     Args:
-        unit_right: (n,) right predictions of each unit.
-        n_inside: units inside, copies included.
-        n_right_inside: their right predictions.
-        times: copies of each unit.
+        unit_right: (n,) number of right predictions of each unit.
+        n_inside: number of units inside, copies included.
+        n_right_inside: number of right predictions in these units.
+        times: number of copies of each unit.
     """
     values, n_units = np.unique(unit_right, return_counts=True)
     n_units = np.round(times * n_units).astype(np.int64)
@@ -338,25 +360,27 @@ def _permutation_p_value(
     sampled_units = rng.multivariate_hypergeometric(
         n_units, n_sampled, N_PERMUTATIONS, method="marginals"
     )
-    is_as_few = sampled_units @ values <= n_right_inside + 1e-9  # but for rounding
+    is_as_few = sampled_units @ values <= n_right_inside + 1e-9  # 1e-9 for rounding
     # what was observed counts as one of the permutations
     return float((1 + is_as_few.sum()) / (1 + N_PERMUTATIONS))
 
 
 def _betting_p_value(rates: FloatArray, *, is_cut: bool, times: float) -> float:
-    """Return a bound of the p-value of fewer right predictions inside: one over the
-    capital of bets (Markov).
+    """Return an upper bound of the p-value of fewer right predictions inside.
 
-    For every rate m that may be the same inside and outside (`NULL_RATES`), a gambler
-    bets on "less than m inside, more than m outside"; the smallest capital counts. It
-    is a bound also where units differ.
+    The null hypothesis is that the rate of right predictions is some m both inside and
+    outside. For each m (`NULL_RATES`) a gambler bets on "less than m inside, more than
+    m outside". By Markov's inequality one over the final capital bounds the p-value;
+    the smallest capital over all m is used, as m is unknown. The bound also holds if
+    units have different rates.
 
     Args:
-        rates: (n, 4) of each unit: the rate of wrong predictions inside, 1 if it has
-            any inside, the rate of right ones outside, 1 if it has any outside.
-        is_cut: whether a unit has predictions both inside and outside: then half is
-            staked on either.
-        times: copies of each unit.
+        rates: (n, 4) with columns for each unit: the rate of wrong predictions inside;
+            1 if the unit has any predictions inside, else 0; the rate of right ones
+            outside; 1 if it has any outside, else 0.
+        is_cut: whether some unit has predictions both inside and outside. Then half of
+            the stake is put on each side, so that no unit can lose more than all.
+        times: number of copies of each unit.
     """
     distinct_rates, n_units = np.unique(rates, axis=0, return_counts=True)
     wrong_inside, is_inside, right_outside, is_outside = (

@@ -57,13 +57,13 @@ def wilson_interval(rate: Any, n: Any) -> tuple[Any, Any]:
     """Return Wilson's 95 % score interval (1927) of rates of n trials.
 
     Args:
-        rate: the fractions of successes, a number or an array.
-        n: numbers of trials, likewise.
+        rate: fraction of successes, a number or an array.
+        n: number of trials, a number or an array of the same shape.
 
     Returns:
-        The lower and the upper bounds, likewise.
+        The lower and the upper bound, in the shape of `rate`.
     """
-    # 1.96: the normal distribution has 2.5 % above it
+    # The normal distribution has 2.5 % above 1.96.
     z = float(ndtri(0.5 + CONFIDENCE / 2.0))
     center = rate + z * z / (2 * n)
     half_width = z * np.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))

@@ -43,8 +43,8 @@ def _fit_falling(
     """Fit rates (m,) that do not rise with the distance, by isotonic regression.
 
     Args:
-        right: (m,) images that are right at each distance, the nearest first.
-        counts: (m,) images at each distance.
+        right: (m,) number of right images at each distance, the nearest first.
+        counts: (m,) number of images at each distance.
     """
     from scipy.optimize import isotonic_regression  # takes a quarter of a second
 
@@ -57,19 +57,21 @@ def _fit_falling(
 def find_dips(
     distances: Sequence[float], right: NDArray[np.int64], counts: NDArray[np.int64]
 ) -> tuple[Dip, ...]:
-    """Find dips: distances, the nearest first, at which an object is recognised less
-    often than beyond.
+    """Find dips: distances at which an object is recognised less often than beyond.
 
-    Each distance is compared with each run of distances right behind it by Fisher's
-    exact one-sided test, and the p-values are multiplied by the number of comparisons
-    (Bonferroni). If the true rate falls with the distance, at most one curve in twenty
-    has a significant dip (`benchmarks/first_seen.py --simulated`). Other dips are
-    listed too, and may be chance.
+    Each distance is compared with every range of distances that begins right behind it,
+    by Fisher's exact one-sided test. The p-values are multiplied by the number of
+    comparisons (Bonferroni). If the true rate falls with the distance, at most one
+    curve in twenty has a significant dip (`benchmarks/first_seen.py --simulated`).
+    Other dips are returned too, and may be chance.
 
     Args:
-        distances: m distances, ascending.
-        right: (m,) images that are right at each.
-        counts: (m,) images at each.
+        distances: m distances in ascending order.
+        right: (m,) number of images with a right prediction at each distance.
+        counts: (m,) number of images at each distance.
+
+    Returns:
+        At most one dip for each distance, the nearest first.
     """
     from scipy.stats import hypergeom  # takes half a second
 
@@ -80,7 +82,8 @@ def find_dips(
     counts_before = np.concatenate([[0], np.cumsum(counts)])
     dips = []
     for near in range(n_distances - 1):
-        # the runs of distances right behind it, by the index after their last one
+        # Every range that begins right behind this distance, by the index after its
+        # last distance.
         end = np.arange(near + 2, n_distances + 1)
         right_beyond = right_before[end] - right_before[near + 1]
         counts_beyond = counts_before[end] - counts_before[near + 1]
@@ -95,7 +98,7 @@ def find_dips(
         is_dip = right[near] / counts[near] < right_beyond / counts_beyond
         if not is_dip.any():
             continue
-        # the run with the clearest difference
+        # the range with the clearest difference
         best = int(np.argmin(np.where(is_dip, p_values, np.inf)))
         dip = Dip(
             distance=float(distances[near]),

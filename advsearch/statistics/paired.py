@@ -38,8 +38,10 @@ def paired_difference(
     correlation = _phi_coefficient(both, first, second, neither)
 
     def combine(second_distance: float, first_distance: float) -> float:
-        """Return how far a bound of the difference is from the difference, by how far
-        the bounds of both rates are from the rates.
+        """Return the distance from the difference to one of its bounds.
+
+        The arguments are the distances from both rates to their bounds. They add up as
+        standard deviations of correlated variables do.
         """
         squared = (
             second_distance * second_distance
@@ -59,7 +61,8 @@ def _phi_coefficient(both: int, first: int, second: int, neither: int) -> float:
     """Return the correlation of two outcomes, with Newcombe's continuity correction.
 
     Args:
-        both, first, second, neither: counts of pairs, as for `paired_difference`.
+        both, first, second, neither: numbers of pairs in which both outcomes happen,
+            only the first, only the second, or neither.
     """
     product = (both + first) * (second + neither) * (both + second) * (first + neither)
     if not product:  # an outcome that happens always or never
@@ -73,14 +76,13 @@ def _phi_coefficient(both: int, first: int, second: int, neither: int) -> float:
 
 
 def mcnemar(first: int, second: int) -> float:
-    """Return the p-value, in (0, 1], of McNemar's exact two-sided test of two paired
-    outcomes.
+    """Return the p-value of McNemar's exact two-sided test of two paired outcomes.
 
-    The hypothesis is that neither happens more often. Then the pairs in which only one
-    of them happens are throws of a fair coin, and the p-value is the probability that
-    these fall so unevenly: twice the smaller tail of the binomial distribution (McNemar
-    1947, "Note on the sampling error of the difference between correlated proportions
-    or percentages").
+    The null hypothesis is that neither outcome happens more often. Then the pairs in
+    which only one of them happens are tosses of a fair coin. The p-value, in (0, 1], is
+    the probability of tosses at least as uneven as these: twice the smaller tail of the
+    binomial distribution (McNemar 1947, "Note on the sampling error of the difference
+    between correlated proportions or percentages").
 
     Args:
         first: number of pairs in which only the first outcome happens.

@@ -17,13 +17,14 @@ from advsearch.statistics.intervals import CONFIDENCE
 
 
 def find_threshold(is_beyond: Callable[[float], bool]) -> float:
-    """Return the number in (0, 1) from which on a condition holds, by bisection.
+    """Find by bisection the number in (0, 1) above which a condition holds.
 
-    0 if it holds everywhere, 1 if it holds nowhere.
+    The result is 0 if the condition holds everywhere, and 1 if it holds nowhere.
 
     Args:
-        is_beyond: the condition; below some number it is false, and true above.
+        is_beyond: the condition. It is false below some number, and true above it.
     """
+    # not 0 and 1 themselves, by which a caller may have to divide
     low = 1e-9
     high = 1.0 - 1e-9
     if is_beyond(low):
@@ -119,10 +120,11 @@ class ConfidenceSequence:
         return lower, upper
 
     def _has_won(self, mean: float, counts: Mapping[float, int]) -> bool:
-        """Return whether bets on "more than `mean`" have made more of samples than is
-        likely by chance.
+        """Return whether bets on "more than `mean`" have gained more than chance allows.
 
-        Further samples may bring the capital below the threshold again.
+        If `mean` is the true mean, the capital reaches the threshold with a probability
+        of at most 1 - confidence, divided by the number of sides (Ville's inequality).
+        Further samples may bring it below the threshold again.
 
         Args:
             mean: mean that the bets are on, in (0, 1).
@@ -133,14 +135,13 @@ class ConfidenceSequence:
 
 
 def count_needed_samples(mean: float, *, confidence: float, value: float = 1.0) -> int:
-    """Return how many samples, all of one value, show that the true mean is over a
-    number.
+    """Return how many equal samples show that the true mean exceeds a number.
 
-    It is shown by a one-sided `ConfidenceSequence`. With the value 1 it is the minimum:
-    no other samples show it sooner.
+    A one-sided `ConfidenceSequence` has to show it. With the value 1 the result is the
+    minimum for any samples, since 1 is the largest sample.
 
     Args:
-        mean: the number, in (0, 1).
+        mean: number that the true mean has to exceed, in (0, 1).
         confidence: confidence of the sequence.
         value: value of all samples, over `mean`.
     """
@@ -152,7 +153,8 @@ def count_needed_samples(mean: float, *, confidence: float, value: float = 1.0) 
     upper = 1
     while not is_enough(upper):
         upper *= 2
-    # bisection for the first count that is enough; its index is one less than it
+    # Bisection for the first count that is enough. The range begins with 1, so that a
+    # count is one more than its index.
     index = bisect_left(range(1, upper + 1), True, key=is_enough)
     return index + 1
 
@@ -174,10 +176,10 @@ def log_capital(
 ) -> float:
     """Return the logarithm of the capital that bets on "more than `mean`" have made.
 
-    The capital begins with 1, of which each of `STAKES` gets an equal part. A stake s
-    puts the fraction s of its capital on every sample x, which multiplies that capital
-    by 1 - s + s x / mean: by 1 on average if the mean is true. It is -inf if all is
-    lost.
+    The capital starts with 1 and is divided equally among strategies, one for each s of
+    `STAKES`. A strategy bets the fraction s of its capital on every sample x, which
+    multiplies its capital by 1 - s + s x / mean. If `mean` is the true mean, this
+    factor is 1 on average. The result is -inf if all capital is lost.
 
     Args:
         mean: mean that the bets are on, in (0, 1).

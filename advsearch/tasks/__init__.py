@@ -82,10 +82,11 @@ class FunctionTask(Task):
         return facts
 
     def loss(self, output: Any, truth: Facts) -> Tensor:
-        """Return what the function returns for the N outputs: how wrong each is, (N,).
+        """Compute how wrong each of N outputs is by the user's function, (N,).
 
         Raises:
-            InputError: it is something else than a floating-point number for each output.
+            InputError: the function returns something else than a floating-point number
+                for each output.
         """
         losses = self.function(copy_value(output), truth)
         n_outputs = len(output)
@@ -105,8 +106,10 @@ class FunctionTask(Task):
         )
 
     def predictions(self, output: Any, count: int = 1) -> list[tuple[Prediction, ...]]:
-        """Return the class with the largest output if classes have names, else the
-        numbers of the output.
+        """Return a prediction for each image.
+
+        It is the class with the largest output if there is a number for each label.
+        Otherwise it lists the numbers, or if there are many their shape and mean.
         """
         predictions_of_images: list[tuple[Prediction, ...]] = []
         for values in output.detach():

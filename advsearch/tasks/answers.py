@@ -84,8 +84,17 @@ class FreeAnswer(Task):
     def on(
         self, model: Model, *, target: str | None = None, minimise: bool = False
     ) -> FreeAnswer:
-        """See `Task.on`: the target is a word, or several separated by commas, of which
-        the answer has to contain one.
+        """Return the task for a model that answers in words.
+
+        Args:
+            model: the model, loaded for this task.
+            target: a word, or several separated by commas, of which the answer has to
+                contain one; None for any answer without a right word.
+            minimise: whether a right answer is sought.
+
+        Raises:
+            InputError: the model was loaded for its logits, or there are both a target
+                and `minimise`.
         """
         if model.read is None:  # its outputs are logits, as of a classifier
             raise InputError(
@@ -105,11 +114,13 @@ class FreeAnswer(Task):
     def read(
         self, returned: Any, count: int
     ) -> list[AnswerWithLogits | AnswersWithoutLogits]:
-        """Return the answers of a network, which have to be mappings, one for each
-        picture.
+        """Check what a network returned: a list with an answer for each image.
+
+        An answer is a mapping with its "text", the "logits" of its tokens, and a
+        function "begins" from a word to the tokens that may begin it; or with "texts".
 
         Raises:
-            ValueError: they are something else.
+            ValueError: the network returned something else.
         """
         if isinstance(returned, (list, tuple)) and all(map(_is_answer, returned)):
             return list(returned)
@@ -147,12 +158,12 @@ class FreeAnswer(Task):
     def loss(
         self, output: Sequence[AnswerWithLogits | AnswersWithoutLogits], truth: Words
     ) -> Tensor:
-        """Compute the loss of each answer, (N,).
+        """Compute the loss of each answer, (N,); over 0 for a wrong one.
 
         Without logits it is 1 - 2 s, where s is the fraction of right texts about the
-        image. With logits, p is the sigmoid of the lead of the tokens that begin a right
-        word (`_compute_token_margin`): the loss is log(1 - p) for a right answer and
-        -log(p) for a wrong one.
+        image. With logits, let p = sigmoid(m), where m is by how much the best token
+        that begins a right word exceeds all other tokens (`_compute_token_margin`). The
+        loss is log(1 - p) for a right answer and -log(p) for a wrong one.
         """
         losses = []
         for answer in output:
@@ -175,8 +186,9 @@ class FreeAnswer(Task):
     def predictions(
         self, output: Sequence[AnswerWithLogits | AnswersWithoutLogits], count: int = 1
     ) -> list[tuple[tasks.Prediction, ...]]:
-        """Return the texts about each image, the most frequent first, on one line and
-        without control characters.
+        """Return the `count` most frequent texts about each image.
+
+        Each text is on one line and has no control characters.
         """
         predictions_of_images = []
         for answer in output:
@@ -192,10 +204,15 @@ class FreeAnswer(Task):
         truth: Words,
         margins: Sequence[float],
     ) -> list[tasks.PredictionWithPayload]:
-        """See `Task.describe`: the most frequent of the texts about each image.
+        """Return the most frequent text about each image, and a payload.
 
-        If the prediction is right, only right texts are compared, else only wrong ones.
-        The payload has all texts, if there are several.
+        If the judgement is right, the most frequent right text is returned, otherwise
+        the most frequent wrong one. The payload has all texts if there are several.
+
+        Args:
+            output: answers about N images.
+            truth: right words.
+            margins: margin of each judgement; at least 0 if it is right.
         """
         results = list[tasks.PredictionWithPayload]()
         for answer, margin in zip(output, margins, strict=True):
@@ -219,17 +236,17 @@ def _is_answer(value: Any) -> bool:
 def _compute_token_margin(
     logits: Tensor, begins: Callable[[str], Sequence[int]], words: Words
 ) -> Tensor:
-    """Compute the lead of the tokens that begin one of the words over all others, at
-    the step of an answer at which it is largest.
+    """Compute how near an answer is to beginning one of the words.
 
     Args:
-        logits: (T, tokens) of each step of the answer.
-        begins: returns the tokens that may begin a word.
-        words: at least one.
+        logits: logits of all tokens at each step of the answer, (T, tokens).
+        begins: function from a word to the tokens that may begin it.
+        words: at least one word.
 
     Returns:
-        The largest logit of these tokens minus the largest of all others, (), at the
-        step at which that difference is largest.
+        The largest logit of a token that begins one of the words, minus the largest
+        logit of the other tokens, (). It is taken at the step at which it is largest,
+        since a word may stand anywhere in the answer.
 
     Raises:
         InputError: no token begins one of the words.

@@ -87,8 +87,14 @@ class Judgement:
     ) -> Judgement:
         """Create the judgement of an output.
 
-        If its margin is not finite, the prediction is `NOT_A_NUMBER`, neither right nor
-        a success, without a payload.
+        If the margin is not finite, the model returned NaN or infinity. Then the
+        prediction is `NOT_A_NUMBER`, which is neither right nor a success.
+
+        Args:
+            score: how near the output is to what is sought; over 0 for a success.
+            margin: minus the loss; at least 0 for a right output.
+            prediction: prediction for the user.
+            payload: further values for the stored row; None for none.
         """
         if not math.isfinite(margin):
             not_a_number = Prediction(NOT_A_NUMBER)
@@ -185,10 +191,10 @@ class Facts:
 
     @cached_property
     def sight(self) -> Sight:
-        """What is visible in the configuration, computed once, on first use.
+        """What is visible in the configuration; computed at the first access only.
 
         Raises:
-            InputError: the facts belong to no configuration.
+            InputError: these are facts of the scene, and not of a single configuration.
         """
         if self.compute_sight is None:
             raise InputError(
@@ -226,11 +232,13 @@ class Facts:
 
     @cached_property
     def box(self) -> tuple[int, int, int, int] | None:
-        """The smallest box around the visible part of the object: x0, y0, x1, y1 in
-        pixels from the top left.
+        """The smallest box around the visible part of the object, (x0, y0, x1, y1).
 
-        Its pixels have x0 <= x < x1 and y0 <= y < y1. None if the object is out of
-        view. Raises InputError as `sight`.
+        The unit is pixels from the top left; pixels of the box have x0 <= x < x1 and y0
+        <= y < y1. It is None if the object is out of view.
+
+        Raises:
+            InputError: these are facts of the scene, and not of a single configuration.
         """
         columns = self.mask.any(dim=0).nonzero().flatten().tolist()
         rows = self.mask.any(dim=1).nonzero().flatten().tolist()
@@ -245,6 +253,9 @@ class Facts:
 
     def get_number(self, name: str) -> float:
         """Return the value of a parameter in this configuration.
+
+        Args:
+            name: name of the parameter, such as "pose.yaw".
 
         Raises:
             InputError: the scene has no such parameter.
@@ -299,7 +310,8 @@ class Task(ABC):
     def __init_subclass__(cls, **keywords: Any) -> None:
         """Make methods of a user's class get copies of their arguments.
 
-        So they may change what they get, and nothing else changes with it.
+        So a method may change its arguments in place without changing the search. The
+        list below has the methods that get outputs or the truth.
         """
         super().__init_subclass__(**keywords)
         receive_copies: tuple[Callable[..., Any], ...] = (
@@ -325,9 +337,9 @@ class Task(ABC):
         """Check options that are numbers.
 
         Args:
-            fits: whether a value is in range.
-            expected: the range in words.
-            *names: names of the options.
+            fits: function that returns whether a value is in range.
+            expected: the range in words, such as "a number between 0 and 1".
+            *names: names of the options, which are attributes of the task.
 
         Raises:
             InputError: a value is not a number, or does not fit.
@@ -433,9 +445,9 @@ class Task(ABC):
         """Return the task for one model, with what is sought.
 
         Args:
-            model: whose output it will evaluate.
-            target: the label that the model should predict; None for any wrong one.
-            minimise: a right prediction is sought.
+            model: model whose outputs the task will evaluate.
+            target: label that the model should predict; None for any wrong one.
+            minimise: whether a right prediction is sought.
 
         Raises:
             InputError: there is no such target, or the task has none.
@@ -531,7 +543,12 @@ class Task(ABC):
     # ---- judgement ----
 
     def judge(self, output: Output, truth: Truth) -> list[Judgement]:
-        """Evaluate each of N outputs."""
+        """Judge each of N outputs: its score, margin, prediction and payload.
+
+        Args:
+            output: output of the model for N images.
+            truth: truth of the scene.
+        """
         with torch.no_grad():
             scores = self.score(output, truth).tolist()
             # not `-loss`, which would be -0.0 for a loss of 0
@@ -561,11 +578,12 @@ class Task(ABC):
 def most_frequent_judgement(judgements: Sequence[Judgement]) -> Judgement:
     """Return a judgement with the most frequent of several predictions.
 
-    Of equally frequent ones it is that with the lowest class index. Score, margin and
-    probability are the means of the judgements with this prediction.
+    Of equally frequent predictions it is the one with the lowest class index. Score,
+    margin and probability are means over the judgements with this prediction.
 
     Args:
-        judgements: at least one.
+        judgements: judgements of several images of the same configuration, at least
+            one.
     """
     label_and_index = [(x.prediction.label, x.prediction.index) for x in judgements]
     counts = Counter(label_and_index)

@@ -39,8 +39,8 @@ def compute_iou(boxes: Tensor, box: Tensor) -> Tensor:
     """Compute the intersection over union of boxes with one box; differentiable.
 
     Args:
-        boxes: (D, 4).
-        box: (4,), or any shape that broadcasts.
+        boxes: (D, 4), corners x0, y0, x1, y1.
+        box: (4,), or any shape (..., 4) that broadcasts.
 
     Returns:
         (D,) in [0, 1].
@@ -84,8 +84,9 @@ def to_corners(boxes: Tensor, form: str) -> Tensor:
 def suppress_class(boxes: Tensor, scores: Tensor, iou: float) -> Tensor:
     """Apply greedy non-maximum suppression to the boxes of one class.
 
-    Each round keeps the undecided boxes that no better undecided box overlaps, and
-    removes those that they overlap.
+    The greedy method takes the best box, removes the boxes that it overlaps, and
+    repeats this. Here a round takes all undecided boxes that no better undecided box
+    overlaps, which has the same result in fewer steps.
 
     Args:
         boxes: (D, 4).
@@ -93,12 +94,11 @@ def suppress_class(boxes: Tensor, scores: Tensor, iou: float) -> Tensor:
         iou: intersection over union from which a better box suppresses another.
 
     Returns:
-        Which boxes survive, (D,) bool; none of those beyond the best `MAX_SUPPRESSED`
-        does.
+        Which boxes survive, (D,) bool. Only the best `MAX_SUPPRESSED` boxes can.
     """
     order = scores.argsort(descending=True)[:MAX_SUPPRESSED]
     sorted_boxes = boxes[order]
-    # 256 rows at a time, which bounds the memory of what `compute_iou` computes
+    # 256 rows at a time, to bound the memory of the intermediate results
     overlap_chunks = [
         compute_iou(sorted_boxes, chunk[:, None]) >= iou
         for chunk in sorted_boxes.split(256)
@@ -112,7 +112,7 @@ def suppress_class(boxes: Tensor, scores: Tensor, iou: float) -> Tensor:
         survives = survives | (undecided & ~has_better_rival)
         is_suppressed = (is_overlapped & survives).any(dim=1)
         undecided = undecided & ~survives & ~is_suppressed
-    # back into the order of the arguments
+    # from the order of scores back to the order of the arguments
     result = torch.zeros(len(boxes), dtype=torch.bool, device=boxes.device)
     result[order] = survives
     return result
@@ -156,8 +156,8 @@ def compute_iou_with_truth(detections: Detections, truth: DetectionTruth) -> Ten
 def suppress(detections: Detections, min_score: float, iou: float) -> Detections:
     """Set the scores of suppressed boxes to 0, class by class.
 
-    The choice of boxes has no derivative; the scores that remain have. Boxes that come
-    with labels stay as they are.
+    The choice of boxes is not differentiable, but the scores that remain are. Boxes
+    with labels are returned unchanged: networks return them after suppression.
 
     Args:
         detections: detections of one image, with a score of every class.
@@ -210,10 +210,13 @@ def list_boxes(
 
 
 def _top_scores(detections: Detections) -> tuple[Tensor, Tensor, Tensor]:
-    """Return row, class and score, (K,) each, of the best scores in descending order.
+    """Return the best scores of an image in descending order, with box and class.
 
-    K is at most `MAX_CANDIDATES`. A box with a score of every class may be there more
-    than once.
+    A box with a score for every class may occur several times.
+
+    Returns:
+        Indices of boxes, indices of classes, and scores, (K,) each; K is at most
+        `MAX_CANDIDATES`.
     """
     scores = detections["scores"].detach()
     top_scores, flat_index = scores.flatten().topk(min(MAX_CANDIDATES, scores.numel()))
@@ -351,8 +354,9 @@ class BoxFormat:
         return float((~has_fault).all(dim=0).float().mean())
 
     def describe_fault(self, boxes: Tensor) -> str:
-        """Describe the most frequent fault of boxes (D, 4); empty if most boxes are
-        plausible, or there are none.
+        """Describe the most frequent fault of boxes (D, 4), such as "90 % of them ...".
+
+        The text is empty if most boxes are plausible, or there are none.
         """
         if (
             not len(boxes)
@@ -367,11 +371,11 @@ class BoxFormat:
         return f"{100.0 * fraction_by_fault[worst]:.0f} % of them {worst}"
 
     def suggest_plausible_formats(self, boxes: Tensor) -> str:
-        """Return the end of a message about implausible boxes (D, 4): the options that
-        make them plausible; empty if no format does.
+        """Suggest options that make implausible boxes (D, 4) plausible.
 
-        If several formats do, only those that differ from this one in the fewest options
-        are suggested.
+        The text is the end of a message, and empty if no format helps. If several
+        formats help, those that differ from this one in the fewest options are
+        suggested.
         """
         alternatives = [
             BoxFormat(form, unit, self.input_size)
@@ -410,18 +414,20 @@ class BoxFormat:
     def suggest_better_format(
         self, boxes: Tensor, true_box: Tensor, min_iou: float
     ) -> str:
-        """Return the options of a format in which one of the boxes fits the true box much
-        better than in this format; empty if there is no such format.
+        """Suggest a format in which one of the boxes fits the true box much better.
+
+        In that format the best intersection over union has to reach `min_iou`, and has
+        to exceed the best one in this format by `MIN_IOU_GAIN`. The text is empty if
+        there is no such format.
 
         Args:
-            boxes: (D, 4), with a right class.
+            boxes: boxes of a right class, (D, 4), in the units of the output.
             true_box: the true box (4,) in fractions of width and height.
-            min_iou: minimum intersection over union in the suggested format, which must
-                exceed that in this one by `MIN_IOU_GAIN` too.
+            min_iou: minimum intersection over union in the suggested format.
         """
         if not len(boxes):
             return ""
-        # this format first: `max` returns the first of equally good ones
+        # This format comes first, since `max` returns the first of several best ones.
         candidates = [self]
         candidates += [
             BoxFormat(form, unit, self.input_size) for unit in UNITS for form in FORMS

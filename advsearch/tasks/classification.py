@@ -54,7 +54,13 @@ class ClassTask(Task):
         target: str | None = None,
         minimise: bool = False,
     ) -> ClassTaskType:
-        """See `Task.on`: the target is one of the model's classes, or several.
+        """Return the task for one model, with its labels.
+
+        Args:
+            model: model whose outputs the task will evaluate.
+            target: one class of the model that it should predict, or several separated
+                by commas; None for any wrong one.
+            minimise: whether a right prediction is sought.
 
         Raises:
             InputError: there is no such class, or the model's outputs are not what the
@@ -95,8 +101,10 @@ class ClassTask(Task):
         raise InputError(f"model {model.name}: {advice}")
 
     def _get_model_labels(self, model: Model) -> tuple[tuple[str, ...], bool]:
-        """Return the names of the classes that a model predicts, and whether they are
-        names or placeholders.
+        """Return the names of a model's classes, and whether they are real names.
+
+        If the model has no labels, placeholders are returned. To count its classes, the
+        model is run on a gray image.
         """
         gray_image = torch.full((1, *model.input_size, 3), 0.5)
         with torch.no_grad():
@@ -117,8 +125,12 @@ class ClassTask(Task):
         return None
 
     def find_right_classes(self, facts: Facts) -> Labels:
-        """Return the indices of the right classes: of the setting `label`, or else of
-        the object's own label.
+        """Return the indices of the right classes.
+
+        They come from the setting `label`, or from the object's own label without it.
+
+        Args:
+            facts: ground truth of the object, such as its label.
 
         Raises:
             InputError: the model has no such class, the object has no label, or a
@@ -151,9 +163,9 @@ class ClassTask(Task):
 
     @cached_property
     def nothing_classes(self) -> Labels:
-        """Indices of classes that stand for no thing, such as "background".
+        """Indices of classes that stand for no object, such as "background".
 
-        They do not count as predictions. Targets are left out: these count.
+        They do not count as predictions, unless they are targets.
         """
         if not self.named:
             return ()
@@ -193,8 +205,14 @@ class Classification(ClassTask):
         return self.find_right_classes(facts)
 
     def as_logits(self, output: Tensor, truth: Labels) -> Tensor:
-        """See `Task.as_logits`: a class that stands for no thing gets a logit of minus
-        infinity, unless it is right or there is no other wrong class.
+        """Return logits in which classes such as "background" cannot win.
+
+        Their logits become minus infinity, unless such a class is right or there is no
+        other wrong class.
+
+        Args:
+            output: logits (N, classes).
+            truth: indices of the right classes; empty if they are unknown.
         """
         excluded = set(self.nothing_classes) - set(truth)
         n_classes = output.shape[1]
@@ -222,7 +240,10 @@ class Classification(ClassTask):
         return self._rank_classes(self.as_logits(output, ()), count)
 
     def _rank_classes(self, logits: Tensor, count: int) -> list[tuple[Prediction, ...]]:
-        """Return the `count` likeliest classes of each row of logits (N, classes)."""
+        """Return the `count` most probable classes of each row of logits (N, classes).
+
+        A row with NaN has the only prediction `NOT_A_NUMBER`.
+        """
         probabilities = logits.detach().softmax(dim=1)
         if count == 1:  # of equal ones `argmax` returns the first, `topk` any
             top_classes = probabilities.argmax(dim=1, keepdim=True)
@@ -250,10 +271,14 @@ class Classification(ClassTask):
         return predictions_of_images
 
     def judge(self, output: Tensor, truth: Labels) -> list[Judgement]:
-        """See `Task.judge`; the logits are computed only once.
+        """Judge each of N outputs.
 
-        A subclass that defines `loss` or `score` computes logits for itself: its methods
-        are called as they are.
+        The result is that of `Task.judge`, but the logits are computed only once. If a
+        subclass defines `loss` or `score`, these methods are called instead.
+
+        Args:
+            output: logits (N, classes).
+            truth: indices of the right classes.
         """
         logits = self.as_logits(output, truth)
         defines_loss = type(self).loss is not Classification.loss
@@ -312,12 +337,13 @@ def make_class_mask(
     """Return which classes are in a label set, (C,) bool.
 
     Args:
-        logits: (N, C).
-        labels: indices of classes, the same for all N.
-        setting: named in messages.
+        logits: (N, C), to which the mask belongs.
+        labels: indices of the classes in the set, the same for all N rows.
+        setting: name of the setting with the labels, for messages.
 
     Raises:
-        InputError: logits of another shape; no index, one out of range, or all classes.
+        InputError: the logits have another shape, an index is out of range, or the set
+            has no class or all classes.
     """
     if logits.ndim != 2:
         raise InputError(

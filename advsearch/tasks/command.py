@@ -95,13 +95,14 @@ class Command(Task):
                 )
 
     def wrap_network(self, network: Callable[..., Any]) -> Callable[..., Any]:
-        """See `Task.wrap_network`: a policy gets the state next to images.
+        """Wrap a policy so that it gets the state of the robot together with images.
 
-        A network stays as it is if there is no state, unless it has the method of
-        LeRobot's policies, `select_action`, which `WithState` calls.
+        Without a state the network is returned unchanged. An exception is a policy of
+        LeRobot: it has a method `select_action`, which `WithState` calls.
         """
         if isinstance(network, models.AllAtOnce):
-            # It passes the images of all cameras to a policy, which is what is wrapped.
+            # `AllAtOnce` passes the images of all cameras to a policy. The policy inside
+            # of it is wrapped.
             policy_with_state: Any = self.wrap_network(network.network)
             return models.AllAtOnce(policy_with_state, network.cameras, network.layout)
         policy = network
@@ -115,11 +116,12 @@ class Command(Task):
     def read(self, returned: Any, count: int) -> Tensor:
         """Read actions (count, A) from what a policy returned.
 
-        This is (count, A), or (count,) for actions of one element: a tensor, the first
-        item of a tuple or list, or `action` of a mapping.
+        The actions are the tensor itself, the first item of a tuple or list, or the
+        item "action" of a mapping. Actions of one element may have the shape (count,).
 
         Raises:
-            ValueError: there are none, or their size differs from that of the options.
+            ValueError: there are no actions, or their number of elements differs from
+                that of the options.
         """
         actions = returned.get("action") if isinstance(returned, Mapping) else returned
         # A named tuple has the type of its class, and is none of the forms.
@@ -164,8 +166,13 @@ class Command(Task):
     def on(
         self, model: Model, *, target: str | None = None, minimise: bool = False
     ) -> Command:
-        """See `Task.on`: the target is an action, ``0.1,-0.3``, or some of its
-        elements, ``yaw rate=-0.3``.
+        """Return the task for one policy.
+
+        Args:
+            model: the policy, loaded for this task.
+            target: an action, ``0.1,-0.3``, or some of its elements by name, ``yaw
+                rate=-0.3``; None for any action outside of the envelope.
+            minimise: not possible, since the clean action is right already.
 
         Raises:
             InputError: there is no envelope, the model was loaded for another task or
@@ -198,8 +205,10 @@ class Command(Task):
         )
 
     def _parse_target(self, text: str) -> Tensor:
-        """Parse a target action (A,): numbers of all elements ("0.1,-0.3"), or named
-        ones ("yaw rate=-0.3"); elements that are not named are NaN.
+        """Parse a target action to numbers, (A,).
+
+        The text has numbers for all elements ("0.1,-0.3") or for some of them by name
+        ("yaw rate=-0.3"). Elements that are not named are NaN: any value is accepted.
         """
         # ("yaw rate", "=", "-0.3"), or ("", "", "0.1") without a name
         assignments = [part.rpartition("=") for part in str(text).split(",")]
@@ -224,7 +233,11 @@ class Command(Task):
         return self.clean is None
 
     def after_calibration(self, output: Tensor, truth: Tensor | None) -> Command:
-        """See `Task.after_calibration`: store the clean action.
+        """Store the clean action, by which all other actions are judged.
+
+        Args:
+            output: action (1, A) for the clean image.
+            truth: not used.
 
         Raises:
             InputError: the clean action is not finite, or the target has another size
@@ -243,8 +256,10 @@ class Command(Task):
         return replace(self, clean=clean_action)
 
     def _check_target(self, clean_action: Tensor) -> None:
-        """Raise InputError if the target has another size than the clean action (A,),
-        or their envelopes overlap.
+        """Check that a target action fits the clean action (A,).
+
+        Raises:
+            InputError: they differ in size, or their envelopes overlap.
         """
         if len(self.target) != len(clean_action):
             raise InputError(
@@ -297,9 +312,10 @@ class Command(Task):
         return () if truth is None else (self._format_action(truth.tolist()),)
 
     def _compute_deviation(self, output: Tensor, center: Tensor | None) -> Tensor:
-        """Compute the deviation (N, A) of each element of actions (N, A) from an action.
+        """Compute by how much each element of actions deviates from an action, (N, A).
 
-        It is in envelopes: 1 is at the edge of what is allowed.
+        The unit is the envelope of the element: 1 is the largest deviation that is
+        allowed.
 
         Args:
             output: the actions.
@@ -333,10 +349,15 @@ class Command(Task):
     def describe(
         self, output: Tensor, truth: Tensor | None, margins: Sequence[float]
     ) -> list[tasks.PredictionWithPayload]:
-        """See `Task.describe`: whether an action left its envelope, and by which element.
+        """Return for each action whether it left its envelope, and by which element.
 
         The payload has the action and the clean one, also as text, and the number of
         envelopes between them.
+
+        Args:
+            output: actions (N, A).
+            truth: the clean action (A,).
+            margins: margin of each action: 1 minus its largest deviation in envelopes.
         """
         assert truth is not None
         results: list[tasks.PredictionWithPayload] = []
@@ -434,7 +455,7 @@ def _parse_numbers(option: str, value: Any) -> Numbers:
     if not any(isinstance(item, bool) for item in items):
         with suppress(TypeError, ValueError, OverflowError):
             numbers = tuple(float(item) for item in items)
-    # well within the range of float32
+    # The bound is well within the range of float32, which ends at 3e38.
     are_finite = all(math.isfinite(number) and abs(number) < 1e30 for number in numbers)
     if not 1 <= len(numbers) <= MAX_NUMBERS or not are_finite:
         got = f"{value!r:.80}"

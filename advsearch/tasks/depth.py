@@ -105,11 +105,11 @@ class DepthTruth:
 
     @cached_property
     def background_disparity(self) -> Tensor:
-        """The disparity of what is behind the object, (H, W); NaN if it is unknown.
+        """The disparity of the background behind the object, (H, W); NaN if unknown.
 
-        It is interpolated linearly between the nearest pixels to the left and right of
-        the object in the same row, which is exact for a plane. What is infinitely far
-        has a disparity of 0.
+        Disparity is the inverse of z-depth, 0 at an infinite distance. It is
+        interpolated linearly between the nearest pixels left and right of the object in
+        the same row, which is exact for a plane.
         """
         height, width = self.mask.shape
         disparity = self.z.reciprocal()
@@ -124,7 +124,8 @@ class DepthTruth:
         right_disparity = disparity.gather(1, right.clamp_max(width - 1))
         weight = (column - left) / (right - left).clamp_min(1)
         result = left_disparity + weight * (right_disparity - left_disparity)
-        # where the object reaches an edge of the image, the value of its other side
+        # If the object reaches one edge of the image, the value on its other side is
+        # taken.
         has_left = left >= 0
         has_right = right != width
         result = torch.where(has_right, result, left_disparity)
@@ -188,10 +189,13 @@ class Depth(Task):
     # ---- reading ----
 
     def read(self, returned: Any, count: int) -> list[DepthMap]:
-        """Read the map (h, w) of each image, by what its values are.
+        """Read the map (h, w) of each image from what a network returned.
+
+        Each map is stored under the kind of its values, one of `KINDS`, such as
+        "disparity"; "" if the network does not state the kind.
 
         Raises:
-            ValueError: there is none.
+            ValueError: there is no map for each of `count` images.
         """
         kind, maps = _find_maps(returned)
         if isinstance(maps, Tensor) and maps.ndim == 4 and maps.shape[1] == 1:
@@ -212,7 +216,12 @@ class Depth(Task):
     def on(
         self, model: Model, *, target: str | None = None, minimise: bool = False
     ) -> Depth:
-        """See `Task.on`.
+        """Return the task for one depth model.
+
+        Args:
+            model: the model, loaded for this task.
+            target: not possible, since there are no labels.
+            minimise: whether a right prediction is sought.
 
         Raises:
             InputError: the model was loaded for another task or with names of classes,
@@ -255,8 +264,9 @@ class Depth(Task):
         return self.kind or stated_kind
 
     def _describe_missing_option(self, kind: str, truth: DepthTruth | None) -> str:
-        """Return what the user has to state before predictions can be judged, as a
-        message; "" if nothing.
+        """Return a message if predictions cannot be judged yet; "" if they can.
+
+        The message says what the user has to state or change.
 
         Args:
             kind: kind of the model's values, one of `KINDS`, or "" if it is unknown.
@@ -348,12 +358,13 @@ class Depth(Task):
         )
 
     def score(self, output: Sequence[DepthMap], truth: DepthTruth) -> Tensor:
-        """Compute how near each of N outputs is to what is sought, (N,); over 0 if it
-        is a success.
+        """Compute how near each output is to what is sought, (N,), over 0 for a success.
 
-        For "nearer" and "farther" it is the signed mean over pixels, beyond the
-        tolerance. For "gone" it is the lesser of two: the loss, and how far the remaining
-        fraction of the object's relief (`_compute_relief_fraction`) is below a half.
+        For "nearer" and "farther" it is the signed mean over pixels of log(predicted /
+        true), minus the tolerance. For "gone" it is the smaller of two numbers: the
+        loss, and by how much the remaining fraction of the object's relief
+        (`_compute_relief_fraction`) is below a half. So an object counts as gone if
+        less than half of its relief is left.
         """
         if self.minimise or not self.seek:
             return super().score(output, truth)
@@ -383,8 +394,10 @@ class Depth(Task):
         truth: DepthTruth,
         function: Callable[[Tensor], Tensor],
     ) -> Tensor:
-        """Apply a function to each image, (N,); -1, a right prediction, if the object is
-        out of view.
+        """Apply a function to each image, (N,).
+
+        If the object is out of view, the value is -1, which stands for a right
+        prediction.
 
         Args:
             output: output for N images.
@@ -426,12 +439,15 @@ class Depth(Task):
     def _align_to_truth(
         self, depth_map: DepthMap, truth: DepthTruth
     ) -> tuple[Tensor, bool]:
-        """Return the predicted z-depth of every pixel in units of the truth, (H, W), or
-        its inverse; and whether it is the inverse.
+        """Convert a predicted map to the size and the units of the truth.
 
-        It is the inverse for a map of disparity. Scale and shift of a map are fitted to
-        the truth by least squares, unless it is in metres. A map of another size is
-        resized as transformers does it in `post_process_depth_estimation`.
+        A map in metres is only scaled. Other maps are known up to a scale and a shift,
+        which are fitted to the truth by least squares. A map of another size is resized
+        as `post_process_depth_estimation` of transformers does it.
+
+        Returns:
+            The predicted z-depth of every pixel, (H, W), and False; for a map of
+            disparity the inverse of z-depth, and True.
         """
         kind = self._get_kind(depth_map)
         (values,) = depth_map.values()  # the only map
@@ -502,8 +518,16 @@ class Depth(Task):
     def describe(
         self, output: Sequence[DepthMap], truth: DepthTruth, margins: Sequence[float]
     ) -> list[tasks.PredictionWithPayload]:
-        """See `Task.describe`; the payload has the true and the predicted distance, the
-        factor between them, the remaining relief, and where scale and shift were fitted.
+        """Return whether the object's distance is right in each image, and a payload.
+
+        The payload has the true and the predicted distance, the mean factor between
+        them, the remaining fraction of the relief, and where scale and shift were
+        fitted.
+
+        Args:
+            output: maps of N images.
+            truth: truth of the scene.
+            margins: margin of each image; below 0 if it is wrong.
         """
         if not truth.is_visible:
             return [(tasks.Prediction(tasks.OUT_OF_VIEW), None)] * len(output)
@@ -553,8 +577,10 @@ class Depth(Task):
     def marks(
         self, output: Sequence[DepthMap], truth: DepthTruth
     ) -> list[list[tasks.Mark]]:
-        """See `Task.marks`: the object, its pixels whose distance is right, and the
-        disparity of everything.
+        """Return what is drawn for each image.
+
+        The true mark has the object's mask and the true disparity; the predicted mark
+        has the pixels with a right distance and the predicted disparity.
         """
         true_mark = tasks.Mark(
             "disparity", true=True, mask=truth.mask, map=truth.z.reciprocal()
@@ -616,14 +642,13 @@ def _find_maps(returned: Any) -> tuple[str, Any]:
 
 
 def _fit_scale_and_shift(values: Tensor, expected: Tensor, mask: Tensor) -> Tensor:
-    """Return `scale * values + shift`, (H, W), which fits what is expected by least
-    squares.
+    """Return `scale * values + shift`, (H, W), fitted to a map by least squares.
 
-    The scale is not negative: what the model predicts as near stays near.
+    The scale is at least 0, so that the model's order of near and far is kept.
 
     Args:
-        values: (H, W).
-        expected: (H, W), finite in the mask.
+        values: predicted map, (H, W).
+        expected: map to fit, (H, W), finite inside of the mask.
         mask: (H, W) bool, the pixels of the fit, at least one.
     """
     fit_values = values[mask]

@@ -197,7 +197,16 @@ class Detection(ClassTask):
     def on(
         self, model: Model, *, target: str | None = None, minimise: bool = False
     ) -> Detection:
-        """See `Task.on`. One image of noise is run to infer the output's format."""
+        """Return the task for a model whose output format is inferred.
+
+        The model is run on one image of noise, since its output shows the format of
+        boxes and scores.
+
+        Args:
+            model: the detector.
+            target: name of the class that the attack seeks; None for any wrong one.
+            minimise: whether the opposite of an error is sought.
+        """
         task = super().on(model, target=target, minimise=minimise)
         generator = torch.Generator().manual_seed(0)
         with torch.no_grad():
@@ -226,12 +235,18 @@ class Detection(ClassTask):
     def after_calibration(
         self, output: Sequence[Detections], truth: DetectionTruth | None
     ) -> Detection:
-        """See `Task.after_calibration`: infer the format of the boxes, and note in
-        `doubts` why it may be wrong.
+        """Infer the format of the boxes from the clean image, and note doubts about it.
 
         If there are boxes of right classes and a true box, the format in which one of
         them fits best is compared with the one in use. Otherwise the boxes with the best
         scores are checked for plausibility.
+
+        Args:
+            output: output of the model for the clean image.
+            truth: truth of that image; None if it is unknown.
+
+        Returns:
+            The task whose `doubts` say why its format may be wrong; "" for no doubt.
         """
         task = self._infer_format(output)
         output = task._resolve_grids(output)
@@ -273,7 +288,8 @@ class Detection(ClassTask):
     def _infer_format(self, output: Sequence[Detections]) -> Detection:
         """Return the task with the order and unit that an output of its model shows.
 
-        What this output leaves open stays as it was inferred from an earlier one.
+        An order or unit that this output does not show stays as it was inferred from an
+        earlier output: noise comes first, and then the clean image.
         """
         order = self._infer_order(output)
         grids = [detections["grid"] for detections in output if "grid" in detections]
@@ -291,7 +307,8 @@ class Detection(ClassTask):
             unit = "pixels"  # as `DECLARED_FORMAT_ATTRIBUTE` says
         else:
             unit = infer_unit(select_best_boxes(resolved)) or self.inferred_unit
-        # rows of NaN beside boxes: with them the model fills its outputs up
+        # If an output has boxes and rows of NaN, the rows only fill it up to a fixed
+        # length. So a later output with nothing but such rows is not broken.
         has_nan_rows = any(
             "n_nan_rows" in detections and len(detections["boxes"])
             for detections in resolved
@@ -303,10 +320,10 @@ class Detection(ClassTask):
         )
 
     def _infer_order(self, output: Sequence[Detections]) -> str:
-        """Return the order that an output shows, "" if it leaves it open.
+        """Return the order of components that an output shows; "" if it shows none.
 
-        If the user states no order for a DETR output, and the name of the model's last
-        class means no object, it is the order with such a class.
+        A DETR output is read with a class for "no object" if the user states no order
+        and the name of the model's last class means "no object".
 
         Raises:
             InputError: the output contradicts the options or the number of classes.
@@ -329,10 +346,10 @@ class Detection(ClassTask):
             raise InputError(f"task detection: {shape}{error}{hint}") from None
 
     def _has_mask_coefficients(self, output: Sequence[Detections], order: str) -> bool:
-        """Return whether an output has mask coefficients beside the scores of its boxes.
+        """Return whether an output has mask coefficients in addition to boxes and scores.
 
-        It has them if feature maps came with rows of boxes; or in a YOLO grid, if that
-        has more channels than the box and the scores take.
+        It has them if the network returned feature maps together with rows of boxes, or
+        if a YOLO grid has more channels than the box and the scores need.
 
         Args:
             output: output of N images.
@@ -347,6 +364,7 @@ class Detection(ClassTask):
             return False
         channel_axis = 0 if order.endswith(CHANNELS_FIRST) else 1
         n_channels = grids[0].shape[channel_axis]
+        # Channel of the first score: the numbers of the box come before it.
         first_score = next(
             start for head, start in HEADS.items() if order.startswith(head)
         )
@@ -362,7 +380,10 @@ class Detection(ClassTask):
 
     @property
     def ambiguities(self) -> str:
-        """Say which option the user has to state, as no output shows it."""
+        """Return a message with the option that the user has to state; "" for none.
+
+        An option has to be stated if no output of the model shows its value.
+        """
         if self.is_order_ambiguous and not (self.order or self.inferred_order):
             return (
                 "order: expected what tells scores from classes, and no output of "
@@ -380,7 +401,11 @@ class Detection(ClassTask):
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Say how the model's output is read, where that was inferred."""
+        """Return sentences about how the model's output is read.
+
+        They report the order that was inferred, masks that are not read, and doubts
+        about the format of boxes.
+        """
         remarks = []
         order = format_option(f"order: {self.inferred_order}")
         if not self.order:
@@ -437,7 +462,7 @@ class Detection(ClassTask):
         return scores.shape[1] if scores is not None and scores.ndim == 2 else None
 
     def truth(self, facts: Facts) -> DetectionTruth:
-        """See `Task.truth`: the true box, and those of other things of its classes."""
+        """Return the object's true box, and the boxes of other objects of its classes."""
         height, width = facts.mask.shape
         right_classes = self.find_right_classes(facts)
         other_boxes = []
@@ -466,8 +491,9 @@ class Detection(ClassTask):
         Only boxes that survive suppression count.
 
         Returns:
-            (N,), over 0 if the object is not found. If `seek` is `create`: by how much
-            the best box where nothing is exceeds `confidence`.
+            (N,), over 0 if the object is not found. If `seek` is "create", the loss is
+            instead by how much the best phantom exceeds `confidence`; a phantom is a
+            box at a spot without an object of its class.
         """
         if self.seek == "create":
             loss_of_image = self._score_create
@@ -482,9 +508,11 @@ class Detection(ClassTask):
     def score(self, output: Sequence[Detections], truth: DetectionTruth) -> Tensor:
         """Compute how near each output is to what is sought, (N,), in log-odds.
 
-        It is over 0 if the output is a success. Unlike for the loss, boxes count before
-        suppression, unless they make the output a success.
+        It is over 0 if the output is a success. The loss reads only boxes that survive
+        suppression; the score also reads the suppressed ones, unless they alone would
+        make the output a success.
         """
+        # `__post_init__` allows `minimise` for the goal "vanish" only.
         if self.minimise:
             return -self.loss(output, truth)
         score_by_goal: dict[str, Callable[[Detections, DetectionTruth], Tensor]] = {
@@ -506,9 +534,11 @@ class Detection(ClassTask):
     ) -> Tensor:
         """Apply a function to the detections of each image, (N,).
 
-        The value is NaN for detections that cannot be judged (`_is_broken`), and -1, a
-        right prediction, if the object is out of view, unless boxes where nothing is are
-        sought.
+        The value is NaN if the detections cannot be judged, as with a box that is not
+        finite (`_is_broken`). If the object is out of view, the value is -1: losses
+        below 0 stand for right predictions, and nobody can miss what is not visible.
+        The goal "create" is an exception. It seeks boxes at spots without an object, so
+        that the object need not be visible.
 
         Args:
             output: output of N images.
@@ -518,7 +548,8 @@ class Detection(ClassTask):
         is_out_of_view = truth.box is None and self.seek != "create"
         values = []
         for detections in self._read_boxes(output):
-            # Constants are computed from the scores to be attached to the graph.
+            # Constants are computed from the scores, so that autograd can go through
+            # them; their gradient is 0.
             if self._is_broken(detections):
                 value = detections["scores"].sum() * math.nan
             elif is_out_of_view:
@@ -546,12 +577,13 @@ class Detection(ClassTask):
         return torch.minimum(self._score_vanish(detections, truth), wrong_excess)
 
     def _score_displace(self, detections: Detections, truth: DetectionTruth) -> Tensor:
-        """Compute the lesser of two: that boxes miss the object, and that some box
-        counts.
+        """Compute how near the boxes of a right class are to being displaced.
 
-        The first is how far the best overlap of a box that counts is below `iou`,
-        scaled so that a small step from `iou` is as long as one in log-odds. The second
-        is by how much the best score of a right class exceeds `confidence`.
+        Boxes are displaced if some box of a right class counts, but none overlaps the
+        object by `iou`. So the score is the smaller of two numbers. The first is by how
+        much the best overlap of a box that counts falls short of `iou`, scaled so that
+        a small step from `iou` is as long as one in log-odds. The second is by how much
+        the best score of a right class exceeds `confidence`, in log-odds.
         """
         scores = self._find_best_scores(detections, truth.labels)
         score_excess = compute_log_odds(max_or_zero(scores)) - self._min_log_odds
@@ -579,12 +611,14 @@ class Detection(ClassTask):
     # ---- boxes and scores of one image ----
 
     def _resolve_labels(self, output: Sequence[Detections]) -> list[Detections]:
-        """Return an output with scores and classes identified; boxes stay in its format.
+        """Identify the scores and the classes of an output.
+
+        The boxes stay in the format of the network, such as x0, y0, x1, y1 in pixels.
 
         Raises:
             InputError: the values do not show which numbers are scores.
         """
-        n_classes = len(self.labels) or None
+        n_classes = len(self.labels) or None  # None: the number is unknown
         try:
             return [
                 outputs.resolve_detections(detections, self.inferred_order, n_classes)
@@ -596,9 +630,9 @@ class Detection(ClassTask):
     def _read_boxes(self, output: Sequence[Detections]) -> list[Detections]:
         """Return the detections of each image with boxes as fractions of the image.
 
-        Classes that stand for nothing get a score of 0. Boxes that are not finite are
-        dropped if all their scores are below the minimum, so that they do not make the
-        output broken (`_is_broken`).
+        Classes such as "no object" get a score of 0. A box that is not finite makes the
+        output broken (`_is_broken`). It is dropped first if all its scores are too low
+        to count, since networks leave such boxes in unused rows.
         """
         images = list[Detections]()
         box_format = self._box_format
@@ -638,8 +672,9 @@ class Detection(ClassTask):
     def _is_broken(self, detections: Detections) -> bool:
         """Return whether the detections of an image cannot be judged.
 
-        Then a score or a box is not finite; or all rows of the output were NaN and were
-        removed, although the model does not fill its outputs up with such rows.
+        They cannot if a score or a box is not finite. They cannot either if all rows of
+        the output were NaN, unless the model fills unused rows with NaN: then such an
+        output means that nothing is detected.
         """
         has_only_nan_rows = "n_nan_rows" in detections and not len(detections["boxes"])
         if has_only_nan_rows and not self.fills_with_nan:
@@ -654,10 +689,10 @@ class Detection(ClassTask):
         return suppress(detections, self._min_score, self.suppression)
 
     def _is_elsewhere(self, detections: Detections, truth: DetectionTruth) -> Tensor:
-        """Return which boxes (D,) are elsewhere than the object.
+        """Return which boxes are elsewhere than the object, (D,) bool.
 
-        They neither fit its box nor lie mostly inside of it. All are if the object is
-        out of view.
+        Such a box neither fits the object's box nor lies mostly inside of it. If the
+        object is out of view, all boxes are elsewhere.
         """
         boxes = detections["boxes"]
         if truth.box_fractions is None:
@@ -681,9 +716,10 @@ class Detection(ClassTask):
     def _is_loosely_on_object(
         self, detections: Detections, truth: DetectionTruth
     ) -> Tensor:
-        """Return which boxes (D,) are on the object, however loosely.
+        """Return which boxes are on the object, however loosely, (D,) bool.
 
-        A box does not count if it overlaps another thing of the right classes more.
+        A box that overlaps another object of the right classes more belongs to that
+        other object, and is not counted here.
         """
         boxes = detections["boxes"]
         true_box = truth.box_fractions
@@ -696,8 +732,10 @@ class Detection(ClassTask):
         return is_on_object
 
     def _is_on_nothing(self, detections: Detections, truth: DetectionTruth) -> Tensor:
-        """Return which boxes (D,) are neither on the object nor on another thing of the
-        right classes.
+        """Return which boxes are on no object of the right classes, (D,) bool.
+
+        These are the object itself, if it is in view, and the other objects in the
+        image that have one of its classes.
         """
         boxes = detections["boxes"]
         true_boxes = list(truth.others)
@@ -712,12 +750,12 @@ class Detection(ClassTask):
     def _find_phantom_scores(
         self, detections: Detections, truth: DetectionTruth
     ) -> Tensor:
-        """Return the score (D,) of each box as a phantom: a box where nothing is.
+        """Return the score of each box as a phantom, (D,); 0 if the box is none.
 
-        It is 0 if the box is none. A box of a right class is a phantom if it is on no
-        thing of these classes, however loosely; a box of another class, if it is
-        elsewhere than the object. Only scores of target classes count, if there is a
-        target.
+        A phantom is a box at a spot without an object of its class. A box of a right
+        class is a phantom if it is on no object of these classes, however loosely. A
+        box of another class is a phantom if it is elsewhere than the object. If there
+        is a target, only the scores of target classes count.
         """
         if self.target is None:
             right_score = self._find_best_scores(detections, truth.labels)
@@ -737,8 +775,9 @@ class Detection(ClassTask):
 
     @staticmethod
     def _find_best_scores(detections: Detections, classes: Labels) -> Tensor:
-        """Return the best score of each box for one of the classes, (D,); 0 for a box
-        that has none.
+        """Return the best score of each box for one of the classes, (D,).
+
+        A box without a score for any of these classes gets 0.
         """
         scores = detections["scores"]
         if "labels" in detections:  # each box has the score of its own class only
@@ -750,8 +789,10 @@ class Detection(ClassTask):
         return scores.sum(dim=1) * 0.0
 
     def _find_rival_scores(self, detections: Detections, classes: Labels) -> Tensor:
-        """Return the best score of each box for a target, (D,); without a target, for a
-        class other than `classes`.
+        """Return the best score of each box for a class that the attack seeks, (D,).
+
+        These are the classes of the target; without a target, all but `classes`, which
+        are the right ones.
         """
         if self.target is not None:
             return self._find_best_scores(detections, self.target)
@@ -767,7 +808,10 @@ class Detection(ClassTask):
     def predictions(
         self, output: Sequence[Detections], count: int = 1
     ) -> list[tuple[Prediction, ...]]:
-        """See `Task.predictions`: the boxes with the best scores."""
+        """Return the `count` boxes with the best scores of each image, as predictions.
+
+        An image without a box has the only prediction "nothing".
+        """
         predictions_of_images: list[tuple[Prediction, ...]] = []
         for detections in self._read_boxes(output):
             if self._is_broken(detections):
@@ -787,8 +831,15 @@ class Detection(ClassTask):
         truth: DetectionTruth,
         margins: Sequence[float],
     ) -> list[PredictionWithPayload]:
-        """See `Task.describe`: what becomes of the object; the payload has boxes in
-        pixels.
+        """Return what becomes of the object in each image, with a payload for its row.
+
+        The payload has the object's box and the best detected boxes, in pixels, and the
+        outcome (such as "missed") with the class and the overlap of the deciding box.
+
+        Args:
+            output: detections of N images.
+            truth: truth of the scene.
+            margins: not used; other tasks read them.
         """
         results: list[PredictionWithPayload] = []
         for detections in self._read_boxes(output):
@@ -807,9 +858,12 @@ class Detection(ClassTask):
     def _list_stored_boxes(
         self, detections: Detections, truth: DetectionTruth
     ) -> list[JsonValue]:
-        """Return the best boxes of an image as they are stored in rows."""
+        """Return the best boxes of an image in the form in which rows store them.
+
+        Each has its corners in pixels, the name of its class, and its score.
+        """
         height, width = truth.size
-        scale = [width, height] * 2
+        scale = [width, height] * 2  # of x0, y0, x1, y1
         boxes: list[JsonValue] = []
         for box, label, score in list_boxes(
             detections, MAX_STORED_BOXES, self._min_score, self.suppression
@@ -832,7 +886,8 @@ class Detection(ClassTask):
     ) -> ObjectMatch:
         """Decide what becomes of the object in the boxes that survived suppression.
 
-        Where phantoms (boxes where nothing is) are sought, they come before all others.
+        A phantom is a box at a spot without an object of its class. If phantoms are
+        sought (`seek` is "create"), one of them decides before any other box.
         """
         if self.seek == "create" and float(self._score_create(detections, truth)) > 0.0:
             phantom_score = self._find_phantom_scores(detections, truth)
@@ -910,12 +965,12 @@ class Detection(ClassTask):
             is_candidate: (D,) bool.
             truth: truth of the scene.
         """
-        # scores are at least 0, so that other boxes come last
+        # Scores are at least 0. So -1 puts all boxes that are no candidates last.
         row = int(torch.where(is_candidate, scores, -1.0).argmax())
         score = float(scores[row])
         if "labels" in detections:
             class_id = int(detections["labels"][row])
-        else:  # the first class that has this score
+        else:  # the first class that has this score in the row
             class_id = int((detections["scores"][row] == score).nonzero()[0])
         iou = None
         if truth.box is not None:
@@ -938,8 +993,9 @@ class Detection(ClassTask):
     def marks(
         self, output: Sequence[Detections], truth: DetectionTruth
     ) -> list[list[Mark]]:
-        """See `Task.marks`: the true box, and every box with a score of
-        `confidence`.
+        """Return what is drawn over each image: the true box and the detected boxes.
+
+        A detected box is drawn if its score is at least `confidence`.
         """
         true_marks = []
         if truth.box is not None:

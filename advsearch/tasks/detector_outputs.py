@@ -154,12 +154,18 @@ def read_detections(returned: Any, count: int, order: str = "") -> list[Detectio
     """Read the detections of each of `count` images from what a detector returned.
 
     Args:
-        returned: by the network, in one of the forms of `EXPECTED`.
+        returned: what the network returned, in one of the forms of `EXPECTED`.
         count: number of images.
-        order: order of components without names, see `parse_order`; "" to infer it.
+        order: names of the components of a tuple or a row, such as "boxes scores
+            labels"; "" to infer them.
+
+    Returns:
+        For each image, tensors by name: "boxes" and "scores", perhaps "labels"; or, if
+        values have to show later what is a score, "grid", "logits" or
+        "score_or_label".
 
     Raises:
-        ValueError: it has another form, or scores are not in [0, 1].
+        ValueError: the output has another form, or scores are not in [0, 1].
     """
     order_names = parse_order(order) if order else ()
     order = " ".join(order_names)
@@ -174,12 +180,14 @@ def read_detections(returned: Any, count: int, order: str = "") -> list[Detectio
         isinstance(predictions, Tensor)
         and predictions.ndim == 3
         and predictions.shape[0] == count
-        and predictions.shape[2] != 4  # boxes alone
+        and predictions.shape[2] != 4  # boxes without scores, as of a DETR
     )
     has_mask_rows = is_batch and _has_mask_rows(predictions, channels)
     # The rows of a tensor (N, D, 6) are a box, a score and a class.
     has_six_columns = is_batch and predictions.shape[2] == 6
     is_rows = bool(order_names) or has_mask_rows or has_six_columns
+    # A tensor of another width is the output of a YOLO head, whose columns are known
+    # only when the number of classes is.
     if is_batch and (order in HEAD_ORDERS or not is_rows):
         return [
             {"grid": grid.float(), "map_channels": map_channels} for grid in predictions
@@ -187,7 +195,8 @@ def read_detections(returned: Any, count: int, order: str = "") -> list[Detectio
     if has_mask_rows:
         rows = read_detections(predictions[..., :6], count, order)
         return [{**detections, "map_channels": map_channels} for detections in rows]
-    # the words of a YOLO head, whose output would be a grid
+    # The order is that of a YOLO head, but the output is not a grid as such heads
+    # return it.
     if "objectness" in order_names or "channels" in order_names:
         raise ValueError(EXPECTED)
     return [
@@ -245,12 +254,13 @@ def _split_images(
     or tensors whose first axis is the image.
 
     Args:
-        returned: by the network.
+        returned: what the network returned.
         count: number of images.
-        order_names: the order that the user stated, or none.
+        order_names: names of the components in the order that the user stated; empty
+            without one.
 
     Raises:
-        ValueError: it is none of the forms of `EXPECTED`.
+        ValueError: the output has none of the forms of `EXPECTED`.
     """
     if (
         isinstance(returned, (list, tuple))
@@ -283,16 +293,17 @@ def _split_batch_rows(
 ) -> list[dict[str, Tensor]]:
     """Split rows (D, 7) of all images by their column with the index of the image.
 
-    It is the first column, or the one of "batch" in the order. A row with the index -1
-    is padding.
+    The index is in the first column, as ONNX exports with suppression have it, or in
+    the column that the order calls "batch". A row with the index -1 is padding.
 
     Args:
-        rows: rows of all images.
+        rows: rows of all images: four numbers of a box, two more, and the index.
         count: number of images.
-        order_names: the order that the user stated, or none.
+        order_names: names of the components in the order that the user stated; empty
+            without one.
 
     Raises:
-        ValueError: there is no such column.
+        ValueError: that column does not hold indices of images.
     """
     names_before: Sequence[str] = ()
     if "batch" in order_names:
@@ -322,8 +333,12 @@ def _split_batch_rows(
 def _find_queries(returned: Any, order: str) -> tuple[Tensor, Tensor] | None:
     """Find the boxes and logits of a DETR output; None if it is no such output.
 
-    A sequence of tensors is one if `order` says so (one of `QUERIES`), a mapping or an
-    object by the names of its components.
+    A sequence of tensors is a DETR output if the user says so. A mapping or an object
+    is one if it has "pred_boxes" and a component with a usual name of logits.
+
+    Args:
+        returned: what the network returned.
+        order: order that the user stated, one of `QUERIES` for a DETR; "" for none.
     """
     if order in QUERIES and isinstance(returned, (list, tuple)):
         return _find_query_tensors(returned)
@@ -362,12 +377,13 @@ def _are_fraction_boxes(tensor: Tensor) -> bool:
 def _split_off_maps(returned: Any) -> tuple[Any, set[int]]:
     """Split a YOLO output in training form into its predictions and feature maps.
 
-    In that form the predictions are the first of a tuple; feature maps (N, K, h, w)
-    and prototypes of masks follow, also in lists and mappings.
+    In that form the network returns a tuple. The predictions (N, A, B) come first;
+    feature maps (N, K, h, w) and prototypes of masks follow, also nested in lists and
+    mappings.
 
     Returns:
-        The predictions, and the numbers of channels K of the maps; any other output as
-        it is, and no channels.
+        The predictions, and the numbers of channels K of the maps. An output of any
+        other form is returned unchanged, with an empty set.
     """
     is_sequence = isinstance(returned, (list, tuple)) and len(returned) > 0
     if not is_sequence or not isinstance(returned[0], Tensor):
@@ -375,6 +391,7 @@ def _split_off_maps(returned: Any) -> tuple[Any, set[int]]:
     predictions = returned[0]
     rest = returned[1:]
     is_boxes = predictions.ndim == 3 and predictions.shape[2] == 4
+    # Boxes that other tensors follow are a tuple of boxes, scores and labels.
     has_other_tensors = any(isinstance(x, Tensor) and x.ndim < 4 for x in rest)
     if predictions.ndim != 3 or is_boxes or has_other_tensors:
         return returned, set()
@@ -405,14 +422,15 @@ def _find_components(returned: Any, order_names: Sequence[str]) -> dict[str, Ten
     Args:
         returned: a tensor of rows of six numbers, named tensors, or a sequence of
             tensors.
-        order_names: the order that the user stated, or none.
+        order_names: names of the components in the order that the user stated; empty
+            without one.
 
     Returns:
-        "boxes" and "scores", perhaps with "labels"; or "boxes" and "score_or_label",
-        two numbers of each box of which it is unknown which one is the score.
+        Tensors by name: "boxes" and "scores", perhaps with "labels". If it is unknown
+        which of a box's two numbers is its score, both are "score_or_label", (..., 2).
 
     Raises:
-        ValueError: it is none of the forms of `EXPECTED`.
+        ValueError: the output has none of the forms of `EXPECTED`.
     """
     if isinstance(returned, Tensor):
         if returned.ndim not in (2, 3) or returned.shape[-1] != 6:
@@ -495,10 +513,10 @@ def _find_named(returned: Any) -> dict[str, Tensor] | None:
 
 
 def _list_named_tensors(returned: Any) -> dict[str, Tensor] | None:
-    """Return the tensors of a mapping by name, or of an object those among its
-    attributes that have one of `NAMES`.
+    """Return the tensors of a mapping or an object by name.
 
-    None if it is neither a mapping nor an object with boxes.
+    Of an object only attributes with one of `NAMES` are read. The result is None if
+    `returned` is neither a mapping nor an object with boxes.
     """
     if isinstance(returned, Mapping):
         return {
@@ -555,13 +573,15 @@ def _identify_by_shape(tensors: Sequence[Tensor]) -> dict[str, Tensor]:
 def _find_boxes_by_shape(tensors: Sequence[Tensor]) -> Tensor:
     """Return which of several tensors holds the boxes: it has four columns.
 
-    Of several it is the only one with values over 1, since scores of four classes have
-    none; else the first.
+    Scores of four classes have four columns too, but no values over 1. So of several
+    tensors with four columns the only one with such values is chosen; otherwise the
+    first one.
 
     Raises:
         ValueError: there are no boxes, or nothing else.
     """
     with_four_columns = [x for x in tensors if x.ndim > 1 and x.shape[-1] == 4]
+    # Scores of exactly four boxes have four columns too, but an axis less than boxes.
     max_ndim = max((x.ndim for x in with_four_columns), default=0)
     candidates = [x for x in with_four_columns if x.ndim == max_ndim]
     if not candidates or len(tensors) < 2:
@@ -579,7 +599,7 @@ def _check_detections(components: Mapping[str, Tensor]) -> Detections:
     boxes = components["boxes"]
     if boxes.numel() == 0:
         boxes = boxes.reshape(-1, 4)
-    # everything has a row for each box, but for the count of rows that were removed
+    # Each component has a row for each box. Only "n_nan_rows" is a single count.
     row_tensors = [
         tensor for name, tensor in components.items() if name != "n_nan_rows"
     ]
@@ -602,7 +622,8 @@ def _check_detections(components: Mapping[str, Tensor]) -> Detections:
     if labels is not None:
         checked["labels"] = labels.long()
     detections = dict(_remove_padding(checked, is_padding, values))
-    if "n_nan_rows" in components:  # removed already
+    # These rows were removed in an earlier check, which counted them.
+    if "n_nan_rows" in components:
         detections["n_nan_rows"] = components["n_nan_rows"]
     return detections
 
@@ -610,12 +631,13 @@ def _check_detections(components: Mapping[str, Tensor]) -> Detections:
 def _find_padding(boxes: Tensor, scores: Tensor, labels: Tensor | None) -> Tensor:
     """Return which rows of detections are padding, (D,) bool.
 
-    They have a score or a class of -1, or an invalid box and no score over 0.
+    Networks with a fixed number of rows fill unused rows with a score or a class of -1,
+    or with an invalid box (such as zeros) and no score over 0.
 
     Args:
         boxes: (D, 4).
-        scores: (D, K), of every class or of the label.
-        labels: (D,); None if scores are of every class.
+        scores: scores of each box, (D, K): for every class, or one for its label.
+        labels: class of each box, (D,); None if there is a score for every class.
     """
     has_score = (scores > 0.0).any(dim=1)
     is_marked = (scores == -1.0).all(dim=1)
@@ -642,10 +664,13 @@ def _remove_padded_pairs(boxes: Tensor, pairs: Tensor) -> Detections:
 
 
 def _check_scores(components: Mapping[str, Tensor]) -> tuple[Tensor, Tensor | None]:
-    """Return the scores of detections and their labels, None without labels.
+    """Check the scores and labels of detections, and return them.
 
-    The score of a label that is NaN becomes NaN. Raises ValueError if the shapes do not
-    match, or a label is not an integer.
+    A label that is NaN makes the score of its box NaN, so that the output counts as
+    broken. Labels are None if there is a score for every class.
+
+    Raises:
+        ValueError: the shapes do not match, or a label is not an integer.
     """
     scores = components["scores"].float()
     labels = components.get("labels")
@@ -665,10 +690,14 @@ def _check_scores(components: Mapping[str, Tensor]) -> tuple[Tensor, Tensor | No
 
 
 def _check_probabilities(values: Tensor, *, has_labels: bool) -> None:
-    """Raise ValueError if a finite value is outside [0, 1].
+    """Raise ValueError if a finite score is outside [0, 1].
 
-    Without labels the values may be logits of a DETR: then the message says how to
-    state that.
+    Scores without labels may be logits of a DETR; then the message also says with
+    which option the user states that.
+
+    Args:
+        values: scores, of any shape.
+        has_labels: whether each box has a label and a single score.
     """
     is_too_low = values < -TOLERANCE
     is_too_high = (values > 1.0 + TOLERANCE) & values.isfinite()
@@ -687,13 +716,15 @@ def _check_probabilities(values: Tensor, *, has_labels: bool) -> None:
 def _remove_padding(
     components: dict[str, Tensor], is_padding: Tensor, values: Tensor
 ) -> Detections:
-    """Return components without rows of padding; `n_nan_rows` is added, the count of
-    those of them that are all NaN, if there are any.
+    """Return the components of an image without rows of padding.
+
+    If some of the removed rows are all NaN, their count is added as "n_nan_rows": an
+    output with nothing else may be broken.
 
     Args:
         components: components of one image, with a row for each box.
-        is_padding: (D,) bool.
-        values: (D, K) the numbers of each box beside its coordinates.
+        is_padding: which rows are padding, (D,) bool.
+        values: numbers of each box other than its coordinates, (D, K).
     """
     if not bool(is_padding.any()):
         return components
@@ -714,8 +745,9 @@ def resolve_detections(
     """Return the detections of an image with boxes, scores and labels identified.
 
     Args:
-        detections: detections of one image, perhaps with a "grid", "logits" or
-            "score_or_label", of which the module's docstring says what they are.
+        detections: detections of one image. They may still have a "grid" (output of a
+            YOLO head), "logits" (of a DETR), or "score_or_label" (two numbers for each
+            box, of which one is the score).
         order: one of `ORDERS` or `QUERIES`, or of `HEADS` with a layout; "" to infer
             it from the values.
         classes: number of classes; None if it is unknown.
@@ -757,8 +789,9 @@ def _split_by_class_count(
 
 
 def _resolve_pairs(detections: Detections, order: str) -> Detections:
-    """Return the detections of an image with its pairs of numbers ("score_or_label")
-    as scores and labels, or as scores alone.
+    """Replace the pairs of numbers of an image ("score_or_label") by what they are.
+
+    They are a score and a label, or two scores.
 
     Args:
         detections: detections of one image.
@@ -778,7 +811,8 @@ def _resolve_pairs(detections: Detections, order: str) -> Detections:
             )
         order = SCORES_FIRST  # of no importance, since no box counts
     if order in HEAD_ORDERS:
-        # both are scores; or the first is objectness, by which the other is multiplied
+        # Both are scores; or the first is objectness, the probability that the box
+        # holds any object, and the score of a class is their product.
         has_objectness = "objectness" in order
         scores = pairs.prod(dim=1, keepdim=True) if has_objectness else pairs
         return _check_detections({"boxes": detections["boxes"], "scores": scores})
@@ -802,9 +836,10 @@ def infer_order(
 ) -> str:
     """Infer from values and sizes in which order a network returns scores and classes.
 
-    Logits and grids show it by the number of classes. Of the two numbers beside a box
-    a class is an integer, and a score lies in [0, 1] and does not rise from box to box.
-    If neither is a class, both are scores (`_infer_pair_order`).
+    For logits and grids the number of classes shows it. If a box comes with two
+    numbers, the class is an integer, and the score lies in [0, 1] and does not rise
+    from box to box, since suppression sorts by score. If neither is a class, both are
+    scores (`_infer_pair_order`).
 
     Args:
         detections_of_images: detections of images.
@@ -832,9 +867,10 @@ def infer_order(
 
 
 def _infer_logit_order(n_logits: int, classes: int, head: str) -> str:
-    """Return which of `QUERIES` has so many logits for each box.
+    """Return which DETR head (one of `QUERIES`) has so many logits for each box.
 
-    One more logit than classes is that of no object, unless the user states the head.
+    If there is one logit more than classes, it stands for "no object" and the scores
+    are a softmax, unless the user states the head. Otherwise they are sigmoids.
 
     Args:
         n_logits: number of logits of a box.
@@ -842,7 +878,8 @@ def _infer_logit_order(n_logits: int, classes: int, head: str) -> str:
         head: one of `QUERIES` that the user stated, or "".
 
     Raises:
-        ValueError: the number fits neither.
+        ValueError: the number fits neither head; the message names sets of labels that
+            would fit.
     """
     has_nothing_logit = n_logits == classes + 1
     order = head
@@ -903,8 +940,9 @@ def _infer_pair_order(
     """Return what the two numbers of boxes ("score_or_label") are, "" if it is open.
 
     Scores lie in [0, 1], and classes are integers. If both columns may be either, the
-    one that never rises within an image has the scores, as after suppression. If
-    neither can be classes, both are scores (`_infer_order_without_labels`).
+    scores are in the column that never rises within an image, since suppression sorts
+    boxes by score. If neither can be classes, both are scores
+    (`_infer_order_without_labels`).
 
     Args:
         detections_of_images: detections of images.
@@ -945,7 +983,9 @@ def _infer_pair_order(
 def _infer_order_without_labels(columns: Sequence[Tensor], classes: int | None) -> str:
     """Return the order of boxes that have two scores and no class, "" if there is none.
 
-    They are the scores of two classes, or objectness and the score of the only class.
+    They are the scores of two classes; or, with a single class, objectness (the
+    probability of any object) and the score of that class. If a column has only
+    integers, such as 0 and 1, it may hold classes, and the result is "".
 
     Args:
         columns: the two numbers of all boxes, (D,) each, in [0, 1].
@@ -1000,12 +1040,14 @@ def _is_falling(pairs_of_images: Sequence[Tensor], column: int) -> bool:
 def find_head_orders(
     returned: Tensor, map_channels: Collection[int], classes: int, order: str = ""
 ) -> tuple[str, ...]:
-    """Return the orders that the output (A, B) of one image may have.
+    """Return the orders in which the output (A, B) of one image can be read.
 
-    The sizes of the output decide, and its scores, which lie in [0, 1].
+    An order says which channels are boxes, objectness and scores, and whether channels
+    are the first or the last axis. It fits if the output has its number of channels,
+    and the scores read in this order lie in [0, 1].
 
     Args:
-        returned: the output.
+        returned: output of a YOLO head for one image.
         map_channels: numbers of channels of feature maps that came with it, which may
             be mask coefficients.
         classes: number of classes.
@@ -1034,6 +1076,8 @@ def find_head_orders(
                 f"{float(scores.max()):.3g} if it is read as '{name}'; "
                 "expected probabilities in [0, 1]: apply a sigmoid to them"
             )
+    # A head with objectness has 5 channels before its scores, as many as the box and
+    # the angle of an OBB head. So this order is accepted only if the user states it.
     if orders == [_WITH_ANGLE] and not order:
         raise ValueError(
             f"its {5 + classes} channels may be those of an OBB head (with an angle), "
@@ -1052,8 +1096,14 @@ def _list_orders_of_size(
 ) -> Iterator[str]:
     """Yield the orders whose number of channels fits the output (A, B) of one image.
 
-    Channels beyond the box and the scores have to be mask coefficients, as many as a
-    feature map has channels. For the arguments see `find_head_orders`.
+    Channels that the box and the scores leave over have to be mask coefficients; there
+    are as many of them as a feature map has channels.
+
+    Args:
+        shape: sizes of the output, (A, B).
+        map_channels: numbers of channels of feature maps that came with the output.
+        classes: number of classes.
+        order: one of `HEADS`, with or without a layout, to try alone; "" for all.
     """
     for layout, n_channels in zip(LAYOUTS, shape, strict=True):
         for head, first_score in HEADS.items():
@@ -1064,10 +1114,12 @@ def _list_orders_of_size(
 
 
 def _make_channel_error(shape: tuple[int, int], classes: int) -> ValueError:
-    """Return the error about an output (A, B) of one image whose number of channels
-    fits no head.
+    """Return the error for an output whose number of channels fits no YOLO head.
 
-    The smaller of the two sizes is taken for that number, since there are more boxes.
+    Args:
+        shape: sizes of the output of one image. The smaller one is taken for the number
+            of channels, since there are usually more boxes than channels.
+        classes: number of classes.
     """
     n_channels = min(shape)
     is_channels_last = shape[0] >= shape[1]
@@ -1080,8 +1132,10 @@ def _make_channel_error(shape: tuple[int, int], classes: int) -> ValueError:
 
 
 def _advise_on_channels(n_channels: int, classes: int, *, may_be_rows: bool) -> str:
-    """Return the end of a message about an output whose number of channels does not
-    fit: what the channels beyond boxes and scores seem to be, and what to do.
+    """Return the end of the message about a number of channels that does not fit.
+
+    It says what the channels other than boxes and scores seem to be, and what the user
+    can do.
 
     Args:
         n_channels: number of channels of a box.

@@ -72,7 +72,17 @@ class Rig(tasks.JointTask):
     def on(
         self, model: Model, *, target: str | None = None, minimise: bool = False
     ) -> Rig:
-        """See `Task.on`. Raises InputError if there is a single camera."""
+        """Return the task for a model that takes the images of several cameras.
+
+        Args:
+            model: the model, whose `cameras` is the number of images of a rig.
+            target: name of the class that the attack seeks; None for any wrong one.
+            minimise: whether the opposite of an error is sought.
+
+        Raises:
+            InputError: there is a single camera, or the task is about all images at
+                once and the model takes them one by one.
+        """
         if model.cameras < 2:
             raise InputError(
                 "task rig: expected a rig, got one camera; give it with "
@@ -105,7 +115,7 @@ class Rig(tasks.JointTask):
     def after_calibration(
         self, output: Sequence[tasks.Outputs], truth: tasks.Truths | None
     ) -> Rig:
-        """See `Task.after_calibration`: the first camera's image is the clean one."""
+        """Calibrate the task of the images on the clean image of the first camera."""
         first_output = output[0][0]
         first_truth = None if truth is None else truth[0]
         part = self.part.after_calibration(first_output, first_truth)
@@ -137,8 +147,12 @@ class Rig(tasks.JointTask):
         output: Sequence[tasks.Outputs],
         truth: tasks.Truths,
     ) -> Tensor:
-        """Apply a function, the loss or the score of the task of an image, to each of K
-        images of each of N rigs, (N, K).
+        """Apply a function to each of K images of each of N rigs, (N, K).
+
+        Args:
+            function: loss or score of the task of a single image.
+            output: outputs of the images of each rig.
+            truth: truth of each image of the rig.
         """
         rows = []
         for image_outputs in output:
@@ -150,8 +164,10 @@ class Rig(tasks.JointTask):
         return torch.stack(rows)
 
     def _combine(self, values: Tensor) -> Tensor:
-        """Combine losses of images (N, K) by the rule, (N,). A loss over 0 is a wrong
-        prediction.
+        """Combine the losses of a rig's images (N, K) by the rule, (N,).
+
+        A loss over 0 means a wrong prediction. Under the rules "any", "all" and "vote"
+        the loss of one image, chosen by its rank, is the loss of the rig.
         """
         if self.rule == "mean":
             return values.mean(dim=1)
@@ -181,7 +197,12 @@ class Rig(tasks.JointTask):
     def judge(
         self, output: Sequence[tasks.Outputs], truth: tasks.Truths
     ) -> list[tasks.Judgement]:
-        """See `Task.judge`; the payload has the judgement of each image."""
+        """Judge the predictions of each rig; the payload has the judgement of each image.
+
+        Args:
+            output: outputs of the images of each rig.
+            truth: truth of each image of the rig.
+        """
         with torch.no_grad():
             # not `-loss`, which would be -0.0 for a loss of 0
             margins = (0.0 - self.loss(output, truth)).tolist()
@@ -192,6 +213,7 @@ class Rig(tasks.JointTask):
                 self.part.judge(image_output, image_truth)[0]
                 for image_output, image_truth in zip(image_outputs, truth, strict=True)
             ]
+            # The rule could skip an image without a number: the rig is broken anyway.
             if any(judgement.is_non_finite for judgement in judgements):
                 margin = math.nan
             rig_judgements.append(self._join_judgements(judgements, margin, score))
@@ -227,22 +249,27 @@ class Rig(tasks.JointTask):
     def _find_deciding_judgement(
         self, judgements: Sequence[tasks.Judgement], margin: float
     ) -> tasks.Judgement:
-        """Return the judgement of the image that decides about the rig by the rule; for
-        the mean, to which all images add, the worst one.
+        """Return the judgement of the image that decides about the rig.
+
+        Under the rule "mean" all images contribute, and the worst one is returned.
 
         Args:
-            judgements: the judgements of the images.
-            margin: the joint margin.
+            judgements: judgements of the images.
+            margin: margin of the rig.
         """
         if self.rule == "mean":
             return min(judgements, key=lambda judgement: judgement.margin)
-        # By other rules the joint margin is that of one image.
+        # Under other rules the rig's margin is the margin of one of its images.
         return min(judgements, key=lambda judgement: abs(judgement.margin - margin))
 
     def marks(
         self, output: Sequence[tasks.Outputs], truth: tasks.Truths
     ) -> list[list[tasks.Mark]]:
-        """See `Task.marks`: those of the first image, which is the leftmost."""
+        """Return the marks of each rig: those of its first image.
+
+        The images of a rig are drawn side by side, and the first one is the leftmost,
+        so that positions in it are positions in the joined image.
+        """
         marks_of_rigs = []
         for image_outputs in output:
             marks = self.part.marks(image_outputs[0], truth[0])[0]

@@ -40,8 +40,8 @@ class SegmentationTruth:
     def resize_mask(self, size: tuple[int, int]) -> Tensor:
         """Resize the mask to the size of an output, (h, w) bool.
 
-        A pixel is the object's if the object covers at least half of it. If there is no
-        such pixel, all that the object touches are.
+        A pixel belongs to the object if the object covers at least half of it. A small
+        object may cover no pixel by half; then all pixels that it touches belong to it.
         """
         if self.mask.shape == size:
             return self.mask
@@ -77,8 +77,11 @@ class Segmentation(tasks.ClassTask):
     def read(self, returned: Any, count: int) -> Tensor:
         """Read the logits (N, classes, h, w) from what a network returned.
 
+        They are the tensor itself, the first of a sequence, the attribute "logits" (as
+        in Hugging Face's models), or the item "out" (as in torchvision's) or "logits".
+
         Raises:
-            ValueError: there are none.
+            ValueError: there are no logits of `count` images.
         """
         if isinstance(returned, Mapping):
             returned = returned.get("out", returned.get("logits"))
@@ -115,15 +118,19 @@ class Segmentation(tasks.ClassTask):
         )
 
     def score(self, output: Tensor, truth: SegmentationTruth) -> Tensor:
-        """See `Task.score`; with a target, enough of the object's pixels have to get
-        it.
+        """Compute how near each output is to what is sought, (N,), over 0 for a success.
+
+        With a target, a success is that at least a fraction `accuracy` of the object's
+        pixels gets a target class.
         """
         if self.target is None:
             return super().score(output, truth)
 
         def compute_target_shortfall(logits: Tensor, labels: tasks.Labels) -> Tensor:
-            """Compute by how much the target falls short at pixels: at most 0 if they get
-            it, as the margin of wrong classes is at most 0 at right ones.
+            """Compute by how much the target falls short of other classes at pixels.
+
+            At most 0 means that a pixel gets the target. The sign is that of the margin
+            of wrong classes, which is at most 0 at right pixels.
             """
             return -tasks.compute_target_margin(logits, labels)
 
@@ -134,8 +141,9 @@ class Segmentation(tasks.ClassTask):
     def pixel_margin(self, output: Tensor, truth: SegmentationTruth) -> Tensor:
         """Compute the mean margin over the object's pixels, in logits, (N,).
 
-        It is the margin of wrong classes, or of those of the target; with `minimise` that
-        of right ones. Every pixel has a derivative, not only the deciding one as in `loss`.
+        The margin is by how much the best wrong class (or the best class of the target)
+        exceeds the best other class; with `minimise` the sign is reversed. All pixels
+        have a gradient here, while `loss` has one at the deciding pixel only.
         """
         pixels = self._select_object_logits(output, truth)
         if pixels is None:
@@ -156,10 +164,11 @@ class Segmentation(tasks.ClassTask):
     ) -> Tensor:
         """Compute the margin (N,) at the deciding pixel of the object.
 
-        The object's pixels are sorted by their margin, in ascending order; the first
-        `accuracy` of them end with the deciding pixel. So it is at most 0 exactly if
-        enough of them are. It is NaN if a margin is not finite, and -1 if the object is
-        out of view.
+        The object's pixels are sorted by margin, in ascending order. The deciding pixel
+        is the last one of the first fraction `accuracy` of them, such as pixel 80 of
+        100 for 0.8. So its margin is at most 0 exactly if enough pixels have a margin
+        of at most 0. The result is NaN if a margin is not finite, and -1 (a right
+        prediction) if the object is out of view.
 
         Args:
             output: logits (N, classes, h, w).
@@ -204,7 +213,8 @@ class Segmentation(tasks.ClassTask):
             logits: (classes, h, w), without a graph.
             count: how many; there may be fewer.
         """
-        # minus infinity is a class that is excluded
+        # A network may exclude a class with a logit of minus infinity. Pixels with any
+        # other logit that is not finite are left out.
         is_number = (logits.isfinite() | (logits == -math.inf)).all(dim=0)
         class_of_pixel = logits[:, is_number].argmax(dim=0)
         n_classes = len(logits)
@@ -230,11 +240,16 @@ class Segmentation(tasks.ClassTask):
     def describe(
         self, output: Tensor, truth: SegmentationTruth, margins: Sequence[float]
     ) -> list[tasks.PredictionWithPayload]:
-        """See `Task.describe`: the class of most of the object's pixels
-        (`_describe_object`).
+        """Return the prediction about the object in each image, and a payload.
 
-        The payload has the outcome, the fraction of the object's pixels that are right,
-        their fractions by class, and the intersection over union.
+        The prediction is the class of most of its pixels (`_describe_object`). The
+        payload has the outcome, the fraction of the object's pixels that are right, the
+        fraction of them with each class, and the intersection over union.
+
+        Args:
+            output: logits (N, classes, h, w).
+            truth: truth of the scene.
+            margins: margin of each image; at least 0 if it is right.
         """
         results: list[tasks.PredictionWithPayload] = []
         mask = truth.resize_mask((output.shape[2], output.shape[3])).to(output.device)
@@ -285,16 +300,17 @@ class Segmentation(tasks.ClassTask):
     ) -> tuple[tasks.Prediction, tasks.Outcome]:
         """Return the prediction about the object, and what becomes of it.
 
-        If the object is right, it is the most frequent right class. Else it is the most
-        frequent wrong class; where that stands for nothing, "no bottle", or from
-        `MIN_PARTIAL_ACCURACY` on "bottle in part".
+        If enough pixels are right, the prediction is the most frequent right class.
+        Otherwise it is the most frequent wrong class. If that one stands for
+        background, the prediction is "no bottle"; or "bottle in part" if at least
+        `MIN_PARTIAL_ACCURACY` of the pixels are right.
 
         Args:
-            counts: the object's pixels by class, (classes,).
+            counts: number of the object's pixels with each class, (classes,).
             truth: truth of the image.
-            accuracy: fraction of the object's pixels that are right: the probability of
-                the prediction.
-            is_right: whether enough of them are.
+            accuracy: fraction of the object's pixels that are right. It is stored as
+                the probability of the prediction.
+            is_right: whether enough of them are right.
         """
         is_right_class = torch.zeros_like(counts, dtype=torch.bool)
         is_right_class[list(truth.labels)] = True
@@ -325,7 +341,7 @@ class Segmentation(tasks.ClassTask):
         return is_correct.reshape(logits.shape[1:])
 
     def marks(self, output: Tensor, truth: SegmentationTruth) -> list[list[tasks.Mark]]:
-        """See `Task.marks`: the object, and the pixels that get a right class."""
+        """Return what is drawn: the object, and the pixels that get a right class."""
         name = " or ".join(self.get_class_names(truth.labels))
         true_mark = tasks.Mark(name, True, mask=truth.mask)
         return [

@@ -88,9 +88,9 @@ def embed_gallery(folder: str, model: Model, *, linear: bool) -> Gallery:
         linear: fit a linear head on the features.
 
     Raises:
-        InputError: as for `list_name_folders`; a name without an image; too many
-            images; features that are not (N, D).
-        FileFormatError: a file that is no image, or a huge one.
+        InputError: the folder has fewer than two names, or a name has no image, or the
+            model returns features that are not (N, D) or not finite.
+        FileFormatError: a file is no image or is too large, or there are too many.
     """
     named_folders = list_name_folders(folder)
     root = Path(folder).expanduser()
@@ -141,7 +141,7 @@ def _list_references(
 
 def _embed_images(paths: Sequence[Path], model: Model) -> Tensor:
     """Compute the features (R, D) of length 1 of the images in files, in batches."""
-    # loaded one by one, as the batches below ask for them
+    # A generator: images are loaded one by one, when a batch below needs them.
     images = (
         _crop_center(
             torch.from_numpy(models.load_upright(path, MAX_IMAGE_SIZE)),
@@ -186,7 +186,7 @@ def fit_linear_head(features: Tensor, name_index: Tensor) -> tuple[Tensor, Tenso
     """
     n_names = int(name_index.max()) + 1
     images_per_name = torch.bincount(name_index, minlength=n_names).double()
-    # of each image: the images of every name weigh 1 / n_names together
+    # The weights of the images of one name add up to 1 / n_names.
     image_weights = 1.0 / (n_names * images_per_name[name_index])
     # The fit is faster with centered features. With bias b, w (x - center) + b is
     # w x + (b - w center): so the bias is shifted at the end.
@@ -341,12 +341,19 @@ class Similarity(tasks.Classification):
     def on(
         self, model: Model, *, target: str | None = None, minimise: bool = False
     ) -> Similarity:
-        """See `Task.on`; references are loaded and embedded, unless they are already.
+        """Return the task for a model, with the features of its reference images.
+
+        References are not embedded again if that was done for the same model.
+
+        Args:
+            model: model that returns features.
+            target: name that the attack seeks; None for any wrong one.
+            minimise: whether the opposite of an error is sought.
 
         Raises:
-            InputError: there are neither references nor a threshold; or as for
-                `embed_gallery`.
-            FileFormatError: as for `embed_gallery`.
+            InputError: there are neither references nor a threshold, a target has no
+                references, or the folder of references does not fit.
+            FileFormatError: a reference is no image or is too large.
         """
         if not self.references and self.threshold is None:
             raise InputError(
@@ -374,10 +381,14 @@ class Similarity(tasks.Classification):
         return tuple(name for name, _ in list_name_folders(self.references)), True
 
     def find_right_classes(self, facts: tasks.Facts) -> tasks.Labels:
-        """See `ClassTask.find_right_classes`.
+        """Return the indices of the right names for an object in the scene.
 
-        With a threshold there are two classes, `ITSELF` (the thing in the clean image) and
-        `SOMETHING_ELSE`, of which the first is right.
+        With references they come from the object's label. With a threshold there are
+        two classes, `ITSELF` (the object in the clean image) and `SOMETHING_ELSE`, of
+        which the first, with the index 0, is right.
+
+        Args:
+            facts: ground truth of the object, such as its label.
         """
         if self.references:
             return super().find_right_classes(facts)
@@ -395,21 +406,25 @@ class Similarity(tasks.Classification):
     def after_calibration(
         self, output: Tensor, truth: tasks.Labels | None
     ) -> Similarity:
-        """See `Task.after_calibration`: store the features of the clean image."""
+        """Store the features of the clean image, to which others are compared."""
         if not self.calibrates:
             return self
         features = functional.normalize(output.detach().float(), dim=1)
         return replace(self, clean=features[0])
 
     def read(self, returned: Any, count: int) -> Tensor:
-        """Read features (count, D): a tensor, the first of a tuple, or a component that
-        has one of the names `PARTS`.
+        """Read features (count, D) from what a network returned.
 
-        Of `last_hidden_state` these are of the first token (CLS); a map is averaged
-        over its positions.
+        They are the tensor itself, the first of a tuple, or a component with one of the
+        names in `PARTS`. Of `last_hidden_state` (N, tokens, D) the first token (CLS) is
+        taken; a feature map is averaged over its positions.
+
+        Args:
+            returned: what the network returned.
+            count: number of images.
 
         Raises:
-            ValueError: there are none.
+            ValueError: there are no features of this shape.
         """
         # A named tuple has the type of its class, and its components have names.
         is_tuple = type(returned) in (tuple, list) and returned
@@ -422,7 +437,12 @@ class Similarity(tasks.Classification):
         return features.float()
 
     def compute_logits(self, output: Tensor) -> Tensor:
-        """Compute logits (N, names) of features (N, D); differentiable."""
+        """Compute logits (N, names) of features (N, D); differentiable.
+
+        With a linear head they are its outputs. By the method "nearest", the score of a
+        name is the mean cosine to its k nearest reference images; divided by the
+        temperature it is a logit.
+        """
         features = functional.normalize(output, dim=1)
         if self.gallery is None:
             return self._compute_threshold_logits(features)
@@ -442,8 +462,10 @@ class Similarity(tasks.Classification):
         return torch.stack(name_scores, dim=1) / TEMPERATURE
 
     def _compute_threshold_logits(self, features: Tensor) -> Tensor:
-        """Compute the logits (N, 2) of `ITSELF` and `SOMETHING_ELSE`: the first is larger
-        where the cosine to the clean image exceeds the threshold.
+        """Compute the logits (N, 2) of `ITSELF` and `SOMETHING_ELSE`.
+
+        They are the cosine to the clean image and the threshold, both divided by the
+        temperature. So the first class wins where the cosine exceeds the threshold.
 
         Args:
             features: (N, D), of length 1.
@@ -464,8 +486,10 @@ class Similarity(tasks.Classification):
         return super().as_logits(self.compute_logits(output), truth)
 
     def judge(self, output: Tensor, truth: tasks.Labels) -> list[tasks.Judgement]:
-        """See `Task.judge`; the payload has the cosine to the clean image, or the ranks
-        of the right references (`_rank_references`).
+        """Judge the features of each image.
+
+        The payload has the ranks of the right references (`_rank_references`); without
+        references, the cosine to the clean image.
         """
         with torch.no_grad():
             judgements = super().judge(output, truth)

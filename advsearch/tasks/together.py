@@ -57,9 +57,9 @@ def join_models(models: Sequence[Model], size: tuple[int, int] | None = None) ->
     """Combine several models into one.
 
     Args:
-        models: at least one.
-        size: size of the images, (height, width) in pixels; None for the maximum of the
-            models' input sizes.
+        models: at least one model. Each resizes the images to its own input size.
+        size: size of the images, (height, width) in pixels; None for the largest height
+            and the largest width among the models' inputs.
 
     Returns:
         A model whose output is a list with a tuple of the models' outputs for each
@@ -182,7 +182,13 @@ class EnsembleTask(JointTask):
     def on(
         self, model: Model, *, target: str | None = None, minimise: bool = False
     ) -> EnsembleTask:
-        """See `Task.on`; a target goes only to the tasks that take a label, if any do.
+        """Return the task for an ensemble of models, one for each of its tasks.
+
+        Args:
+            model: model from `join_models`.
+            target: label that the attack seeks; None for any wrong one. It is passed
+                only to the tasks that take a label, if any do.
+            minimise: whether the opposite of an error is sought.
 
         Raises:
             InputError: the model is not from `join_models`, or has not one model per
@@ -227,7 +233,12 @@ class EnsembleTask(JointTask):
     def after_calibration(
         self, output: Sequence[Outputs], truth: Truths | None
     ) -> EnsembleTask:
-        """See `Task.after_calibration`: each task gets the output of its model."""
+        """Let each task infer what it needs from the clean output of its model.
+
+        Args:
+            output: outputs of all models for each image.
+            truth: truth for each task; None if it is unknown.
+        """
         truths = truth or [None] * len(self.tasks)  # unknown for each task
         tasks = tuple(
             task.after_calibration(model_output, task_truth)
@@ -280,7 +291,7 @@ class EnsembleTask(JointTask):
         ]
 
     def judge(self, output: Sequence[Outputs], truth: Truths) -> list[Judgement]:
-        """See `Task.judge`; the payload has those of the models by name."""
+        """Judge each image; the payload has the payload of each model by name."""
         judgements_of_models = [
             task.judge(model_output, task_truth)
             for task, model_output, task_truth in self._by_task(output, truth)
@@ -293,9 +304,9 @@ class EnsembleTask(JointTask):
     def _join_judgements(self, judgements: Sequence[Judgement]) -> Judgement:
         """Join the models' judgements of one image, in the order of the models.
 
-        Margin and outcome are those of the model with the smallest margin; the payload
-        has those of all by name. If a model returned NaN, the joint judgement is that
-        of NaN too.
+        The margin and the outcome are those of the model with the smallest margin. The
+        payload has the payloads of all models by name. If a model returned NaN, the
+        joint margin is NaN too.
         """
         worst = min(judgements, key=lambda judgement: judgement.margin)
         margin = worst.margin
@@ -313,8 +324,10 @@ class EnsembleTask(JointTask):
         return Judgement.of(score, margin, prediction, payload)
 
     def marks(self, output: Sequence[Outputs], truth: Truths) -> list[list[Mark]]:
-        """See `Task.marks`: the truth of the first model, the maps of all, and the
-        prediction of each model under its name.
+        """Return what is drawn over each image.
+
+        This is the truth as the first model's task marks it, the maps of all models,
+        and the prediction of each model with its name before the text.
         """
         marks_of_images: list[list[Mark]] = [[] for _ in output]
         for index, (task, model_output, task_truth) in enumerate(
@@ -366,7 +379,7 @@ class EachThingTask(JointTask):
     def after_calibration(
         self, output: Output, truth: TruthByThing | None
     ) -> EachThingTask:
-        """See `Task.after_calibration`: with the truth of the first thing."""
+        """Calibrate the task of an object with the truth of the first object."""
         first_truth = None if truth is None else next(iter(truth.values()))
         return replace(self, part=self.part.after_calibration(output, first_truth))
 
@@ -407,9 +420,15 @@ class EachThingTask(JointTask):
     def describe(
         self, output: Output, truth: TruthByThing, margins: Sequence[float]
     ) -> list[PredictionWithPayload]:
-        """See `Task.describe`: the prediction about the worst visible thing.
+        """Return the prediction about the worst visible object in each image.
 
-        The payload is that of the worst thing, with the judgement of each.
+        The payload is that of the worst object. It also has the name of this object,
+        the mean margin, and a summary of the judgement of each object ("things").
+
+        Args:
+            output: output of N images.
+            truth: truth of each object, by its name.
+            margins: not used; the margin of each object is computed here.
         """
         judgements_of_things = [
             self.part.judge(output, thing_truth) for thing_truth in truth.values()
@@ -436,7 +455,9 @@ class EachThingTask(JointTask):
         return results
 
     def marks(self, output: Output, truth: TruthByThing) -> list[list[Mark]]:
-        """See `Task.marks`: the truth of each thing, and the prediction once."""
+        """Return what is drawn over each image: the truth of all objects, and the
+        prediction once.
+        """
         marks_of_things = [
             self.part.marks(output, thing_truth) for thing_truth in truth.values()
         ]
@@ -475,7 +496,10 @@ def _summarize_thing(judgement: Judgement) -> dict[str, JsonValue]:
 
 
 def make_each_thing_task(task: Task) -> EachThingTask:
-    """Return a task on its model as one that judges every thing.
+    """Return a task that judges every object in the scene by the given task.
+
+    Args:
+        task: task that judges one object, already bound to its model.
 
     Raises:
         InputError: its models make one prediction about the full image, or there are
@@ -486,7 +510,7 @@ def make_each_thing_task(task: Task) -> EachThingTask:
             f"judge: all is for {' and '.join(PER_THING_TASKS)}, got task {task.name}; "
             "judge one thing, by its name"
         )
-    # a class of its own, since name and objective are attributes of the class
+    # A class is made for this task, since name and objective are attributes of a class.
     attributes = {"name": task.name, "objective": task.objective}
     task_class: Any = type("EachThing", (EachThingTask,), attributes)
     result: EachThingTask = task_class(

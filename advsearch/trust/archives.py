@@ -60,7 +60,7 @@ class Archive:
 
         Raises:
             FileFormatError: there is no member of that name, it is larger than `limit`
-                bytes (before `scale_limit`), or it is damaged.
+                bytes (before `scale_limit`), or it is corrupt.
         """
         if name not in self.members:
             raise make_archive_error(
@@ -89,7 +89,7 @@ class Archive:
         """Return the value of a member that holds JSON.
 
         Raises:
-            FileFormatError: as for `read`, or it is not JSON.
+            FileFormatError: the member is missing, too large, corrupt, or not JSON.
         """
         try:
             return parse_json(self.read(name, LARGEST_TEXT))
@@ -103,13 +103,13 @@ def open_archive(path: Path, file: BinaryIO, size: int) -> Archive:
     """Check the table of contents of an archive of torch, and return the archive.
 
     Args:
-        path: named in errors.
+        path: path of the archive, for errors.
         file: the open archive, which has to stay open as long as the result is used.
         size: size of the file in bytes.
 
     Raises:
-        FileFormatError: it is damaged, unpacks to too much, or has members that torch's
-            archives never have.
+        FileFormatError: the archive is corrupt, unpacks to too many bytes, or has
+            members that torch's archives never have.
     """
     try:
         archive = zipfile.ZipFile(file)
@@ -117,7 +117,8 @@ def open_archive(path: Path, file: BinaryIO, size: int) -> Archive:
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
         raise make_truncation_error(path, error) from None
     _check_unpacked_size(path, sum(entry.file_size for entry in entries), size)
-    # torch puts all members into one folder, whose name means nothing: it is left out
+    # torch puts all members into one folder of an arbitrary name. It is left out of the
+    # names, so that "resnet/data.pkl" becomes "data.pkl".
     roots = {
         entry.filename.partition("/")[0] if "/" in entry.filename else ""
         for entry in entries
@@ -138,11 +139,18 @@ def open_archive(path: Path, file: BinaryIO, size: int) -> Archive:
 
 
 def _check_unpacked_size(path: Path, unpacked: int, size: int) -> None:
-    """Check that the members of an archive of `size` bytes have not too many bytes
-    together, unpacked.
+    """Check that the members of an archive do not unpack to too many bytes.
+
+    A small archive could otherwise fill the memory ("zip bomb").
+
+    Args:
+        path: path of the archive, for errors.
+        unpacked: bytes of all members, unpacked.
+        size: bytes of the archive itself.
 
     Raises:
-        FileFormatError: they have more than the limit, or than the ratio allows.
+        FileFormatError: they are more than the limit, or more than the largest ratio to
+            the archive's size allows.
     """
     if unpacked > scale_limit(LARGEST):
         raise make_size_error(
@@ -205,16 +213,16 @@ _ITEM_BYTES = {
 
 
 def rewrite_torchscript(archive: Archive) -> tuple[io.BytesIO, bool]:
-    """Copy the code, the pickles and the tensors of a checked archive into a new one
-    for `torch.jit.load`.
+    """Copy the code, the pickles and the tensors of an archive into a new, safe one.
+
+    `torch.jit.load` reads the new archive. Other members are left out.
 
     Returns:
-        The new archive, and whether torch would run a part of its code while it loads
-        it.
+        The new archive, and whether torch would run some of its code while loading.
 
     Raises:
-        FileFormatError: the code calls what a network has no use for, or the pickles
-            state what is not there.
+        FileFormatError: the code calls functions that a network does not need, such as
+            those for files, or the pickles name tensors whose data is missing.
     """
     code = _read_code(archive)
     for name in PICKLES:
@@ -237,10 +245,11 @@ def rewrite_torchscript(archive: Archive) -> tuple[io.BytesIO, bool]:
 
 
 def _read_code(archive: Archive) -> dict[str, bytes]:
-    """Return the source code of a TorchScript archive by member, checked.
+    """Read and check the source code of a TorchScript archive; return it by member.
 
     Raises:
-        FileFormatError: there is too much, or it calls what a network has no use for.
+        FileFormatError: there is too much code, or it calls functions that a network
+            does not need.
     """
     scripts = [
         name
@@ -261,10 +270,10 @@ def _read_code(archive: Archive) -> dict[str, bytes]:
 
 
 def _read_version(archive: Archive) -> int:
-    """Return the version of a TorchScript archive's form.
+    """Return the version of the format of a TorchScript archive.
 
     Raises:
-        FileFormatError: it is missing, or no small number.
+        FileFormatError: the version is missing, or is not a number of 1 to 3 digits.
     """
     # torch writes it under one of two names
     name = "version" if "version" in archive else ".data/version"
@@ -277,8 +286,9 @@ def _read_version(archive: Archive) -> int:
 
 
 def _find_code_problem(content: bytes) -> str:
-    """Return what speaks against source code of a TorchScript archive, as a clause; ""
-    if nothing does.
+    """Return what is wrong with source code of a TorchScript archive; "" for nothing.
+
+    The result is a clause for a message, such as "is not text".
     """
     try:
         text = content.decode("utf-8")
@@ -297,13 +307,15 @@ def _find_code_problem(content: bytes) -> str:
 
 
 def _hides_character(escape: str) -> bool:
-    r"""Return whether an escape in a text of source code may hide what it stands for.
+    r"""Return whether an escape in source code may hide a character from a reader.
 
-    It may be a character that torch writes plainly, or one that steers a terminal.
+    Torch writes printable ASCII characters plainly. So an escape of one was made to
+    hide it, and an escape of a control character could change the terminal. Octal
+    escapes of bytes over 127 are letters of other languages, and are fine.
 
     Args:
-        escape: what stands behind the backslash: octal digits, as torch writes them for
-            bytes of other languages; or the beginning of another escape, such as x1b.
+        escape: text after the backslash: octal digits, such as 303, or the beginning of
+            another escape, such as x1b.
     """
     if not escape.isdecimal():
         return True
@@ -351,10 +363,15 @@ class _Unpickler(pickle._Unpickler):
 
 
 def _check_pickle(archive: Archive, name: str) -> None:
-    """Check that a pickle is nested no deeper than a network, makes no native objects,
-    and names only tensors whose data is there in full.
+    """Check a pickle of a TorchScript archive without importing or running anything.
 
-    Nothing that it names is imported or run.
+    Args:
+        archive: archive of the network.
+        name: name of the member with the pickle.
+
+    Raises:
+        FileFormatError: the pickle is corrupt, nested too deeply, creates native
+            objects, or names a tensor whose data is not complete.
     """
     reader = _Unpickler(archive.read(name, LARGEST_PICKLE))
     try:
@@ -363,7 +380,8 @@ def _check_pickle(archive: Archive, name: str) -> None:
         raise make_archive_error(
             archive.path, f"{name!r} is damaged ({get_first_line(error)})"
         ) from None
-    # of torch's native classes only those of quantized networks and the like are plain
+    # Of torch's native classes only some, such as those of quantized networks, are
+    # harmless.
     if any(
         family not in _CLASSES
         for text in reader.names
@@ -378,18 +396,18 @@ def _check_pickle(archive: Archive, name: str) -> None:
 
 
 def _check_storage(archive: Archive, folder: str, storage: Any) -> None:
-    """Check that the data of a tensor is there in full.
+    """Check that the data of a tensor is complete.
 
-    torch reads as many numbers as are stated, be they there or not.
+    torch reads as many numbers as the pickle states, even beyond the end of the data.
 
     Args:
-        archive: the archive.
-        folder: folder of the data in it.
-        storage: what a pickle has in the place of the data. torch writes ("storage",
+        archive: archive of the network.
+        folder: folder of the data in the archive.
+        storage: reference to the data in the pickle. torch writes it as ("storage",
             type, member, device, count of numbers).
 
     Raises:
-        FileFormatError: it is of another form, or there is less data.
+        FileFormatError: the reference has another form, or there is less data.
     """
     item_type: Any = None
     member: Any = None
@@ -411,8 +429,13 @@ def _check_storage(archive: Archive, folder: str, storage: Any) -> None:
 def _check_values(archive: Archive, name: str, value: Any) -> None:
     """Check the texts in a nested value of a pickle.
 
-    Each object is looked at once, however often the pickle names it; those at one
-    depth come before those below.
+    The value is searched breadth first. Each object is checked once, however often the
+    pickle refers to it, so that a small pickle cannot take long.
+
+    Args:
+        archive: archive of the pickle, for errors.
+        name: name of the pickle, for errors.
+        value: value of the pickle.
 
     Raises:
         FileFormatError: a text has hidden characters, or the nesting is deeper than
@@ -451,13 +474,13 @@ def _list_inner_values(value: Any) -> Iterable[Any]:
 
 @contextlib.contextmanager
 def without_unpickling() -> Iterator[None]:
-    """Make `torch.load` inside the block load tensors and plain containers only,
-    whoever calls it and whatever arguments it gets.
+    """Make `torch.load` load only tensors and plain containers inside the block.
 
-    It sets an environment variable of torch, and restores the old value afterwards.
+    That holds for any caller and any arguments, since an environment variable of torch
+    is set. Its old value is restored afterwards.
     """
     switch = "TORCH_FORCE_WEIGHTS_ONLY_LOAD"
-    # torch refuses to load where both are set
+    # torch refuses to load anything if both variables are set
     switches = (switch, "TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD")
     before = {key: os.environ.pop(key) for key in switches if key in os.environ}
     os.environ[switch] = "1"

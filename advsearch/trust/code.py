@@ -39,17 +39,19 @@ _CODE = re.compile(r"[^\W\d][\w.]*:[^\W\d][\w.]*|(?:hf|timm|torchvision|https?):
 
 
 def allow_code(*names: str) -> None:
-    """Allow this process to import Python code that a file names, such as the
-    `run.yaml` of a run: read it before.
+    """Allow this process to import Python code that a file names.
+
+    Such a file is the `run.yaml` of a run, which may come from somebody else. Read the
+    code before you allow it.
 
     Args:
-        names: "package.module:attribute", each as it stands in the file, without
-            weights behind an @; or a model of a library, "hf:OWNER/NAME", whose weights
-            may then be fetched; or a model's address, "https://...", to which pictures
-            may then be sent.
+        names: what is allowed, as the file names it: code,
+            "package.module:attribute", without weights after an @; a model of a
+            library, "hf:OWNER/NAME", whose weights may then be downloaded; or the
+            address of a model, "https://...", to which images may then be sent.
 
     Raises:
-        InputError: a name is none of this form.
+        InputError: a name has none of these forms.
     """
     for name in names:
         if not isinstance(name, str) or not _CODE.fullmatch(name):
@@ -64,10 +66,13 @@ def allowed_code() -> tuple[str, ...]:
 
 
 def allow_named(settings: Mapping[str, Any]) -> None:
-    """Allow the code that a person names in settings, by typing them or in Python.
+    """Allow the code that the user names in settings, on the command line or in Python.
 
-    It is named by models, controls and metrics. Settings that come from a file are
-    never given to this function.
+    Models, controls and metrics may name code. Settings from a file are never passed to
+    this function, since somebody else may have written the file.
+
+    Args:
+        settings: values of settings by name.
     """
     names: list[object] = []
     for key in ("model", "compared", "than"):
@@ -119,10 +124,10 @@ def _name_metric(metric: Any) -> Any:
 
 
 def allow_code_of_call(function: Function) -> Function:
-    """Make a function allow the code that its caller names in the arguments
-    (`allow_named`).
+    """Make a function allow the code that its caller names in the arguments.
 
-    It is for functions that are called from Python only, never with what a file says.
+    Decorate only functions that users call from Python: there the user names the code,
+    and no file does.
     """
     signature = inspect.signature(function)
 
@@ -179,7 +184,8 @@ def check_import(name: str) -> None:
     if name in _ALLOWED:
         return
     importlib.invalidate_caches()
-    # finding the top package runs nothing of it
+    # Only the top package is searched for: that runs no code, while finding a module
+    # inside of it would import the package.
     top_package = name.partition(":")[0].partition(".")[0]
     spec = PathFinder.find_spec(top_package, [*sys.path, os.getcwd()])
     where = f" from {spec.origin}" if spec is not None and spec.origin else ""

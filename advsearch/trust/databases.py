@@ -47,15 +47,14 @@ def translate_database_errors(path: Path) -> Iterator[None]:
 
 
 def check_schema(db: sqlite3.Connection, path: Path, statements: str) -> None:
-    """Check that a database has exactly the tables and indices that some statements
-    make.
+    """Check that a database has exactly the tables and indices of a schema.
 
-    More is refused: a view or a trigger is code, and may never end.
+    Any other entry is refused: a view or a trigger is code, which may never end.
 
     Args:
         db: the database; it is closed if the check fails.
         path: path of its file, for the error.
-        statements: SQL that makes the right schema.
+        statements: SQL statements that create the right schema.
     """
     if read_schema(db) != _schema_of(statements):
         db.close()
@@ -80,7 +79,7 @@ def read_schema(db: sqlite3.Connection) -> Counter[Any]:
     """
     entries = db.execute(
         "SELECT type, name, tbl_name, sql FROM sqlite_master"
-        # a right one has far fewer; a hostile one may have any number
+        # A right schema has far fewer entries; a hostile one may have any number.
     ).fetchmany(MAX_SCHEMA_ENTRIES)
     return Counter(
         (*names, None if sql is None else _strip_comments(str(sql)))
@@ -108,11 +107,14 @@ def protect(db: sqlite3.Connection) -> None:
 
 
 def check_before_writing(path: Path) -> None:
-    """Check that SQLite may write to a path: that there is no file yet, or an ordinary
-    one that is no link, and that its journal names no other file.
+    """Check that it is safe to let SQLite write to a path.
+
+    There must be no file yet, or an ordinary file. A link could lead the writing to
+    another file, and a journal can make SQLite delete another file.
 
     Raises:
-        FileFormatError: it may not.
+        FileFormatError: the path is a link or a special file, or its journal names
+            another file.
     """
     if os.path.islink(path):
         raise FileFormatError(
@@ -125,10 +127,16 @@ def check_before_writing(path: Path) -> None:
 
 
 def _check_journal(journal: Path) -> None:
-    """Refuse a journal that ends with the name of a file, as those of several databases
-    do.
+    """Refuse a journal that names a file, as a transaction on several databases writes.
 
-    SQLite would delete the file of that name. No journal of ours has one.
+    Such a journal ends with the name of a file (a super-journal), which SQLite would
+    delete. Our own journals have none.
+
+    Args:
+        journal: path of the journal; it need not exist.
+
+    Raises:
+        FileFormatError: the journal names a file.
     """
     if not os.path.lexists(journal):
         return
@@ -146,8 +154,8 @@ def _check_journal(journal: Path) -> None:
 def connect_to_read(path: Path) -> sqlite3.Connection:
     """Open a database for reading.
 
-    To read a database in WAL mode SQLite has to make a file beside it. Where it can't
-    (a read-only disk), the database is opened as one that never changes.
+    To read a database in WAL mode, SQLite has to create a file next to it. If it
+    cannot, as on a read-only disk, the database is opened as one that never changes.
 
     Raises:
         FileFormatError: there is no such file.

@@ -73,8 +73,11 @@ def is_symbol(text: str) -> bool:
 
 
 def problem(text: object) -> str:
-    """Return what is wrong with an expression over sizes of tensors, or "" if torch may
-    evaluate it.
+    """Return what is wrong with an expression over sizes of tensors; "" for nothing.
+
+    A file of torch.export holds such expressions, for instance "2*s0 + 1", and torch
+    evaluates them as Python code. So only arithmetic with numbers and the symbols of
+    torch is allowed.
     """
     if not isinstance(text, str) or len(text) > LENGTH:
         return f"expected a text of at most {LENGTH} characters"
@@ -83,7 +86,8 @@ def problem(text: object) -> str:
         _check(tree.body, DEPTH, EXPONENT)
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         reason = "it cannot be read"
-        # a plain ValueError is from `_check`; those of Python are subclasses
+        # Our `_check` raises a plain ValueError, whose message is for the user. Python's
+        # own errors here are subclasses of it.
         if type(error) is ValueError:
             reason = str(error.args[0])
         return (
@@ -97,10 +101,10 @@ def _check(node: ast.expr, depth: int, power: int) -> None:
     """Raise ValueError unless a node of an expression is arithmetic that ends soon.
 
     Args:
-        node: checked with all that is below it.
-        depth: how many levels may still be nested.
-        power: how large the product of the exponents around may still become, so that
-            9**9**9 is refused.
+        node: node to check, with all nodes below it.
+        depth: number of levels that may still be nested.
+        power: largest value that the product of exponents below may have. Powers of
+            powers multiply their exponents, so that (9**9)**9 is bounded too.
     """
     if depth <= 0:
         raise ValueError("it is nested too deeply")
@@ -117,7 +121,8 @@ def _check(node: ast.expr, depth: int, power: int) -> None:
             _check_symbol(node)
         case ast.Call(func=ast.Name(id="Float")):
             _check_decimal(node)
-        # any other call has no keywords
+        # The two calls above may have keywords, such as Symbol("s0", integer=True).
+        # Calls of other functions may not.
         case ast.Call(keywords=[_, *_]):
             raise ValueError("keywords")
         case ast.Call(func=ast.Name(id=name), args=[base, exponent]) if name in POWERS:
@@ -142,7 +147,7 @@ def _check(node: ast.expr, depth: int, power: int) -> None:
             isinstance(op, _COMPARISONS) for op in ops
         ):
             operands = [left, *others]
-        # a tuple is a case of a Piecewise
+        # A Piecewise is a call with tuples (value, condition).
         case ast.BoolOp(values=parts) | ast.Tuple(elts=parts):
             operands = parts
         case _:
@@ -171,7 +176,11 @@ def _check_symbol(call: ast.Call) -> None:
 
 
 def _check_decimal(call: ast.Call) -> None:
-    """Raise ValueError unless a call is like Float('0.5', precision=53)."""
+    """Raise ValueError unless a call is like Float('0.5', precision=53).
+
+    Sympy computes with as many bits as the precision says (53 for float64), so that a
+    huge one would take all memory. 200 is more than torch writes.
+    """
     text = _get_only_argument(call)
     if not isinstance(text, str) or not _DECIMAL.fullmatch(text):
         raise ValueError("a number of another form")
@@ -196,14 +205,21 @@ def _get_constant(node: ast.expr) -> object:
 
 
 def _power_left(exponent: ast.expr, power: int) -> int:
-    """Return how large the product of the exponents below this one may still become:
-    `power` divided by it.
+    """Return the bound on exponents that remains after this exponent.
 
-    It may be a whole number, also with a sign or in ``Integer(...)``; or a half, a root
-    that makes nothing larger.
+    The exponent may be an integer, also with a sign or as ``Integer(3)``. It may also
+    be 1/2 or -1/2: a root makes no number large, and leaves the bound as it is.
+
+    Args:
+        exponent: node of the exponent.
+        power: largest value that the product of this exponent and those below it may
+            have.
+
+    Returns:
+        `power` divided by the exponent, rounded down.
 
     Raises:
-        ValueError: it is anything else, or larger than `power`.
+        ValueError: the exponent is anything else, or larger than `power`.
     """
     exponent = _without_sign(exponent)
     match exponent:
@@ -294,16 +310,16 @@ _FORGOTTEN: JsonObject = {"metadata": {}, "guards_code": []}
 
 
 def rewrite_program(archive: Archive) -> io.BytesIO:
-    """Copy the network and the weights of a checked archive into a new one for
-    `torch.export.load`.
+    """Copy the network and the weights of an archive into a new one that is safe to load.
 
-    Compiled code, pickled objects and the rest are left out, or refused.
+    `torch.export.load` reads the new archive. Members that could run code, such as
+    compiled code and pickled objects, are left out or refused.
 
     Raises:
-        FileFormatError: there is something in it that a plain network does not have;
+        FileFormatError: the archive has something that a plain network does not have;
             the message says what.
     """
-    # a second of compilers, which no other model needs
+    # This import takes a second, and only this kind of model needs it.
     from torch.export.pt2_archive import PT2ArchiveWriter
 
     # archives up to torch 2.7 have other names for the same members
@@ -315,11 +331,12 @@ def rewrite_program(archive: Archive) -> io.BytesIO:
     buffer = io.BytesIO()
     with PT2ArchiveWriter(buffer) as writer:  # type: ignore[no-untyped-call, arg-type, unused-ignore]
         writer.write_bytes(PROGRAM, json.dumps(program).encode())
-        # torch wants the member, and takes an empty one
+        # torch requires this member (example inputs), but does not need its content
         writer.write_bytes(EXAMPLE[0], b"")
         for kind in ("weights", "constants"):
             folder = f"data/{kind}/"
-            # either one pickle of all tensors, or a record for each
+            # An archive has either one pickle of all tensors, or a table with a file
+            # for each tensor.
             pickle_name = names[f"{folder}model.pt"]
             if pickle_name in archive:
                 _check_pickle(archive, pickle_name)
@@ -332,11 +349,13 @@ def rewrite_program(archive: Archive) -> io.BytesIO:
 
 
 def _read_program(archive: Archive, name: str) -> Any:
-    """Return the description of the network in a member, checked and without what is
-    not needed.
+    """Read the description of the network from a member of the archive, and check it.
+
+    Entries that are not needed to run the network are emptied.
 
     Raises:
-        FileFormatError: it is something else, or has what a plain network does not have.
+        FileFormatError: the member describes no network, or has something that a plain
+            network does not have.
     """
     program = archive.read_json(name)
     if not isinstance(program, dict) or not isinstance(
@@ -350,19 +369,19 @@ def _read_program(archive: Archive, name: str) -> Any:
 
 
 def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> None:
-    """Copy the tensors that a table names from an archive to the one that is written.
+    """Copy the tensors that a table names from an archive to a new one.
 
-    Only plain records of numbers are copied: no pickles, and no empty records for
-    tensors that have numbers.
+    Only files with plain numbers are copied, and no pickles. An empty file is refused
+    for a tensor that should have numbers.
 
     Args:
-        archive: is read.
+        archive: archive to read.
         writer: writer of the new archive.
-        folder: folder of the tensors in both archives.
-        config: the member with the table.
+        folder: folder of the tensors in both archives, such as "data/weights/".
+        config: name of the member with the table.
 
     Raises:
-        FileFormatError: the table or an entry is something else.
+        FileFormatError: the table or one of its entries has another form.
     """
     content = archive.read_json(config)
     table = content.get("config") if isinstance(content, dict) else None
@@ -374,11 +393,12 @@ def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> No
             f"expected a table of tensors in {config!r}, got something else",
         )
     table = _check_value(archive.path, table, "tensor_name")
-    copied: set[str] = set()  # tensors that share their numbers name one record
+    copied: set[str] = set()  # several tensors may share one file of numbers
     for name, entry in table.items():
         member = f"{folder}{_get_record(archive, name, entry)}"
         shape = _read_shape(archive, member, entry)
-        # torch makes a tensor without data of whatever size it is told
+        # For an empty file torch would allocate a tensor of any size that the table
+        # states, which could exhaust the memory.
         if (
             member in archive
             and archive.members[member].file_size == 0
@@ -395,11 +415,16 @@ def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> No
 
 
 def _get_record(archive: Archive, name: str, entry: Any) -> str:
-    """Return the name of the file with the numbers of a tensor, by its entry in the
-    table.
+    """Return the name of the file that holds the numbers of a tensor.
+
+    Args:
+        archive: archive, for errors.
+        name: name of the tensor.
+        entry: entry of the tensor in the table, which names the file.
 
     Raises:
-        FileFormatError: it is a pickle, or no plain file in the folder of the tensors.
+        FileFormatError: the file is a pickle, or is not directly in the folder of the
+            tensors.
     """
     record = entry.get("path_name") if isinstance(entry, dict) else None
     if isinstance(record, str) and _RECORD.fullmatch(record):
@@ -412,10 +437,10 @@ def _get_record(archive: Archive, name: str, entry: Any) -> str:
 
 
 def _read_shape(archive: Archive, member: str, entry: JsonObject) -> list[int]:
-    """Return the sizes of a tensor, by its entry in the table.
+    """Return the shape of a tensor from its entry in the table.
 
     Raises:
-        FileFormatError: they are something else than whole numbers from 0.
+        FileFormatError: the sizes are not integers of at least 0.
     """
     meta = entry.get("tensor_meta")
     sizes: Any = meta.get("sizes") if isinstance(meta, dict) else None
@@ -437,17 +462,20 @@ def _read_shape(archive: Archive, member: str, entry: JsonObject) -> list[int]:
 
 
 def _check_value(path: Path, value: JsonValue, key: str) -> Any:
-    """Check a value of the network's description with all that is in it, and return it
-    without what is not needed.
+    """Check a value of the network's description, with all values inside of it.
 
     Args:
         path: path of the archive, for errors.
         value: any JSON value.
-        key: the name under which it stands; for an entry of a list, the name of the
-            list.
+        key: name of the entry that holds the value; for an element of a list, the name
+            of the entry that holds the list.
+
+    Returns:
+        The value, in which entries that the network does not need (`_FORGOTTEN`) are
+        replaced by harmless ones.
 
     Raises:
-        FileFormatError: a text, number or name is none of a plain network.
+        FileFormatError: a text, number or name cannot be part of a plain network.
     """
     if isinstance(value, list):
         return [_check_value(path, inner, key) for inner in value]
@@ -457,7 +485,8 @@ def _check_value(path: Path, value: JsonValue, key: str) -> Any:
         return value
     checked: JsonObject = {}
     for name, inner in value.items():
-        # names of values stand as keys, too: they are checked like a text under `key`
+        # Keys of a mapping may be names of tensors. So a key is checked like a text
+        # that stands under the name of the mapping.
         wrong = "" if name in ("", *_FORGOTTEN) else _problem(name, key)
         is_custom_object = name in ("as_custom_obj", "custom_obj")
         if is_custom_object or (name == "custom_obj_values" and inner):
@@ -472,8 +501,12 @@ def _check_value(path: Path, value: JsonValue, key: str) -> Any:
 
 
 def _problem(value: Any, key: str) -> str:
-    """Return what speaks against a text, number or name that stands under a key, "" if
-    nothing does.
+    """Return what is wrong with a text, number or name; "" for nothing.
+
+    Args:
+        value: the value.
+        key: name of the entry that holds it. It decides which check a text needs: for
+            instance "expr_str" holds an expression.
     """
     if isinstance(value, str):
         find_problem = _TEXTS.get(key, _plain_problem)
@@ -521,10 +554,10 @@ def _operator_problem(text: str) -> str:
 
 
 def _tree_problem(text: str) -> str:
-    """Return what speaks against the description of a container of inputs or outputs,
-    "" if nothing does.
+    """Return what is wrong with the structure of inputs or outputs; "" for nothing.
 
-    Torch imports the types that it names, so only tuples, lists and dicts are allowed.
+    Torch imports the types of containers that the structure names. So only tuples,
+    lists and dicts are allowed.
 
     Args:
         text: JSON of [version, node]; a node has a type, a context (the keys of a dict,
@@ -545,11 +578,14 @@ def _tree_problem(text: str) -> str:
 
 
 def _has_plain_keys(context: Any) -> bool:
-    """Return whether the context of a container is a JSON list of plain names or
-    numbers, the keys of a dict; a tuple or a list has no context.
+    """Return whether a container of inputs or outputs has harmless keys, or none.
+
+    Args:
+        context: keys of a dict as a JSON list, such as '["image", "size"]'. They have
+            to be plain names or numbers. A tuple or a list has None or "null".
 
     Raises:
-        ValueError: it is a text that is not JSON.
+        ValueError: the context is a text that is not JSON.
     """
     if context in (None, "null"):
         return True
@@ -585,11 +621,18 @@ _TEXTS: dict[str, Callable[[str], str]] = {
 
 
 def _check_pickle(archive: Archive, name: str) -> None:
-    """Check that a member is a file of `torch.save` with tensors in tuples and dicts;
-    an empty one is fine.
+    """Check that a member is a file of `torch.save` that holds only tensors.
 
-    Nothing is unpickled here: the steps of the pickle are read one by one, and those
-    that import anything else are refused.
+    They may be in tuples and dicts; an empty member is accepted too. Nothing is
+    unpickled here, since that may run code: the steps of the pickle are read one by
+    one, and a step that imports anything but the classes of tensors is refused.
+
+    Args:
+        archive: archive of the network.
+        name: name of the member.
+
+    Raises:
+        FileFormatError: the member is another file, or imports something else.
     """
     data = archive.read(name)
     if not data:

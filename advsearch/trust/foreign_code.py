@@ -56,19 +56,20 @@ class TimedOut(Exception):
 def run_within_limits(
     call: Callable[[], Result], stop: Callable[[], None] | None = None
 ) -> Result:
-    """Call a function of others that may never end, and return its result or raise its
-    error.
+    """Call foreign code with a time limit, and return its result or raise its error.
+
+    The code runs in another thread, since it may never end.
 
     Args:
-        call: the function; it runs in a thread of its own.
-        stop: asks it to end when the time is up.
+        call: function to call.
+        stop: function that asks the code to end when the time is up.
 
     Raises:
-        TimedOut: it has not ended in `LONGEST` seconds (times `ADVSEARCH_LIMITS`); its
-            thread may go on.
+        TimedOut: it has not ended in `LONGEST` seconds (times `ADVSEARCH_LIMITS`). Its
+            thread may go on, since Python cannot end a thread.
     """
     outcome: Future[Result] = Future()
-    # each thread has this switch for itself: the new one takes it over
+    # Torch has this switch for each thread, so it is copied to the new one.
     records_gradients = torch.is_grad_enabled()
 
     def work() -> None:
@@ -85,18 +86,22 @@ def run_within_limits(
     if thread.is_alive():
         if stop is not None:
             stop()
-            thread.join(GRACE)  # its result would be too late all the same
+            thread.join(
+                GRACE
+            )  # so that it ends before we go on; its result is not used
         raise TimedOut
     return outcome.result()
 
 
 def try_torchscript(archive: io.BytesIO) -> str:
-    """Load TorchScript in a process of its own, and return what is wrong, "" if nothing
-    is.
+    """Load TorchScript in another process, and return what is wrong; "" for nothing.
 
-    In this process it could not be stopped: torch keeps Python waiting while it loads.
-    Only a crash and too long a time are reported. An error that torch raises is not,
-    since loading it here raises it again.
+    In this process loading could not be stopped, since torch does not let Python run
+    meanwhile. Only a crash and a timeout are reported. An error that torch raises is
+    not, since loading the archive in this process raises it again.
+
+    Args:
+        archive: the TorchScript file, in memory.
     """
     command = [sys.executable, "-W", "ignore", "-c", _TRIAL]
     try:
@@ -159,14 +164,17 @@ _outside: list[Switches] = []  # as `use_plain_switches` found them, the outermo
 
 @contextmanager
 def use_plain_switches() -> Iterator[None]:
-    """Inside the block, set torch's global switches to their defaults (`PLAIN`), and
-    leave `torch.inference_mode`; restore them afterwards.
+    """Set torch's global switches to their defaults (`PLAIN`) inside the block.
+
+    `torch.inference_mode` is left too. All are restored afterwards. So neither the
+    caller's switches nor those that foreign code sets change our own computations.
     """
     leaves_inference_mode: AbstractContextManager[Any] = nullcontext()
     if torch.is_inference_mode_enabled():
         leaves_inference_mode = torch.inference_mode(False)
     with leaves_inference_mode:
         before = Switches.read_current()
+        # `find_code_switches` reads the switches from before the outermost block.
         _outside.append(before)
         if before != PLAIN:
             PLAIN.apply()
@@ -179,12 +187,11 @@ def use_plain_switches() -> Iterator[None]:
 
 
 def find_code_switches() -> Switches:
-    """Return the switches that the code of a network is to run with, and set `PLAIN`
-    again.
+    """Return torch's switches that the code of a network expects, and set `PLAIN` again.
 
-    Call it inside `use_plain_switches`, after the code was loaded. The switches are
-    those that loading it has set; if it has set none, those from before the outermost
-    `use_plain_switches`.
+    Call it inside `use_plain_switches`, after the code was loaded. If loading the code
+    has set switches, such as the default dtype, the network expects these. Otherwise it
+    expects those from before the outermost `use_plain_switches`.
     """
     current = Switches.read_current()
     if current == PLAIN:  # loading the code has set none
@@ -194,14 +201,14 @@ def find_code_switches() -> Switches:
 
 
 def call_with_switches(module: nn.Module, switches: Switches) -> None:
-    """Make every call of a module use the dtype and device of `switches` for new
-    tensors; after the call those of the caller are back.
+    """Make a module create its new tensors with the dtype and device of `switches`.
 
-    It adds hooks to the module, unless both are the defaults.
+    Hooks set the two before each call of the module, and restore those of the caller
+    after it. No hooks are added if both are the defaults.
     """
     if (switches.dtype, switches.device) == (PLAIN.dtype, PLAIN.device):
         return
-    # of the callers; a stack, since a module may call itself
+    # The switches of the callers. They are a stack, since a module may call itself.
     before: list[Switches] = []
 
     def enter(*_: Any) -> None:
@@ -234,12 +241,13 @@ def get_first_line(error: BaseException) -> str:
 def translate_errors(
     what: str, kind: type[AdvsearchError] = ModelError
 ) -> Iterator[None]:
-    """Turn whatever foreign code raises inside the block into one of our errors; our
-    own errors pass unchanged.
+    """Turn any error that foreign code raises inside the block into one of our errors.
+
+    Errors of advsearch itself pass unchanged.
 
     Args:
-        what: beginning of the message, what failed; the foreign error follows in
-            brackets.
+        what: beginning of the message, which says what failed; the foreign error
+            follows in brackets.
         kind: class of the new error.
     """
     try:

@@ -39,11 +39,12 @@ def is_inside(path: Path | str, folder: Path | str) -> bool:
 
 
 def _list_spellings(name: str) -> list[str]:
-    """Return the names that the file which a mesh file names may have, in the order in
-    which they are tried.
+    """Return the names under which a file that a mesh file names may be found.
 
-    They are the name as written and as this system writes it, each as it is, without a
-    leading slash, and as a bare name in the folder of the mesh.
+    A mesh file may name its textures as another system or another folder did, such as
+    "C:\\textures\\wood.png". The name is tried as written, and as this system writes
+    it. Each of the two is tried unchanged, without a leading slash, and as a bare name
+    in the folder of the mesh; the result is in this order.
     """
     spellings = [
         spelling
@@ -67,11 +68,11 @@ class References:
     def get(self, name: str) -> bytes:
         """Return the content of a file that a mesh file names.
 
-        The name is tried as it stands, then with its usual distortions.
+        The name is tried as written, and then as other systems or folders may spell it
+        (`_list_spellings`). If it is not read, `refused` gets the reason.
 
         Raises:
-            FileNotFoundError: it is not there, or must not be read; `refused` says
-                which.
+            FileNotFoundError: the file is missing or must not be read.
         """
         content = self.find(name)
         if isinstance(content, bytes):
@@ -82,7 +83,9 @@ class References:
     def find(self, name: str) -> bytes | str:
         """Return the content of a file that a mesh file names, or why it is not read.
 
-        Unlike `get` it does not add to `refused`.
+        The reason is a text; unlike `get`, this method does not store it in `refused`.
+        If no spelling of the name works, it is the reason of the last spelling that was
+        refused for more than a missing file.
         """
         reason = MISSING
         for spelling in _list_spellings(name):

@@ -38,11 +38,11 @@ KEY = "ADVSEARCH_MODEL_KEY"
 
 
 def check_address(spec: str) -> SplitResult:
-    """Return the parts of a model's address, once it is safe to use and to store.
+    """Check that a model's address is safe to use and to store, and return its parts.
 
     Raises:
-        InputError: it has no host; it holds a secret, which would be stored with the
-            run; or the key would go there unencrypted.
+        InputError: it has no host; it contains a secret, which would be stored with the
+            run; or the key from the environment would be sent there unencrypted.
     """
     try:
         address = urlsplit(spec)
@@ -68,8 +68,10 @@ def check_address(spec: str) -> SplitResult:
 def _check_no_secret(address: SplitResult) -> None:
     """Check that an address has neither a password nor a key in its query.
 
+    A key is recognized by its name, as in "?api_key=...".
+
     Raises:
-        InputError: it has, by the names in its query.
+        InputError: the address contains one of them.
     """
     secret_names = [
         name
@@ -96,14 +98,13 @@ def is_local(host: str) -> bool:
 
 
 def read_key() -> str:
-    """Return the key for models behind an address from the environment, "" if there is
-    none.
+    """Read the key for models behind an address from the environment; "" for none.
 
     Raises:
-        InputError: it is not printable ASCII.
+        InputError: the key is not printable ASCII.
     """
     key = os.environ.get(KEY, "").strip()
-    # checked here, since the error of http.client would show the key
+    # Checked here, since http.client would print the key in its error.
     if not (key.isascii() and key.isprintable()):
         raise InputError(
             f"{KEY}: expected a key of printable ASCII characters, got others"
@@ -122,22 +123,23 @@ DAYS = 7  # for which a certificate is good
 
 
 def make_https_context(hosts: Sequence[str]) -> tuple[ssl.SSLContext, str]:
-    """Make a certificate of our own for HTTPS.
+    """Make a self-signed certificate for HTTPS.
 
     Args:
-        hosts: names and addresses that it is for.
+        hosts: names and addresses of the server that the certificate is valid for.
 
     Returns:
         The TLS context of a server that uses it, and the certificate's SHA-256
         fingerprint, pairs of hexadecimal digits between colons.
 
     Raises:
-        InputError: there is no program `openssl`, or it makes none.
+        InputError: the program `openssl` is missing, or it fails.
     """
     with tempfile.TemporaryDirectory(prefix="advsearch-") as folder:  # mode 0700
         key = Path(folder) / "key.pem"
         certificate = Path(folder) / "certificate.pem"
-        # made before openssl writes it, so that nobody else can read it
+        # The file is created with its permissions before openssl writes the key, so
+        # that nobody else can read it.
         key.touch(mode=0o600)
         _write_certificate(hosts, key, certificate)
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
@@ -199,19 +201,19 @@ def is_address(host: str) -> bool:
 
 @contextlib.contextmanager
 def restrict_connections(allowed: bool, tries: list[object]) -> Iterator[None]:
-    """Inside the block, refuse every connection that this thread makes, unless
-    `allowed`.
+    """Refuse every connection that this thread makes inside the block.
 
-    It is for loading a model of a library that only a file names. Other threads connect
-    as usual.
+    It is used while a model of a library is loaded because a file names it: a file from
+    somebody else must not make us download anything. Other threads connect as usual.
 
     Args:
-        allowed: refuse nothing.
-        tries: is extended by the address of each connection that was refused.
+        allowed: whether connections are allowed; then nothing changes.
+        tries: list to which the address of each refused connection is appended.
     """
     if allowed:
         yield
         return
+    # The methods of sockets are replaced, as libraries connect in many ways.
     names = ("connect", "connect_ex")
     thread = threading.get_ident()
     before = {name: getattr(socket.socket, name) for name in names}

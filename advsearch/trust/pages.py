@@ -57,18 +57,22 @@ def check_request(
 ) -> None:
     """Check that a request may be answered.
 
+    A web page of somebody else, open in the same browser, could send requests to this
+    server. So the host, the origin and the site of the request are checked, and the
+    token if the server can be reached from other machines.
+
     Args:
-        command: such as "GET".
-        path: what is asked for, with its query.
+        command: HTTP method, such as "GET".
+        path: requested path with its query.
         headers: headers of the request.
-        scheme: scheme that the server speaks, "http" or "https".
-        named: the host that the server was told to listen at.
-        port: port that it listens at.
-        token: the secret that the address or a cookie has to have; None for a server
-            that only this machine can reach.
+        scheme: scheme of the server, "http" or "https".
+        named: host at which the user made the server listen.
+        port: port at which it listens.
+        token: secret that the query or a cookie must contain; None for a server that
+            only this machine can reach.
 
     Raises:
-        RequestRejected: it may not.
+        RequestRejected: the request may not be answered.
     """
     if len(path) > LONGEST:
         raise RequestRejected(
@@ -87,7 +91,8 @@ def check_request(
             "a page of another origin asks; open the address that was printed",
         )
     is_same_origin = headers.get("Sec-Fetch-Site", "none") in ("none", "same-origin")
-    # another site may link to a page here, but not read or change anything
+    # Another site may link to a page here, which the user then sees. It cannot read
+    # that page, and a POST from it is refused, since that could change something.
     follows_link = headers.get("Sec-Fetch-Mode") == "navigate" and command != "POST"
     if not is_same_origin and not follows_link:
         raise RequestRejected(HTTPStatus.FORBIDDEN, "a page of another site asks")
@@ -99,15 +104,18 @@ def check_request(
 
 
 def _has_token(path: str, headers: Message, port: int, token: str) -> bool:
-    """Return whether a request has the token of the server that listens at a port, in
-    its query or in the cookie that `make_token_cookie` makes.
+    """Return whether a request has the server's token in its query or in a cookie.
+
+    The name of the cookie contains the port, since browsers send cookies to all ports
+    of a host.
     """
     tokens = parse_qs(urlsplit(path).query).get("token", [])
     for part in headers.get("Cookie", "").split(";"):
         name, _, value = part.strip().partition("=")
         if name == f"{COOKIE}-{port}":
             tokens.append(value)
-    # `compare_digest` takes ASCII only, and as long for a wrong token as for the right one
+    # `compare_digest` takes as long for a wrong token as for the right one, so that the
+    # time does not reveal it. It accepts ASCII only.
     return any(
         hmac.compare_digest(token, candidate)
         for candidate in tokens
@@ -118,14 +126,15 @@ def _has_token(path: str, headers: Message, port: int, token: str) -> bool:
 def _is_server_address(host: str, named: str, port: int, token: str | None) -> bool:
     """Return whether the Host of a request is an address of this server.
 
-    Any other name is refused: a site could let its own name lead here (DNS rebinding).
-    A numeric address needs no name server, so it leads where it says.
+    Any other name is refused, since a foreign site could make its own name resolve to
+    this machine (DNS rebinding). A numeric address is accepted: no name server can
+    redirect it.
 
     Args:
-        host: what the request states, NAME:PORT.
-        named: the host that the server was told to listen at.
-        port: port that it listens at.
-        token: its token; None for a server that only this machine can reach.
+        host: the header Host of the request, NAME:PORT.
+        named: host at which the user made the server listen.
+        port: port at which it listens.
+        token: token of the server; None if only this machine can reach it.
     """
     name, _, port_text = host.rpartition(":")
     if not port_text.isdecimal() or int(port_text) != port:
@@ -150,12 +159,12 @@ def compute_script_digest(code: bytes) -> str:
 
 
 def make_page_policy(digests: Iterable[str], *, connects: bool) -> str:
-    """Return the Content-Security-Policy that stands in a page: what it may load and
-    run.
+    """Return the Content-Security-Policy of a page: what it may load and run.
 
     Args:
-        digests: digests of the scripts that may run.
-        connects: it may load pictures from its server, and send requests there.
+        digests: SHA-256 digests of the scripts that may run.
+        connects: whether the page may load images from its server and send requests
+            there. Other images are part of the page ("data:").
     """
     images = "data:"
     connections = ""
@@ -173,13 +182,14 @@ def make_page_policy(digests: Iterable[str], *, connects: bool) -> str:
 def make_served_policy(digests: Iterable[str], *, is_generated: bool) -> str:
     """Return the `Content-Security-Policy` that the server sends with a page.
 
-    A page that the server made itself may ask it for more. Any other page lies in the
-    folder of a run, which may come from somebody else: it gets an origin of its own, so
-    that it can read and send nothing, and runs no scripts but ours.
+    A page that the server made itself may send requests to it. Any other page is a file
+    in the folder of a run, which may come from somebody else. It is sandboxed: it has
+    an origin of its own, so that it can neither read from the server nor send anything,
+    and it runs no scripts but ours.
 
     Args:
         digests: digests of all our scripts.
-        is_generated: the server made the page itself.
+        is_generated: whether the server made the page itself.
     """
     if is_generated:
         limits = "form-action 'self'"
@@ -193,12 +203,12 @@ def make_served_policy(digests: Iterable[str], *, is_generated: bool) -> str:
 
 
 def has_other_scripts(page: bytes, digests: Collection[str]) -> bool:
-    """Return whether a page has a script whose digest is none of `digests`.
+    """Return whether a page has a script whose digest is not in `digests`.
 
-    Scripts that are data do not count. The page may come from somebody else, so that it
-    is gone through once only, however long it is.
+    Scripts that only hold data, such as JSON, do not count. The page may come from
+    somebody else; the loop never goes back, so that even a long page takes little time.
     """
-    end = 0  # of the script before
+    end = 0  # position of the end of the previous script
     for opening in re.finditer(rb"<script", page, re.IGNORECASE):
         is_inside_script = opening.start() < end
         if is_inside_script:

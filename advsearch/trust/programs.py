@@ -34,15 +34,15 @@ def run_converter(
 
     Args:
         path: path of the file, for errors.
-        program: its name, for errors.
+        program: name of the program, for errors.
         command: the program with its arguments.
         folder: folder in which it runs.
-        seconds: seconds that it may take, before `scale_limit`.
-        env: its environment; None is ours.
+        seconds: time limit, which the user may multiply by `ADVSEARCH_LIMITS`.
+        env: environment of the program; None for that of this process.
 
     Raises:
-        OSError: it can't be started.
-        FileFormatError: it takes too long.
+        OSError: the program cannot be started.
+        FileFormatError: the program takes too long.
     """
     longest = scale_limit(seconds)
     try:
@@ -82,12 +82,14 @@ those that are looked for.
 
 
 def find_blender(who: str, otherwise: str) -> list[str]:
-    """Return the command that runs a script in Blender; the path of the script goes
-    after it.
+    """Return the command that runs a script in Blender.
+
+    The caller appends the path of the script. Blender may be a program, or a Python
+    with the package `bpy`.
 
     Args:
-        who: beginning of the error's message: what needs Blender.
-        otherwise: end of the message: what else can be done.
+        who: beginning of the error's message, which says what needs Blender.
+        otherwise: end of the message, which says what else the user can do.
 
     Raises:
         FileFormatError: there is no Blender.
@@ -110,6 +112,8 @@ def find_blender(who: str, otherwise: str) -> list[str]:
     is_python = Path(program).name.startswith("python")  # one with the package bpy
     if is_python:
         return [program, "-I"]  # without the user's own modules
+    # Without a window, and with neither the user's settings nor scripts of the file. A
+    # script that fails makes the exit status 1.
     return [
         program,
         "--background",

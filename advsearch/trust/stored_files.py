@@ -72,8 +72,10 @@ def list_opened_files(path: Path | str) -> list[str]:
 
 
 def scale_limit(limit: int) -> int:
-    """Return a limit on the size of input (bytes, pixels, faces, ...) times the
-    environment variable `ADVSEARCH_LIMITS`, which is 1 by default.
+    """Multiply a limit by the environment variable `ADVSEARCH_LIMITS`.
+
+    The limits are on the size of input (bytes, pixels, faces) and on seconds. The
+    variable is 1 by default; users who trust their input set it higher.
 
     Raises:
         InputError: the variable is not a number greater than 0.
@@ -122,8 +124,8 @@ def open_regular(path: Path, expected: str, limit: int) -> BinaryIO:
         raise FileFormatError(
             f"{path}: expected the name of a file, got one with a zero byte in it"
         )
-    # checked before it is opened, since opening a device or a pipe may change it, and
-    # once more after that, since another file may have taken its place
+    # The check comes before opening, since opening a device or a pipe may change it. It
+    # is repeated below, since another file may have taken its place meanwhile.
     _check(path, os.stat(path), expected, limit)
     # without blocking: a pipe that has taken its place would wait for a writer
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)
@@ -138,12 +140,21 @@ def open_regular(path: Path, expected: str, limit: int) -> BinaryIO:
 
 
 def read_bytes(path: Path, expected: str, limit: int) -> bytes:
-    """Return the content of an ordinary file; arguments and errors as for
-    `open_regular`.
+    """Return the content of an ordinary file.
+
+    Args:
+        path: path of the file.
+        expected: what it should be, for errors, such as "a label file".
+        limit: how many bytes it may have, before `scale_limit`.
+
+    Raises:
+        FileFormatError: it is a directory, a pipe or a device, or is too large.
+        OSError: it is missing, or there is no permission.
     """
     max_bytes = scale_limit(limit)
     with open_regular(path, expected, limit) as file:
-        # read once more than allowed: a file may grow, and those of /proc state no size
+        # One byte more than allowed is read, to notice a file that is too large after
+        # all: it may have grown, and files in /proc state no size.
         data = file.read(max_bytes + 1)
     if data is None:  # nothing to read yet, as in the kernel's log
         raise FileFormatError(
@@ -160,9 +171,14 @@ def read_bytes(path: Path, expected: str, limit: int) -> bytes:
 def read_text(path: Path, expected: str, limit: int) -> str:
     """Return the text of an ordinary file in UTF-8, without a byte order mark.
 
+    Args:
+        path: path of the file.
+        expected: what it should be, for errors, such as "a label file".
+        limit: how many bytes it may have, before `scale_limit`.
+
     Raises:
-        FileFormatError: as for `open_regular`, or the bytes are not UTF-8.
-        OSError: as for `open_regular`.
+        FileFormatError: it is not an ordinary file, is too large, or is not UTF-8.
+        OSError: it is missing, or there is no permission.
     """
     try:
         return read_bytes(path, expected, limit).decode("utf-8-sig")
@@ -185,10 +201,15 @@ def read_existing_bytes(path: Path, expected: str, limit: int) -> bytes:
 
 
 def read_existing_text(path: Path | str, expected: str, limit: int) -> str:
-    """Return the text of a file that has to exist, as `read_text` does.
+    """Return the text of a file in UTF-8, which has to exist.
+
+    Args:
+        path: path of the file.
+        expected: what it should be, for errors, such as "a label file".
+        limit: how many bytes it may have, before `scale_limit`.
 
     Raises:
-        FileFormatError: as for `read_text`, or the file is missing or cannot be read.
+        FileFormatError: it is missing, not an ordinary file, too large, or not UTF-8.
     """
     try:
         return read_text(Path(path), expected, limit)
@@ -214,7 +235,7 @@ def parse_text(
     """
     try:
         return parse(text)
-    except (ValueError, SyntaxError) as error:  # that of XML is a SyntaxError
+    except (ValueError, SyntaxError) as error:  # errors of XML are SyntaxErrors
         raise FileFormatError(
             f"{path}: expected {kind}, got {error}; correct the file"
         ) from None
@@ -242,6 +263,7 @@ def parse_json(text: str | bytes, *, finite: bool = False) -> Any:
         )
     except RecursionError:
         raise JsonBoundsError(f"lists or objects nested deeper than {DEPTH}") from None
+    # Python's own recursion limit varies, so that the depth is checked as well.
     if not is_shallow(value, DEPTH - 1):
         raise JsonBoundsError(f"lists or objects nested deeper than {DEPTH}")
     return value
@@ -303,11 +325,11 @@ def check_most(
         path: path of the file.
         count: how much it has.
         limit: how much it may have, before `scale_limit`.
-        expected: the text for the error, with {} for the limit.
-        got: what it has instead, for the error; None takes `count`.
+        expected: text for the error, with {} for the limit, such as "at most {} faces".
+        got: text for the error about what it has instead; None for `count`.
 
     Raises:
-        FileFormatError: it has more.
+        FileFormatError: the file has more than the limit.
     """
     max_count = scale_limit(limit)
     if count > max_count:

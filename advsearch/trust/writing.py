@@ -50,13 +50,16 @@ _SQLITE_ADVICE = {
 
 @contextmanager
 def storage_errors(path: Path) -> Iterator[None]:
-    """Turn errors of the operating system and of SQLite inside the block into a
-    `StorageError` that names `path`.
+    """Turn errors of writing inside the block into a `StorageError` that names `path`.
+
+    These are errors of the operating system and of SQLite. The message says what the
+    user can do, for instance about a full disk.
     """
     try:
         yield
     except (OSError, sqlite3.OperationalError) as error:
-        # raises where the folder was moved, which explains any of these errors
+        # If the folder of the run was moved, this raises another error: the move
+        # explains whatever failed.
         check_not_moved(path)
         advice = _find_advice(error)
         if advice is None:
@@ -88,25 +91,25 @@ def name_setting_in_errors(setting: str) -> Iterator[None]:
 
 @contextmanager
 def replace_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
-    """Yield a path to write to; at the end of the block its file takes the place of
-    `path` in one step.
+    """Yield a path to write to; its file replaces `path` at the end of the block.
 
-    When the block raises, or the process is killed, `path` is as it was before. Missing
-    folders are made.
+    The replacement is atomic: if the block raises, or the process is killed, `path` is
+    as it was before. Missing folders are created.
 
     Args:
         path: path of the file.
-        durable: the file survives a power cut; that takes some 10 ms.
+        durable: whether the file must survive a power cut; that takes about 10 ms.
 
     Raises:
-        StorageError: it cannot be written.
+        StorageError: the file cannot be written.
     """
     part = path.with_name(f"{PART}{os.getpid()}-{path.name}")
-    check_not_moved(path)  # or missing folders would be made
+    check_not_moved(path)  # otherwise a folder that was moved would be created again
     try:
         with storage_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-            part.unlink(missing_ok=True)  # what lies there may be somebody else's link
+            # A link of somebody else at this path would lead the writing elsewhere.
+            part.unlink(missing_ok=True)
             yield part
             if durable:
                 _flush(part)
@@ -119,18 +122,17 @@ def replace_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
 
 
 def check_free_folder(out: Path, setting: str) -> None:
-    """Check that a folder, which will be written as a whole, is not there yet or is
-    empty.
+    """Check that a folder to be written does not exist yet or is empty.
 
-    A link is refused: the finished folder could not take its place, and what it leads
-    to may be somebody else's.
+    A link is refused: the finished folder could not replace it, and it may lead to
+    files of somebody else.
 
     Args:
-        out: the folder.
-        setting: setting that names it, for the error.
+        out: path of the folder.
+        setting: setting that names the folder, for the error.
 
     Raises:
-        InputError: it is not free.
+        InputError: the path is a link, a file, or a folder that is not empty.
     """
     if os.path.islink(out):
         raise InputError(
@@ -186,11 +188,15 @@ def _get_file_id(status: os.stat_result) -> tuple[int, int]:
 
 
 def note_open(results: Path) -> Callable[[], None]:
-    """Note that the results of a run are open for writing, so that `check_not_moved`
-    looks after them.
+    """Register that the results of a run are open for writing.
+
+    From now on `check_not_moved` checks that the folder of the run is still there.
+
+    Args:
+        results: path of the file with the results.
 
     Returns:
-        What to call when they are closed.
+        A function without arguments, to be called when the file is closed.
     """
     folder = results.parent
     with storage_errors(results):
@@ -206,14 +212,14 @@ def note_open(results: Path) -> Callable[[], None]:
 
 
 def check_not_moved(path: Path) -> None:
-    """Check that `path` is not in the folder of a run that this process writes to and
-    that somebody has removed or renamed.
+    """Check that the run folder around `path` was not removed or renamed meanwhile.
 
-    Such a folder must not be made again: writing to the open files would succeed, but
+    Only folders of runs to which this process writes are checked. Such a folder must
+    not be created again: writing to the files that are still open would succeed, but
     nobody could find them.
 
     Raises:
-        StorageError: it was removed or renamed.
+        StorageError: the folder was removed or renamed.
     """
     for folder in (path, *path.parents):
         if folder not in _open:
@@ -239,8 +245,8 @@ def _make_lock_error(folder: Path, error: OSError, pid: str) -> Exception:
 
     Args:
         folder: the run directory.
-        error: the error of the system.
-        pid: the process number in the lock, perhaps damaged.
+        error: error of the operating system.
+        pid: process number that the lock file contains; it may be corrupt.
     """
     if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
         owner = f"process {pid}" if pid.isdecimal() else "another process"
@@ -287,7 +293,7 @@ class RunLock:
             os.truncate(self._descriptor, 0)
             os.write(self._descriptor, str(os.getpid()).encode())
         except OSError as error:
-            # of the process that holds the lock
+            # The process that holds the lock has written its number into the file.
             pid = os.pread(self._descriptor, 32, 0).decode(errors="replace")
             self.release()
             raise _make_lock_error(folder, error, pid) from None
@@ -305,7 +311,7 @@ def is_held(folder: Path) -> bool:
     except OSError:
         return False
     try:
-        # can be taken only where nobody holds the lock for writing
+        # A shared lock is granted only if nobody holds the exclusive one.
         fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except OSError:
         return True
@@ -317,18 +323,19 @@ def is_held(folder: Path) -> bool:
 def check_no_links(run: Path, contents: Collection[str], unchecked_suffix: str) -> None:
     """Check that the folder of a run holds files and folders only, and no links.
 
-    In a run that somebody else made, a link may lead to any file, which would be shown,
-    copied or overwritten. The folder itself may be a link.
+    In a run that somebody else made, a link may lead to any file, which would then be
+    displayed, copied or overwritten. The run folder itself may be a link, since the
+    user names it.
 
     Args:
-        run: the folder.
-        contents: names directly in it that are checked, beside the lock; others are
-            ignored.
-        unchecked_suffix: end of a path; of a folder with such a path the subfolders
-            are not looked into.
+        run: the folder of the run.
+        contents: names in this folder that are checked, in addition to the lock; other
+            names are ignored.
+        unchecked_suffix: end of a path. If the path of a folder ends so, its subfolders
+            are not checked.
 
     Raises:
-        FileFormatError: there is a link, or a pipe or the like.
+        FileFormatError: there is a link, a pipe or another special file.
     """
     folders = [str(run)]
     while folders:

@@ -76,8 +76,8 @@ def parse_yaml(text: str) -> Any:
     """Return the value of a YAML text.
 
     Raises:
-        ValueError: it is not YAML, is too large or nested too deeply, or holds something
-            else than settings are made of; the message is short.
+        ValueError: the text is not YAML, is too large or nested too deeply, or has
+            values that no setting has, such as Python objects. The message is short.
     """
     if len(text) > scale_limit(MAX_YAML_BYTES):
         raise ValueError(f"a text of {len(text):,} characters")
@@ -86,7 +86,7 @@ def parse_yaml(text: str) -> Any:
     except RecursionError:
         raise ValueError(f"lists or mappings nested deeper than {DEPTH}") from None
     except yaml.MarkedYAMLError as error:
-        # the note is ours (`_problem`); other errors are the parser's
+        # Our own errors (`_problem`) have a note. Other errors come from PyYAML.
         got = error.note or f"other text ({error.problem or error.context})"
         mark = error.problem_mark or error.context_mark
         if mark is not None:
@@ -112,27 +112,29 @@ def _shorten(text: str) -> str:
 
 
 def _count_checked(node: yaml.Node, depth: int, counts: dict[int, int]) -> int:
-    """Check a node of a YAML document, and return how many values it has with all that
-    is in it.
+    """Check a node of a YAML document, and count the values in it.
 
-    An alias is counted at each place, so that a short text cannot stand for a huge
-    value.
+    A node that has aliases is counted again for each alias. So a short text cannot
+    stand for a huge value: nested aliases ("billion laughs") are refused.
 
     Args:
         node: node of the document.
-        depth: how many nodes are around it.
-        counts: the results so far, by id of the node; `_UNFINISHED` while a node is
-            being counted. It is extended.
+        depth: number of nodes that contain it.
+        counts: counts so far, by id of the node, to which this function adds;
+            `_UNFINISHED` while a node is being counted.
+
+    Returns:
+        The number of values, 1 for a scalar.
 
     Raises:
-        yaml.YAMLError: it has a tag that no setting has, is nested too deeply, repeats
-            a name, or has too many values.
+        yaml.YAMLError: the node has a tag that no setting has, is nested too deeply,
+            repeats a name, or has too many values.
     """
     if node.tag not in _PLAIN:
         raise _problem(node, f"the tag {node.tag[:40]!r}, which no setting has")
     if isinstance(node, yaml.ScalarNode):
         return 1
-    # an alias of a node that is around it: a structure without an end
+    # A node that is still being counted contains an alias of itself.
     contains_itself = counts.get(id(node)) == _UNFINISHED
     if depth >= DEPTH or contains_itself:
         raise _problem(node, f"lists or mappings nested deeper than {DEPTH}")

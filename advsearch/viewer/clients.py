@@ -43,10 +43,12 @@ NO_QR = "pip install segno"
 
 
 def find_reachable_address(host: str) -> str:
-    """Return the address under which other machines reach what listens at `host`.
+    """Return the address under which other machines reach a server.
 
-    A server that listens at all addresses is reached by the one that this machine has
-    on its way to the internet; without a network, only from this machine.
+    Args:
+        host: address at which the server listens. If it is that of all addresses
+            ("0.0.0.0" or "::"), the result is the address that this machine uses for
+            the internet; without a network it is the loopback address.
     """
     if host not in ("0.0.0.0", "::", ""):
         return host
@@ -105,7 +107,14 @@ class ConnectionPool:
         handle: Callable[[socket.socket, Any], None],
         context: ssl.SSLContext | None,
     ) -> None:
-        """Make a pool; arguments as for the class."""
+        """Make a pool of workers for connections.
+
+        Args:
+            listening_socket: socket of the server, which listens already.
+            handle: function that serves a connection, given it and the client's
+                address.
+            context: TLS context for encrypted connections; None for plain ones.
+        """
         self._listening = listening_socket
         self._handle = handle
         self._context = context
@@ -120,7 +129,10 @@ class ConnectionPool:
         self._ended.set()
 
     def serve(self) -> None:
-        """Serve connections until `close` is called."""
+        """Serve connections until `close` is called.
+
+        This thread accepts connections, and worker threads serve them.
+        """
         self._ended.clear()
 
         def work() -> None:
@@ -152,11 +164,12 @@ class ConnectionPool:
             self._ready.put(None)
 
     def report_waiting(self, seconds: float | None) -> None:
-        """Report, from a worker's thread, that it waits for its client from now on, or
-        no longer.
+        """Report that the worker of this thread waits for its client, or no longer.
+
+        A client that lets its worker wait too long is disconnected.
 
         Args:
-            seconds: seconds that it will wait at most; None where it no longer waits.
+            seconds: how long the worker will wait at most; None if it no longer waits.
         """
         client = self._connections[threading.get_ident()]
         if seconds is None:
@@ -168,8 +181,13 @@ class ConnectionPool:
         client.due = now + seconds
 
     def _watch(self, selector: selectors.BaseSelector) -> None:
-        """Accept connections, pass those that have sent something to the workers, and
-        close those that take too long; return when the pool is closed.
+        """Accept connections and pass them to the workers until the pool is closed.
+
+        A connection is passed on when its client has sent something, so that silent
+        clients occupy no worker. Connections that remain silent too long are closed.
+
+        Args:
+            selector: selector that waits for all sockets.
         """
         # connections that have sent nothing yet
         silent: dict[Any, _SilentClient] = {}
@@ -207,13 +225,14 @@ class ConnectionPool:
             connection.close()
 
     def _end_slow_clients(self, now: float) -> None:
-        """Disconnect clients that a worker has waited for too long.
+        """Disconnect clients for which a worker has waited too long.
 
-        Where connections wait for a worker, clients that have had `SLOW_CLIENT_SECONDS`
-        are disconnected too, the slowest first, as many as are needed.
+        If other connections wait because all workers are busy, clients for which a
+        worker has waited over `SLOW_CLIENT_SECONDS` are disconnected too: the slowest
+        first, and only as many as workers are needed.
 
         Args:
-            now: the time, `time.monotonic`.
+            now: the present time (`time.monotonic`).
         """
         clients = sorted(
             self._connections.copy().values(), key=lambda client: client.since
@@ -227,7 +246,8 @@ class ConnectionPool:
             if not is_overdue and not (n_needed_workers > 0 and is_slow):
                 continue
             n_needed_workers -= 1  # its worker becomes free
-            # so that it is not ended twice
+            # These values make it neither slow nor overdue, so that it is not
+            # disconnected twice.
             client.since = math.inf
             client.due = math.inf
             # The worker's next read or write ends then. (The plain method: that of an SSL
@@ -236,7 +256,15 @@ class ConnectionPool:
                 socket.socket.shutdown(client.connection, socket.SHUT_RDWR)
 
     def serve_connection(self, connection: socket.socket, address: Any) -> None:
-        """Serve one client in this thread; whatever it does, nothing is raised."""
+        """Serve one client in this thread.
+
+        Nothing is raised, whatever the client sends, since an error would end the
+        worker.
+
+        Args:
+            connection: socket of the connection.
+            address: address of the client.
+        """
         thread = threading.get_ident()
         try:
             connection.setblocking(True)

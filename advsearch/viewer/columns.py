@@ -114,7 +114,7 @@ def read_columns(
     boxes = Boxes()
 
     def read_corners(row: Row) -> Mapping[str, float]:
-        """Return the corners of a row; what is stored may be anything."""
+        """Return the corners of a row; its stored payload may be corrupt."""
         try:
             return _read_corners(row, boxes)
         except (LookupError, TypeError, ValueError, OverflowError, AttributeError):
@@ -129,10 +129,14 @@ def read_columns(
 
 
 def _read_corners(row: Row, boxes: Boxes) -> Mapping[str, float]:
-    """Return the corners of a row's true box and of its best detection (`CORNERS`), and
-    add all boxes of the row to `boxes`.
+    """Return the corners of a row's true box and of its best detection.
 
-    Rows of other tasks have no corners.
+    The names of the corners are `CORNERS`; a box that does not exist has NaN. Rows of
+    other tasks than detection have no corners.
+
+    Args:
+        row: row of a sweep.
+        boxes: collection to which all boxes of the row are added.
     """
     payload: Any = row.payload
     corners: Mapping[str, float] = {}
@@ -144,7 +148,7 @@ def _read_corners(row: Row, boxes: Boxes) -> Mapping[str, float]:
             for corner in box or [None] * 4:  # no box: four NaN
                 values.append(math.nan if corner is None else float(corner))
         corners = dict(zip(CORNERS, values, strict=True))
-    # every row has an end, also one without boxes
+    # Every row has an entry: the number of boxes up to and including it.
     boxes.ends.append(len(boxes.values) // VALUES_PER_BOX)
     return corners
 
@@ -163,20 +167,22 @@ def _find_best_detection(row: Row, payload: Mapping[str, Any]) -> Any:
 def pack_columns(
     rows: pd.DataFrame, *, has_more: bool = False, is_running: bool = False
 ) -> bytes:
-    """Return rows as bytes for a browser: the length of the head, the head, the
-    columns.
+    """Pack rows into bytes for a browser.
 
-    All is little-endian. The length is a uint32. The head is JSON, padded to a multiple
-    of 4 bytes; it has the count of rows, the names, and the offset of each column
-    behind the head. Columns of four bytes a value come first, so that each one is
-    aligned. Column "boxes" is (n, 8) uint16 in `BOX_STEPS` of a pixel, or `NO_BOX`;
-    "others" are the values of all `Boxes`, and "others end" how many boxes there are up
-    to each row.
+    The bytes are the length of the head, the head, and the columns, all little-endian.
+    The length is a uint32. The head is JSON, padded to a multiple of 4 bytes; it has
+    the number of rows, the names, and the offset of each column from the end of the
+    head. Columns with the largest values (4 bytes) come first, so that each column is
+    aligned, as typed arrays of JavaScript require it.
+
+    The column "boxes" is (n, 8) uint16: the corners of the true box and of the best
+    detection, in units of 1 / `BOX_STEPS` of a pixel, or `NO_BOX`. "others" has the
+    values of all boxes, and "others end" the number of boxes up to each row.
 
     Args:
-        rows: a frame as `read_columns` returns it.
-        has_more: the run has further rows already.
-        is_running: the run is still adding rows.
+        rows: table from `read_columns`.
+        has_more: whether the run has further rows already.
+        is_running: whether the run is still adding rows.
     """
     columns, labels, outcome_names = _prediction_columns(rows)
     parameter_columns, parameters = _parameter_columns(rows)
@@ -208,8 +214,10 @@ def pack_columns(
 def _make_layout(
     arrays: Sequence[tuple[str, npt.NDArray[Any]]],
 ) -> list[dict[str, object]]:
-    """Return a description of each column: name, type, offset in bytes, and how many
-    values a row has.
+    """Return a description of each column for the head.
+
+    It has the name, the type, the offset in bytes ("at"), and the number of values for
+    each row ("width").
     """
     layout = list[dict[str, object]]()
     offset = 0
@@ -220,7 +228,8 @@ def _make_layout(
             "at": offset,
             "width": values.size // max(len(values), 1),
         }
-        # the one column whose length does not follow from the rows
+        # Rows have different numbers of boxes, so that the length of this column does
+        # not follow from the number of rows.
         if name == "others":
             entry["length"] = values.size
         layout.append(entry)
@@ -231,10 +240,13 @@ def _make_layout(
 def _prediction_columns(
     rows: pd.DataFrame,
 ) -> tuple[dict[str, Any], list[str], list[str]]:
-    """Return the columns about predictions, by name, then the names that the indices in
-    "answer" stand for, then those for "outcome".
+    """Return the columns about the predictions of rows.
 
-    Probabilities are in 1/10000; "right" is 0, 1 or `UNKNOWN`.
+    Probabilities are integers in units of 1/10000, and "right" is 0, 1 or `UNKNOWN`.
+
+    Returns:
+        The columns by name; the names for which the indices in "answer" stand; and the
+        names for those in "outcome".
     """
     labels, label_names = _encode_levels(rows["label"])
     outcomes, outcome_names = _encode_levels(rows["outcome"])
@@ -261,8 +273,9 @@ def _parameter_columns(
 ) -> tuple[dict[str, Any], list[dict[str, object]]]:
     """Return the columns of the parameters, and a description of each parameter.
 
-    A description has its name, its unit, its levels (the names that the numbers of its
-    column stand for; None if they are values), and the edges of its ranges.
+    A description has the name, the unit, the levels and the edges of the ranges.
+    Levels are the names for which the numbers in the column stand; None if the numbers
+    are values.
     """
     edges = rows.attrs["edges"]
     columns = dict[str, Any]()
@@ -293,7 +306,8 @@ def _box_columns(rows: pd.DataFrame) -> dict[str, Any]:
         columns["boxes"] = np.where(np.isnan(pixels), NO_BOX, steps).astype(np.uint16)
     boxes: Boxes | None = rows.attrs.get(BOXES_ATTRIBUTE)
     if boxes is not None and boxes.values:
-        # a frame with other rows has the attribute of the one that it was made from
+        # Pandas copies the attribute to selections of rows, to which the boxes do not
+        # belong.
         are_of_these_rows = len(boxes.ends) == len(rows)
         if are_of_these_rows:
             columns["others"] = np.asarray(boxes.values, np.uint16)
@@ -304,14 +318,15 @@ def _box_columns(rows: pd.DataFrame) -> dict[str, Any]:
 def _encode_levels(column: pd.Series) -> tuple[Any, list[str]]:
     """Encode a column of names as indices (n,) uint16, and return these and the names.
 
-    Names beyond `MAX_LEVELS` share the last one, "others". A column without any name
-    has the index 0 throughout.
+    If there are more than `MAX_LEVELS` names, the remaining ones share the last level,
+    "others". If the column has no names, all indices are 0.
     """
     names = column.cat.categories.tolist() if column.dtype == "category" else []
     if not names:
         return np.zeros(len(column), np.uint16), names
     if len(names) >= MAX_LEVELS:
         names = [*names[: MAX_LEVELS - 1], "others"]
-    # what is beyond becomes the last name; a missing name has the code -1, 65535 here
+    # Further names get the index of the last one. A missing name has the code -1, which
+    # becomes 65535 in uint16.
     indices = np.minimum(column.cat.codes.to_numpy(), len(names) - 1)
     return indices.astype(np.uint16), names

@@ -66,7 +66,7 @@ def make_document(
         footer: a sentence at the end, by default the title.
     """
     code = _join_scripts(scripts)
-    # the policy lets no other script run
+    # The policy of the page lets only scripts with these digests run.
     digests = [pages.compute_script_digest(code.encode())] if code else []
     policy = pages.make_page_policy(digests, connects=connects)
     head = _make_head(title, f"{policy}; form-action 'self'")
@@ -170,9 +170,9 @@ def make_header(eyebrow: Html | str, text: str, remarks: Sequence[str]) -> Html:
     """Return the header of a page.
 
     Args:
-        eyebrow: a line above the title, about what the page is of.
-        text: the title, what came out.
-        remarks: sentences below it.
+        eyebrow: line above the title with the subject of the page, such as its run.
+        text: the title, which states the result.
+        remarks: sentences below the title.
     """
     return make_element(
         "header",
@@ -203,11 +203,11 @@ def _list_html(lines: Sequence[str], css: str) -> Html | None:
 
 
 def subject_html(*parts: tuple[str, str]) -> Html:
-    """Return what a run is about as HTML.
+    """Return the subject of a run as HTML, such as "model resnet50, object mug".
 
     Args:
-        parts: (kind, name) each, such as ("model", "resnet50"); the kind may be empty.
-            A path is shortened, and shown in full where the mouse is over it.
+        parts: pairs of kind and name, such as ("model", "resnet50"); the kind may be
+            "". A path is shortened, and displayed in full when the mouse is over it.
     """
     content = list[Html | str]()
     for index, (kind, text) in enumerate(parts):
@@ -240,10 +240,12 @@ def make_table(
 
     Args:
         heads: heads of the columns.
-        rows: the cells of each row, the name first.
-        links: addresses of the names; rows with an empty or no link have none.
-        shares: fractions that color cells, by (row, column), as in `ResultPart`.
-        bars: intervals with marks in an extra column, as in `ResultPart`.
+        rows: texts of the cells of each row, the name first.
+        links: address to which the name of each row links; "" or missing for none.
+        shares: fractions in [0, 1] by which cells are colored, by (row, column); the
+            name is column 0.
+        bars: interval of each row, drawn in an additional column: (lower end, upper
+            end, mark) as fractions of its width; None for no interval.
     """
     lines = []
     for row, (first, *texts) in enumerate(rows):

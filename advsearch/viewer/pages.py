@@ -50,10 +50,15 @@ MEDIA_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg"}
 def find_image(
     run: Path, name: str | Path, max_bytes: int = MAX_FIGURE_BYTES
 ) -> Path | None:
-    """Return the path of an image in a run; None if it is missing, outside of the run
-    or too large.
+    """Return the path of an image in a run; None if it cannot be embedded.
 
-    The name comes from a summary, and may be that of any file.
+    It cannot if it is missing, too large, or outside of the run: the name comes from a
+    summary that somebody else may have written, and could lead to any file.
+
+    Args:
+        run: directory of the run.
+        name: path of the image, relative to the run.
+        max_bytes: maximum size of the file.
     """
     file = run / name
     if not is_inside(file, run) or not file.is_file():
@@ -64,13 +69,13 @@ def find_image(
 def make_part(run: Path, part: ResultPart, description: str) -> Html:
     """Return a part of a result as HTML.
 
-    A part that a script fills is hidden until then, and a folded one opens at its
-    title.
+    A part that a script fills (`live`) is hidden until the script runs. A folded part
+    displays its title, and opens at a click.
 
     Args:
         run: directory of the run.
         part: part of its result.
-        description: description of the chart, where the part has no text of its own.
+        description: text that describes the chart if the part has no text.
     """
     content = _part_content(run, part, description)
     title = make_element("h2", part.title) if part.title else None
@@ -89,18 +94,19 @@ def make_part(run: Path, part: ResultPart, description: str) -> Html:
 
 
 def _part_content(run: Path, part: ResultPart, description: str) -> Html:
-    """Return a part of a result without its title: text, chart or figure, table, images
-    and note.
+    """Return the content of a part: text, chart or figure, table, images and note.
 
     Args:
         run: directory of the run.
         part: part of its result.
-        description: text for the chart, for who cannot see it, if the part has none.
+        description: text that describes the chart to users who cannot see it, if the
+            part has no text.
     """
     content = list[Html | None]()
     if part.draw is not None:
         alt = " ".join([f"{part.title}.", *(part.text or [description])])
-        # a wide one and a narrow one: the style of the page shows what fits the window
+        # The page has a wide chart and a narrow one. Its style sheet displays the one
+        # that fits the window.
         charts = [
             views.make_chart_svg(part.draw, alt, width, part.height)
             for width in (views.WIDE_WIDTH, views.NARROW_WIDTH)
@@ -155,8 +161,9 @@ def _embed_images(run: Path, group: Iterable[Picture], layout: str) -> Html | No
 
 
 def _read_image(run: Path, picture: Picture) -> bytes | None:
-    """Return the bytes of an image as they are embedded, a large PNG scaled down; None
-    if there is no such file, or it is too large.
+    """Return the bytes of an image to embed; None if it cannot be embedded.
+
+    A large PNG is scaled down. The result is None if the file is missing or too large.
     """
     is_png = picture.file.lower().endswith(".png")
     # a PNG is scaled down, so that it may be larger
@@ -318,14 +325,14 @@ def make_view_page(
     data: Sequence[Html] = (),
     scripts: Sequence[str] = (),
 ) -> str:
-    """Return the view of a result as the page of its run.
+    """Return the page of a run as HTML.
 
     Args:
         run: directory of the run.
-        result: its result.
-        view: the view of the result.
-        data: scripts that hold data.
-        scripts: files that fill the parts that are `live`.
+        result: result of the run.
+        view: the parts of the result that are displayed, and a statement about it.
+        data: scripts that only hold data.
+        scripts: names of files with scripts that fill the parts that are `live`.
     """
     content = list[Html | None]()
     names_figures = any(

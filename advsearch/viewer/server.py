@@ -112,9 +112,12 @@ def make_list_page(runs: Mapping[str, Path]) -> str:
 def _runs_table(
     listed: Sequence[tuple[str, listing.ListedRun]], can_compare: bool
 ) -> Html:
-    """Return the table of runs with their names, in their order.
+    """Return the table of runs.
 
-    With `can_compare` a first column has boxes to choose sweeps.
+    Args:
+        listed: name and state of each run, in the order of the table.
+        can_compare: whether the first column has boxes to choose sweeps for a
+            comparison.
     """
     heads = ["picture", "run", "what came out", "begun"]
     if can_compare:
@@ -130,8 +133,9 @@ def _run_row(name: str, run: listing.ListedRun, can_compare: bool) -> Html:
 
     Args:
         name: name of the run.
-        run: what is known of it.
-        can_compare: begin with a cell to choose the run, if it is a sweep.
+        run: state of the run, such as its command and result.
+        can_compare: whether the row begins with a cell to choose it for a comparison;
+            the cell is empty if the run is no sweep.
     """
     address = f"runs/{quote_name(name)}/"
     cells = []
@@ -219,12 +223,12 @@ def is_unfinished(run: Path) -> bool:
 def make_progress_page(name: str, run: Path) -> str:
     """Return the page that follows the progress of a run.
 
-    Its script asks for what is new; without it the page shows the state at the time of
-    the request.
+    A script in the page requests new rows. Without scripts, the page displays the state
+    at the time of its request.
 
     Args:
         name: name of the run in the dashboard.
-        run: its directory.
+        run: directory of the run.
     """
     listed = listing.read_listed_run(run)
     facts = (listed.command, listed.object, " and ".join(listed.controls))
@@ -237,7 +241,7 @@ def make_progress_page(name: str, run: Path) -> str:
         make_element("p", ", ".join(filter(None, facts)), class_="eyebrow"),
         make_element("h1", f"{name} has not ended"),
     )
-    # the script asks this address, relative to the page, for what comes after a row
+    # The script requests rows after a row from this address, relative to the page.
     request = {"progress": "progress", "start": FIRST_ROW_ID}
     state_text = f"{state} Evaluations so far: {', '.join(counts) or 'none'}."
     main = make_element(
@@ -276,8 +280,7 @@ def _attack_list_html(run: Path) -> Html | None:
 
 
 def make_progress_json(run: Path, after: int) -> bytes:
-    """Return, as JSON, the rows and pictures that a run has stored after a row, and
-    whether it goes on.
+    """Return the progress of a run as JSON: new rows and images, and whether it runs.
 
     Args:
         run: directory of the run.
@@ -286,8 +289,8 @@ def make_progress_json(run: Path, after: int) -> bytes:
     Raises:
         FileFormatError: the stored results are corrupt.
     """
-    # looked up before the rows are read: a run that ends in between counts as running,
-    # so that the page asks once more for its last rows
+    # The state is read before the rows. If the run ends in between, it counts as
+    # running, so that the page requests its last rows once more.
     running = is_held(run)
     ended = not is_unfinished(run)
     last = after
@@ -298,7 +301,7 @@ def make_progress_json(run: Path, after: int) -> bytes:
             for row in islice(results.rows(after=after), MAX_PROGRESS_ROWS):
                 rows.append(_row_json(row))
                 last = row.id or after
-            # those of the search alone, which the page draws
+            # Only images of the search, since the page displays no others.
             for step, picture in results.iterate_images("search", after, last):
                 jpeg = make_thumbnail(picture.astype("float32") / 255.0)
                 url = make_data_url(jpeg, "image/jpeg")
@@ -385,8 +388,10 @@ class PhotographServer(Protocol):
 
 
 def _name_runs(paths: Sequence[Path]) -> dict[str, Path]:
-    """Return directories of runs by name; further runs of one name get a number, as in
-    "mug (2)".
+    """Return the directories of runs by name.
+
+    If several directories have the same name, the further ones get a number, as in "mug
+    (2)".
     """
     path_of_name: dict[str, Path] = {}
     for path in paths:
@@ -428,10 +433,19 @@ class Dashboard(HTTPServer):
         https: bool = False,
         photographs: PhotographServer | None = None,
     ) -> None:
-        """Listen at an address; arguments as for the class.
+        """Start to listen at an address.
 
-        Beyond this machine pages are encrypted and need a token. Runs of one name in
-        different folders get numbers.
+        If other machines can reach the server, pages are encrypted and need a token.
+
+        Args:
+            runs: directories of the runs to serve; empty for all runs in `HOME`.
+            host: address at which to listen.
+            port: port at which to listen; 0 for any free one.
+            https: whether to encrypt pages on this machine, too.
+            photographs: object that serves the pages for photographs; None for none.
+
+        Raises:
+            InputError: the address cannot be used.
         """
         self._explicit_runs = _name_runs(runs)
         self.token = None if is_local(host) else secrets.token_urlsafe(24)
@@ -445,7 +459,7 @@ class Dashboard(HTTPServer):
             self._context, self.fingerprint = make_https_context(
                 (find_reachable_address(host), "localhost", LOOPBACK)
             )
-        # bound below, where an address that is taken becomes an error of ours
+        # The socket is bound below, where an error about the address is converted.
         super().__init__((host, port), _Handler, bind_and_activate=False)
         self.clients = ConnectionPool(self.socket, self.finish_request, self._context)
         try:
@@ -487,11 +501,11 @@ class Dashboard(HTTPServer):
 
         Raises:
             RequestRejected: there is no such run.
-            FileFormatError: it has links in it.
+            FileFormatError: the run contains links, which may lead to any file.
         """
         path = self._explicit_runs.get(name)
         if not self._explicit_runs:
-            # the name comes from a request, and must not lead out of the folder
+            # The name comes from a request, so it must not lead to another folder.
             is_name = name not in ("", ".", "..") and not set("/\0") & set(name)
             if is_name and is_run(HOME / name):
                 path = HOME / name
@@ -563,10 +577,14 @@ class _Handler(BaseHTTPRequestHandler):
         """Log nothing."""
 
     def do_GET(self) -> None:
-        """Respond to a GET, HEAD or POST request; any error becomes a response."""
+        """Respond to a GET, HEAD or POST request; any error becomes a response.
+
+        While the worker waits for the client, this is reported to the pool, which
+        disconnects slow clients.
+        """
         headers: dict[str, str] = {}
         status = HTTPStatus.OK
-        # from here until the response is sent the worker computes
+        # From here until the response is sent, the worker does not wait for its client.
         self.server.clients.report_waiting(None)
         try:
             self._check_request()
@@ -644,7 +662,16 @@ class _Handler(BaseHTTPRequestHandler):
         raise RequestRejected(HTTPStatus.NOT_FOUND, "there is no such page")
 
     def _route(self, query: Query, parts: list[str]) -> Response:
-        """Respond to a GET request by the parts of its path."""
+        """Respond to a GET request.
+
+        Args:
+            query: values of the query by name.
+            parts: names in the path, without slashes, such as ["runs", "mug", ""] for
+                "/runs/mug/".
+
+        Raises:
+            RequestRejected: there is no such page.
+        """
         server = self.server
         match parts:
             case [""]:
@@ -662,7 +689,7 @@ class _Handler(BaseHTTPRequestHandler):
                     server.find_run(name), _parse_after(query)
                 )
                 return Response("application/json", progress)
-            # a part of a study, whose page links to it
+            # the page of a part of a study, to which the study's page links
             case ["runs", name, directory.PARTS, part, directory.REPORT]:
                 return self._serve_part(name, part)
             case ["runs", name, "pictures", folder, file] if THUMBNAIL_PATH.fullmatch(
@@ -683,8 +710,10 @@ class _Handler(BaseHTTPRequestHandler):
         raise RequestRejected(HTTPStatus.NOT_FOUND, "there is no such page")
 
     def _serve_run(self, name: str) -> Response:
-        """Return the page of a run: that of a sweep, that of a run in progress, or the
-        stored page of a run that has ended.
+        """Return the page of a run by its name.
+
+        For a sweep it is made anew. For another run in progress it is a page that
+        follows the progress, and for a run that has ended the stored page.
         """
         run = self.server.find_run(name)
         home = "../../"  # from runs/NAME/
@@ -755,8 +784,8 @@ class _Handler(BaseHTTPRequestHandler):
             stored = read_bytes(run / COLUMNS, "columns of a sweep", MAX_COLUMNS_BYTES)
             return Response(media_type, stored)
         max_rows = MAX_ROWS if after else FIRST_ROWS
-        # looked up before the rows are read: a run that ends in between counts as running,
-        # so that the page asks once more for its last rows
+        # The state is read before the rows. If the run ends in between, it counts as
+        # running, so that the page requests its last rows once more.
         is_running = is_held(run)
         rows = read_columns(run, after, max_rows)
         has_more = len(rows) == max_rows
@@ -796,8 +825,10 @@ def _parse_after(query: Query) -> int:
 
 
 def _describe_error(error: Exception) -> tuple[HTTPStatus, str]:
-    """Return status and text of the response to an error; of an error that is not one
-    of advsearch's the text has only the type.
+    """Return the status and the text of the response to an error.
+
+    For an unexpected error, which is not one of advsearch's, the text has only its
+    type.
     """
     if isinstance(error, RequestRejected):
         return error.status, str(error)
@@ -845,10 +876,14 @@ def _serve_page(
 def _serve_stored_page(
     run: Path, home: str, above: tuple[str, str] | None = None
 ) -> Response:
-    """Return the response with the stored page of a run; for `home` and `above` see
-    `_add_navigation`.
+    """Return the response with the stored page of a run.
 
-    The run may be somebody else's, so only our own scripts run in its page.
+    Somebody else may have made the run, so only our own scripts run in its page.
+
+    Args:
+        run: directory of the run.
+        home: address of the list of runs, relative to the page.
+        above: address and name of the run of which this run is a part; None for none.
     """
     page = read_bytes(run / REPORT, "a page", MAX_PAGE_BYTES)
     remark = None
@@ -863,13 +898,13 @@ def _serve_stored_page(
 def _add_navigation(
     page: bytes, home: str, above: tuple[str, str] | None, remark: str | None = None
 ) -> bytes:
-    """Insert links into a page: to the list of runs, and to the run it is a part of.
+    """Insert links to the list of runs, and to the parent run, into a page.
 
     Args:
         page: the page as HTML.
-        home: address of the list of runs.
-        above: address and name of the run that the page is a part of.
-        remark: a sentence below the links.
+        home: address of the list of runs, relative to the page.
+        above: address and name of the run of which this run is a part; None for none.
+        remark: sentence below the links; None for none.
     """
     links = [("All runs", home)]
     if above:

@@ -50,8 +50,10 @@ def make_thumbnail(picture: object) -> bytes:
 
 
 def make_cover(run: Path) -> bytes:
-    """Return a small image of a run as a JPEG: its adversarial picture, or else another
-    one; gray if it has none that can be read.
+    """Return a small image of a run as a JPEG, for the list of runs.
+
+    It is the adversarial image if there is one, otherwise another image of the run. If
+    none can be read, it is gray.
     """
     preferred = ("adversarial", "clean", "worst")
     files = [run / IMAGES / f"{name}.png" for name in preferred]
@@ -165,9 +167,11 @@ class Thumbnails:
     def list_data_urls(
         self, rows: pd.DataFrame, max_bytes: int
     ) -> Iterator[tuple[str, str]]:
-        """Yield number and data URL of thumbnails, those with the worst margins first.
+        """Yield the number and the data URL of thumbnails, the worst margins first.
 
-        It ends before the URLs take more than `max_bytes` in all.
+        Args:
+            rows: table with the "step" and the "margin" of rows.
+            max_bytes: maximum size of all URLs together.
         """
         steps = rows["step"].to_numpy()
         margins = rows["margin"].to_numpy()
