@@ -159,7 +159,7 @@ def _has_type(kind: str, value: object) -> bool:
     An int counts as a float, and a float without a fraction, such as 2.0, as an int.
 
     Args:
-        kind: name such as "int", "Mapping" or "advsearch.scene.loading.Scene".
+        kind: name such as "int", "Mapping" or "advsearch.engine.loading.Scene".
         value: the value.
     """
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)

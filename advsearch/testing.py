@@ -250,7 +250,7 @@ def _describe_repeat() -> str:
     """Return what runs the present assertion again: the pytest command of the test that
     is running, or else a sentence.
     """
-    # pytest sets the variable: "tests/test_mug.py::test_name (call)"
+    # pytest sets the variable: "test_mug.py::test_name (call)"
     test = os.environ.get("PYTEST_CURRENT_TEST", "").rpartition(" ")[0]
     if test:
         return f"pytest {shlex.quote(test)}"
