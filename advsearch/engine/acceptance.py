@@ -183,7 +183,7 @@ def compare_with_traced(
         measure_margin: function from an image (H, W, 3) and its configuration to the
             model's margin.
         predicted_start: (H, W, 3) image that is predicted for the start of the search
-            under the same conditions; None if `u` is that.
+            under the same conditions; None if `u` is the start itself.
     """
     with torch.no_grad():
         # what the model would see in the search without a predictor

@@ -538,9 +538,9 @@ def _open_session(path: Path) -> tuple[Any, Any]:
         f"{runtime.__version__}"
     )
     with translate_errors(problem, kind=FileFormatError):
-        # Without this optimizer, no part of the network runs as the session is created,
-        # which nothing could end. Constants are computed in each call, which has a
-        # deadline.
+        # This optimizer runs the constant parts of a network while the session is
+        # created, which has no deadline: a hostile file could run forever. Without it
+        # they are computed in each call, which has a deadline.
         session = runtime.InferenceSession(
             str(path),
             options,

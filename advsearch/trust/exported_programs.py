@@ -86,8 +86,9 @@ def problem(text: object) -> str:
         _check(tree.body, DEPTH, EXPONENT)
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         reason = "it cannot be read"
-        # Our `_check` raises a plain ValueError, whose message is for the user. Python's
-        # own errors here are subclasses of it.
+        # A plain ValueError is that of `_check`, whose message is for the user. A
+        # subclass of it, such as UnicodeError, comes from Python's parser, as do the
+        # other errors.
         if type(error) is ValueError:
             reason = str(error.args[0])
         return (

@@ -1179,7 +1179,7 @@ def read_waypoints(
 def _make_object_waypoints(
     column: Mapping[str, assets.Float64Array], seconds: Tensor, notes: tuple[str, ...]
 ) -> Waypoints | None:
-    """Return what the object does in a file about the camera; None for nothing.
+    """Return how the object moves, by the file of a camera's path; None if it does not.
 
     Args:
         column: columns (n,) of the file by name.

@@ -188,7 +188,7 @@ def read_sweep_sides(path: Path, *, is_only_sweep: bool) -> Iterator[Side]:
             is_of_side = is_of_scene & (model_index == index)
             side_rows = rows[is_of_side].reset_index(drop=True)
             labels = {"object": sweep.summary.object, "model": model, "answer": ""}
-            # Where rows differ in one of these, it has a column.
+            # Rows have a column only for what differs among them, such as "object".
             for column in SIDE_COLUMNS:
                 if column in side_rows:
                     labels[column] = ",".join(side_rows[column].unique())

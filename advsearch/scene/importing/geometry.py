@@ -344,9 +344,9 @@ def find_shared_edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
     """Find the edges that belong to exactly two faces (F, 3).
 
     Returns:
-        For each edge (E,) two corners: the one of each face at which the edge starts,
-        as 3 face + k; and whether both faces run along the edge in the same direction.
-        Then they disagree in winding.
+        For each edge (E,) two corners: the one of each face at which the edge starts.
+        Corner k of face f has the number 3 f + k. And whether both faces run along the
+        edge in the same direction; then they disagree in winding.
     """
     # The side k of a face runs from its corner k to the next one.
     start = faces.reshape(-1)

@@ -411,8 +411,8 @@ def _translate_ball_lamp(part: parts.BallLamp) -> Translation:
 def _translate_projector(part: parts.ProjectorPart) -> Translation:
     """Return a projector.
 
-    Mitsuba's texture times pi is the irradiance at distance 1, so that it is a white
-    screen's radiance.
+    The irradiance that Mitsuba's projector gives at distance 1 is pi times its texture.
+    So a texel is the radiance of a white screen there.
     """
     name = part.name
     image = {

@@ -120,7 +120,7 @@ def teapot(sampler: ParameterSampler) -> Instance:
     height = sampler(10.2, low=8.0, high=12.5)
     side, body = _teapot_body(sampler, radius, height)
     handle = _teapot_handle(sampler, side, radius, height)
-    opposite = shapes.rotation("z", 180.0)  # of the spout, which is at +x as well
+    opposite = shapes.rotation("z", 180.0)  # both are made at +x; the handle turns
     patches = [
         *body,
         *_spout(sampler, radius, height),
