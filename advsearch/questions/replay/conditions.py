@@ -390,7 +390,6 @@ def replay(
         attack: an attack that has ended and whose run is stored: its result, or the
             name or directory of its run.
         progress: where progress is reported; None for the default.
-        **options: settings, such as `trials`.
     """
     run: str | Path | AttackResult = attack
     parts = None
