@@ -56,7 +56,7 @@ class SharedPaths:
         scene: the scene.
 
     Args:
-        scene: scene; see `find_shared_paths_refusal`.
+        scene: scene; see `can_share_paths`.
         inputs: names of the inputs that may change: of surfaces of shapes that emit no
             light and don't move.
     """
@@ -205,22 +205,20 @@ class SharedPaths:
             n_bytes -= self._stored.pop(next(iter(self._stored))).n_bytes
 
 
-def find_shared_paths_refusal(scene: MitsubaScene) -> str:
-    """Return why images of a scene share no paths; "" if they may.
+def can_share_paths(scene: MitsubaScene) -> bool:
+    """Return whether images of a scene can share light paths, and save time by it.
 
-    Sharing saves time where light paths are long, as among trees and houses. The other
-    reasons are cases that `trace_paths` does not cover.
+    They save time where light paths are long, as among trees and houses: elsewhere
+    light soon leaves the scene. The other conditions are what `trace_paths` covers.
     """
     description, filter_name = scene.definition
-    if scene.integrator != "path":
-        return "light paths soon leave the scene"
-    if filter_name != "box" or scene.sampler not in SAMPLERS:
-        return "the random numbers of single samples are not known"
-    if description.thin_lens or description.camera_model is not None:
-        return "the camera has a lens"
-    if description.backdrop or description.has_opacity or scene.is_volumetric:
-        return "light passes surfaces"
-    return ""
+    has_long_paths = scene.integrator == "path"
+    has_known_samples = filter_name == "box" and scene.sampler in SAMPLERS
+    has_lens = bool(description.thin_lens) or description.camera_model is not None
+    passes_surfaces = (
+        bool(description.backdrop) or description.has_opacity or scene.is_volumetric
+    )
+    return has_long_paths and has_known_samples and not (has_lens or passes_surfaces)
 
 
 def _divide_samples(n_pixels: int, spp: int) -> Iterator[Any]:
