@@ -427,7 +427,7 @@ def choose_policy(
     elif (
         policy.name == "auto" and has_only_budgets and not problem.model.differentiable
     ):
-        return make_policy("nes")
+        policy = make_policy("nes")
     if gradient_setting and not policy.uses_gradient:
         raise InputError(
             f"{gradient_setting}: policy {policy.name} takes no "
