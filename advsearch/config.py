@@ -153,7 +153,10 @@ class SceneConfig(Config):
     says how.
     """
 
-    free: ClassVar[tuple[str, ...]] = (*Config.free, "ask")
+    changeable_settings: ClassVar[tuple[str, ...]] = (
+        *Config.changeable_settings,
+        "ask",
+    )
     default_environment: ClassVar[str] = DEFAULT_ENVIRONMENT
     # which of object, environment and model may be several, with commas
     list_settings: ClassVar[tuple[str, ...]] = ()
@@ -627,7 +630,7 @@ class RenderConfig(SceneConfig):
     """
 
     command: ClassVar[str] = "render"
-    without: ClassVar[tuple[str, ...]] = ("run", "overwrite")
+    excluded_settings: ClassVar[tuple[str, ...]] = ("run", "overwrite")
 
     controls: ControlsByName = setting_as_in(
         SceneConfig,

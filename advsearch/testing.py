@@ -241,7 +241,7 @@ def _assert_claim(
         )
         result: SuiteResult = experiment.run(config, suite=suite)
     (claim_result,) = result.claims
-    if claim_result.answer != "held":
+    if claim_result.verdict != "held":
         raise AssertionError(_format_report(result, claim_result, _describe_repeat()))
     return result
 
@@ -295,7 +295,7 @@ def _format_report(result: SuiteResult, claim: ClaimResult, repeat: str) -> str:
     """Return the message of a failed claim; `repeat` is what runs it again."""
     run = Path(result.run or "")
     lines = [
-        f"{claim.name}: {claim.answer}: {claim.reason}",
+        f"{claim.name}: {claim.verdict}: {claim.reason}",
         f"  claimed: {claim.statement}",
     ]
     if claim.picture:

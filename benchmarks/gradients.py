@@ -172,7 +172,7 @@ def compare_steps(size: int, repeats: int) -> int:
                 cells.append(
                     f"{slope:8.2f} +- {statistics.stdev(far) / FAR_SEEDS**0.5:4.2f}"
                 )
-                for half in (group.pixel, group.step):
+                for half in (group.pixel_step, group.step):
                     found = [
                         difference(renderer, loss, group, half, seed, NEAR_SPP)
                         for seed in range(repeats)

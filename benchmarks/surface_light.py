@@ -470,7 +470,7 @@ def grown(thing: str, environment: str) -> None:
                 f"{found.seconds['total']:5.1f} seconds"
             )
             told = (
-                f"{found.same} of {found.samples} in {found.volume:.2f} of the range"
+                f"{found.n_same} of {found.samples} in {found.volume:.2f} of the range"
                 if found.volume
                 else ""
             )

@@ -176,27 +176,27 @@ STABILITY: dict[str, Any] = {
 
 def attack(**changes: Any) -> AttackSummary:
     """Return an attack's result with other fields."""
-    return AttackSummary.of({**ATTACK, **changes})
+    return AttackSummary.from_values({**ATTACK, **changes})
 
 
 def sweep(**changes: Any) -> SweepSummary:
     """Return a sweep's result with other fields."""
-    return SweepSummary.of({**SWEEP, **changes})
+    return SweepSummary.from_values({**SWEEP, **changes})
 
 
 def curve(**changes: Any) -> CurveResult:
     """Return a curve's result with other fields."""
-    return CurveResult.of({**CURVE, **changes})
+    return CurveResult.from_values({**CURVE, **changes})
 
 
 def matrix(**changes: Any) -> MatrixResult:
     """Return the result of several models with other fields."""
-    return MatrixResult.of({**MATRIX, **changes})
+    return MatrixResult.from_values({**MATRIX, **changes})
 
 
 def region(**changes: Any) -> RegionResult:
     """Return a region's result with other fields."""
-    return RegionResult.of({**REGION, **changes})
+    return RegionResult.from_values({**REGION, **changes})
 
 
 SUMMARY = attack()

@@ -236,7 +236,7 @@ def _render_attack(
     if summary.adversarial is not None:
         # If `answer_from` is set, a baseline found the adversarial scene, and not the
         # search.
-        kind = "baseline verification" if summary.answer_from else "verification"
+        kind = "baseline verification" if summary.adversarial_from else "verification"
         configuration_of_kind[kind] = read_stored_configuration(folder, problem)
     rows = list[Row]()
     for kind in configuration_of_kind:

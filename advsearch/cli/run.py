@@ -96,7 +96,7 @@ def run_file(
     # `left_out` has the settings that count only when typed; they are not set. If such
     # a setting decides no number of the result, a run is continued without it.
     for setting in config.left_out:
-        decides_numbers = setting.name not in config.free
+        decides_numbers = setting.name not in config.changeable_settings
         if resumed is None or decides_numbers:
             raise InputError(
                 f"{file}: {setting.name}: {setting.effect}, which a file "
@@ -209,7 +209,7 @@ def runs(args: argparse.Namespace) -> int:
                 names,
                 str(run.rows),
                 run.state,
-                run.answer,
+                run.outcome,
             ]
         )
     text = f"no runs in {folder}/ yet; advsearch attack makes one"

@@ -183,7 +183,7 @@ def _show_unfinished(run: ListedRun, as_json: bool) -> int:
         The exit status.
     """
     resume_command = None
-    if run.begun and run.state == "stopped":
+    if run.started and run.state == "stopped":
         resume_command = output.make_resume_command(run.path)
     subject = run.command
     if run.object:
@@ -328,12 +328,12 @@ def _format_searched(parameter: Parameter) -> str:
 def _make_choice_row(choice: Choice) -> dict[str, str]:
     """Return the row of a table for a setting of a control, with its allowed values."""
     allowed = ", ".join(choice.options)  # empty if it is a number
-    if choice.whole:  # a whole number between two bounds
-        allowed = f"{choice.whole[0]} to {choice.whole[1]}"
-    elif choice.most and choice.signed:  # a number of either sign
-        allowed = f"{-choice.most:g} to {choice.most:g}"
-    elif choice.most:  # a positive number
-        allowed = f"over 0 to {choice.most:g}"
+    if choice.integer_bounds:  # a whole number between two bounds
+        allowed = f"{choice.integer_bounds[0]} to {choice.integer_bounds[1]}"
+    elif choice.max_value and choice.signed:  # a number of either sign
+        allowed = f"{-choice.max_value:g} to {choice.max_value:g}"
+    elif choice.max_value:  # a positive number
+        allowed = f"over 0 to {choice.max_value:g}"
     default = _format_cell(choice.default)
     return {
         "name": choice.name,

@@ -74,7 +74,7 @@ class WorkerStats:
     """Counts and times of the workers of a run."""
 
     workers: int = 0  # connected now
-    most: int = 0  # maximum that computed at once
+    max_running: int = 0  # maximum that computed at once
     lost: int = 0  # lost that died
     refused: int = 0  # refused that do not suit the task
     retried: int = 0  # batches that were submitted again

@@ -108,7 +108,7 @@ class PoolWorkers:
                     )
                     running[future] = items
                     future.add_done_callback(ended.put)
-                self.stats.most = max(self.stats.most, len(running))
+                self.stats.max_running = max(self.stats.max_running, len(running))
                 if not running and not queued.has_next():
                     return
                 ended_future = self._wait(ended)

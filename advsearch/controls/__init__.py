@@ -147,7 +147,7 @@ def make_instance_name(kind: str, name: str) -> str:
     It is "key" for ``light:key``, but "pose:chair" where the name is that of a mesh,
     and the kind where there is no colon (an empty name).
     """
-    of_a_mesh = kind in CONTROLS and CONTROLS[kind].of_a_mesh
+    of_a_mesh = kind in CONTROLS and CONTROLS[kind].targets_mesh
     if not name or (of_a_mesh and name == OBJECT):
         return kind
     return f"{kind}:{name}" if of_a_mesh else name
@@ -303,7 +303,7 @@ def _check_names_no_mesh(controls: Sequence[Control], scene: SceneDescription) -
             able = ", ".join(
                 kind
                 for kind, usable in CONTROLS.list_usable().items()
-                if usable.of_a_mesh
+                if usable.targets_mesh
             )
             raise InputError(
                 f"`controls` {control.kind}:{control.name}: {control.kind} can't be "

@@ -43,7 +43,7 @@ class BackgroundControl(Control):
 
     kind = "background"
     photograph_refusal = "the photograph is the background"
-    amount = "what"
+    strength_parameter = "what"
     parameters = (
         Parameter.named(
             "what",
@@ -137,7 +137,7 @@ class BackgroundControl(Control):
             )
         }
 
-    def measured(
+    def compute_measurements(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
         """Return the sRGB levels of the color, which is searched as hue, saturation and

@@ -203,9 +203,9 @@ class Choice:
         fixes: the parameter that is not searched where this is chosen; empty if there
             is none.
         options: the names that can be chosen; empty for anything else.
-        whole: the smallest and the largest whole number that can be chosen, or None.
-        most: the largest number that can be chosen, all over 0; None for anything else.
-        signed: numbers down to minus `most` can be chosen, too.
+        integer_bounds: the smallest and the largest whole number that can be chosen, or None.
+        max_value: the largest number that can be chosen, all over 0; None for anything else.
+        signed: numbers down to minus `max_value` can be chosen, too.
     """
 
     name: str
@@ -215,8 +215,8 @@ class Choice:
     bounds: str = ""
     fixes: str = ""
     options: tuple[str, ...] = ()
-    whole: tuple[int, int] | None = None
-    most: float | None = None
+    integer_bounds: tuple[int, int] | None = None
+    max_value: float | None = None
     signed: bool = False
 
     def check(self, control: str, value: object) -> None:
@@ -241,14 +241,14 @@ class Choice:
         """Return a phrase about what can be chosen; None if anything can."""
         if self.options:
             return f"one of {', '.join(self.options)}"
-        if self.whole is not None:
-            low, high = self.whole
+        if self.integer_bounds is not None:
+            low, high = self.integer_bounds
             return f"a whole number from {low} to {high}"
-        if self.most is None:
+        if self.max_value is None:
             return None
         if self.signed:
-            return f"a number from {-self.most:g} to {self.most:g}"
-        return f"a number over 0 and up to {self.most:g}"
+            return f"a number from {-self.max_value:g} to {self.max_value:g}"
+        return f"a number over 0 and up to {self.max_value:g}"
 
     def _is_valid(self, value: object) -> bool:
         """Return whether a value is among those of `_describe_expected`."""
@@ -258,12 +258,16 @@ class Choice:
 
     def _is_in_bounds(self, value: float) -> bool:
         """Return whether a number can be chosen where numbers can be."""
-        if self.whole is not None:
-            low, high = self.whole
+        if self.integer_bounds is not None:
+            low, high = self.integer_bounds
             return low <= value <= high and value == int(value)
-        if self.most is None:
+        if self.max_value is None:
             return True
-        return abs(value) <= self.most if self.signed else 0.0 < value <= self.most
+        return (
+            abs(value) <= self.max_value
+            if self.signed
+            else 0.0 < value <= self.max_value
+        )
 
 
 Values = Mapping[str, Tensor]
@@ -291,9 +295,9 @@ class Control:
         summary: one sentence; of a class that says none, the first of its docstring.
         parameters: what may vary.
         choices: what may be chosen.
-        of_a_mesh: it is about one mesh, and may be about another than the object: the
+        targets_mesh: it is about one mesh, and may be about another than the object: the
             name of that is then `KIND:MESH`.
-        amount: the parameter whose value in the scene as it was described means that
+        strength_parameter: the parameter whose value in the scene as it was described means that
             the rest of the control does not show: the power of a lamp, say. None where
             the scene has all parameters of itself.
         instance_parameters: the parameters of this instance: `declare_parameters` of
@@ -336,10 +340,10 @@ class Control:
     summary: ClassVar[str]
     parameters: ClassVar[tuple[Parameter, ...]]
     choices: ClassVar[tuple[Choice, ...]] = ()
-    of_a_mesh: ClassVar[bool] = False
+    targets_mesh: ClassVar[bool] = False
     travels: ClassVar[bool] = False
     competes_with_ambient: ClassVar[bool] = False
-    amount: ClassVar[str | None] = None
+    strength_parameter: ClassVar[str | None] = None
     photograph_refusal: ClassVar[str] = ""
     on_top: bool = False
     name: str
@@ -448,7 +452,7 @@ class Control:
 
         It stands behind the colon of the control's name; by default it is the object.
         """
-        return (self.name.partition(":")[2] if self.of_a_mesh else "") or OBJECT
+        return (self.name.partition(":")[2] if self.targets_mesh else "") or OBJECT
 
     @property
     def file_name(self) -> str:
@@ -714,7 +718,7 @@ class Control:
                 continue
             scene_value = self.get_scene_value(parameter)
             used = slot.start_value()
-            hides_others = self.amount not in (None, parameter.name)
+            hides_others = self.strength_parameter not in (None, parameter.name)
             if hides_others or is_same_value(used, scene_value, is_angle=slot.is_angle):
                 continue
             # the scene's setting that has the same meaning
@@ -884,7 +888,7 @@ class Control:
             return image
         return self.on_picture(self.values(u), image)
 
-    def measured(
+    def compute_measurements(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
         """Return further values to store, by name without the instance's."""
@@ -920,7 +924,9 @@ class Control:
             else:
                 for index, number in enumerate(value):
                     described[f"{name}.{index}"] = make_value(number, parameter.unit)
-        for name, measurement in self.measured(values, earlier_inputs).items():
+        for name, measurement in self.compute_measurements(
+            values, earlier_inputs
+        ).items():
             described[f"{self.name}.{name}"] = measurement
         return described
 
@@ -947,7 +953,7 @@ class Control:
         """
         return None
 
-    def kept_pictures(
+    def make_artifact_images(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return images to store with a result, by file stem; none by default.
@@ -970,9 +976,9 @@ class Control:
         Returns:
             Images (h, w, 3), display-referred sRGB in [0, 1].
         """
-        return self.kept_pictures(self.values(u.detach()), earlier_inputs)
+        return self.make_artifact_images(self.values(u.detach()), earlier_inputs)
 
-    def kept_files(
+    def make_artifact_files(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, bytes]:
         """Return other files to store with a result, by name with suffix."""
@@ -989,7 +995,7 @@ class Control:
             u: (d,) the control's slice of a configuration, in [0, 1].
             earlier_inputs: inputs of the controls that are evaluated before this one.
         """
-        return self.kept_files(self.values(u.detach()), earlier_inputs)
+        return self.make_artifact_files(self.values(u.detach()), earlier_inputs)
 
 
 NumberControl = Control  # its name in packages that add controls
@@ -1023,9 +1029,9 @@ METHODS_WITH_COPIES = (
     Control.get_artifact_files,
     Control.scene_inputs,
     Control.on_picture,
-    Control.measured,
-    Control.kept_pictures,
-    Control.kept_files,
+    Control.compute_measurements,
+    Control.make_artifact_images,
+    Control.make_artifact_files,
 )
 """Methods of controls that get copies of tensors in controls of another package."""
 

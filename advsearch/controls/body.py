@@ -28,7 +28,7 @@ class BodyControl(Control):
     """
 
     kind = "body"
-    of_a_mesh = True
+    targets_mesh = True
     parameters = (*geometry.PERSON_PARAMETERS, geometry.TIME)
     choices = (
         Choice(
@@ -143,7 +143,7 @@ class BodyControl(Control):
     ) -> dict[str, Tensor]:
         return {f"{self.mesh}.offsets": self.rig.offsets(values, self.clip)}
 
-    def measured(
+    def compute_measurements(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
         return dict(self.rig.get_measurements(values, self.clip))

@@ -358,7 +358,7 @@ class ContentsControl(Control):
     """
 
     kind = "contents"
-    amount = "level"
+    strength_parameter = "level"
     # which is not changed; but it comes after whatever moves the vessel
     refines = frozenset({"object.to_world"})
     parameters = (
@@ -531,7 +531,7 @@ class ContentsControl(Control):
         values = super().values(u)  # of ingredients, where the stick is cut
         return {**values, **self.cut_proportions(values)}
 
-    def measured(
+    def compute_measurements(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
         return {

@@ -98,7 +98,7 @@ class EnvironmentControl(Control):
             "coefficients.",
             "epsilon",
             "harmonics",
-            most=100.0,
+            max_value=100.0,
         ),
     )
 

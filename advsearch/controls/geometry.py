@@ -561,7 +561,7 @@ class GeometryControl(Control):
     """
 
     kind = "geometry"
-    of_a_mesh = True
+    targets_mesh = True
     parameters = (
         Parameter(
             "amplitudes",
@@ -594,13 +594,13 @@ class GeometryControl(Control):
             DEFAULT_EPSILON,
             "Largest displacement of a vertex, in object sizes.",
             "epsilon",
-            most=MAX_EPSILON,
+            max_value=MAX_EPSILON,
         ),
         Choice(
             "modes",
             DEFAULT_MODES,
             "Number of smooth modes (form modes).",
-            whole=(1, MAX_MODES),
+            integer_bounds=(1, MAX_MODES),
         ),
         Choice(
             "form",

@@ -40,7 +40,7 @@ class HazeControl(Control):
 
     kind = "haze"
     photograph_refusal = "haze would lie before the object and not before the rest"
-    amount = "density"
+    strength_parameter = "density"
     parameters = (
         Parameter.number(
             Parameter.LIT,

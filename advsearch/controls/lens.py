@@ -70,7 +70,7 @@ class LensControl(Control):
     """
 
     kind = "lens"
-    amount = "opacity"
+    strength_parameter = "opacity"
     parameters = (
         _per_dot("x", "picture widths", 0.5, "Centre of each dot, from the left edge."),
         _per_dot("y", "picture heights", 0.5, "Centre of each dot, from the top edge."),
@@ -110,7 +110,7 @@ class LensControl(Control):
             "dots",
             DEFAULT_DOTS,
             f"How many dots there are, 1 to {MAX_DOTS}.",
-            whole=(1, MAX_DOTS),
+            integer_bounds=(1, MAX_DOTS),
         ),
     )
 
@@ -138,7 +138,7 @@ class LensControl(Control):
     def on_picture(self, values: Values, image: Tensor) -> Tensor:
         return draw_dots(image, self._spread_dots(values))
 
-    def kept_pictures(
+    def make_artifact_images(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the sticker as it looks on a grey checkerboard."""

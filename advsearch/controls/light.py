@@ -68,7 +68,7 @@ class LightControl(Control):
     """A lamp: where it stands, its colour, its power, and the size of an area light."""
 
     kind = "light"
-    amount = "power"
+    strength_parameter = "power"
     parameters = (
         _make_coordinate("x", -2.0, 2.0, 1.5, "Where the lamp's middle is, along x."),
         _make_coordinate("y", -2.0, 2.0, -1.0, "Where the lamp's middle is, along y."),

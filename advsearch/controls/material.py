@@ -708,7 +708,7 @@ class MaterialControl(Control):
     """The object's gloss, metal, coat and tint, and which named material covers it."""
 
     kind = "material"
-    of_a_mesh = True
+    targets_mesh = True
     parameters = (
         Parameter.named(
             "which",
@@ -793,7 +793,7 @@ class MaterialControl(Control):
             inputs[self._base_color] = tint * base.to(tint.device)
         return inputs
 
-    def kept_pictures(
+    def make_artifact_images(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the texture, where the control changes it."""

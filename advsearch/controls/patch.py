@@ -127,7 +127,9 @@ class PatchControl(PictureControl):
         ),
     )
     choices = (
-        Choice("resolution", 32, "Side of the patch in pixels.", whole=(2, 512)),
+        Choice(
+            "resolution", 32, "Side of the patch in pixels.", integer_bounds=(2, 512)
+        ),
         Choice(
             "norm",
             "box",
@@ -144,7 +146,7 @@ class PatchControl(PictureControl):
             "Radius of that ball, display-referred; by default 0.1 a pixel value.",
             "epsilon",
             "pixels",
-            most=PictureControl.MAX_EPSILON,
+            max_value=PictureControl.MAX_EPSILON,
         ),
         Choice(
             "picture",
@@ -295,7 +297,7 @@ class PatchControl(PictureControl):
     def get_printable_colors(self, u: Tensor) -> Tensor | None:
         return self.values(u)["pixels"] if self.is_searched_image else None
 
-    def kept_pictures(
+    def make_artifact_images(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the patch enlarged for printing, and its pixels."""

@@ -33,7 +33,7 @@ class PoseControl(Control):
     """Where the object stands, how it is turned, and how large it is."""
 
     kind = "pose"
-    of_a_mesh = True
+    targets_mesh = True
     parameters = (
         *POSE[:3],
         Parameter(

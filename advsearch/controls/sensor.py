@@ -123,7 +123,7 @@ class SensorControl(Control):
             "seed",
             0,
             "Which draw of the noise: a whole number from 0.",
-            whole=(0, 2**32 - 1),
+            integer_bounds=(0, 2**32 - 1),
         ),
     )
 

@@ -52,7 +52,7 @@ class ShadowControl(Control):
     """A dark card that throws a shadow onto the object, out of the camera's sight."""
 
     kind = "shadow"
-    amount = "size"
+    strength_parameter = "size"
     # none is changed; but it comes after whatever moves the camera
     refines = frozenset(geometry.OCCLUDER_INPUTS)
     parameters = (
@@ -132,7 +132,7 @@ class ShadowControl(Control):
             log=True,
         ),
     )
-    choices = (Choice("corners", 6, "Corners of the card.", whole=(3, 64)),)
+    choices = (Choice("corners", 6, "Corners of the card.", integer_bounds=(3, 64)),)
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Return the scene with the card, out of sight; `scene_inputs` moves it."""
@@ -216,7 +216,7 @@ class ShadowControl(Control):
         axes = torch.stack([first_axis, -second_axis, -outwards], dim=1)
         return geometry.make_affine(size * axes, center)
 
-    def measured(
+    def compute_measurements(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
         """Return the distance at which the card really is."""

@@ -79,7 +79,7 @@ class TextureControl(Control):
     """
 
     kind = "texture"
-    of_a_mesh = True
+    targets_mesh = True
     parameters = (
         Parameter(
             "texels",
@@ -121,7 +121,7 @@ class TextureControl(Control):
             DEFAULT_EPSILON,
             "Radius of the ball around the original texture, display-referred.",
             "epsilon",
-            most=MAX_EPSILON,
+            max_value=MAX_EPSILON,
         ),
         Choice(
             "norm",
@@ -137,7 +137,7 @@ class TextureControl(Control):
             "Side of the searched texture in texels; by default "
             "the object's own, 256 to 512.",
             "texture_resolution",
-            whole=(2, 4096),
+            integer_bounds=(2, 4096),
         ),
         Choice(
             "form",
@@ -146,13 +146,16 @@ class TextureControl(Control):
             "waves (smooth patterns).",
         ),
         Choice(
-            "colors", 6, "Number of colours of the palette.", whole=(1, MAX_PALETTE)
+            "colors",
+            6,
+            "Number of colours of the palette.",
+            integer_bounds=(1, MAX_PALETTE),
         ),
         Choice(
             "waves",
             8,
             "Number of waves along each side of the texture.",
-            whole=(1, MAX_WAVES),
+            integer_bounds=(1, MAX_WAVES),
         ),
         Choice(
             "materials",

@@ -242,7 +242,7 @@ class ThingsControl(Control):
             inputs[f"{name}.to_world"] = geometry.make_affine(turn, translation) @ base
         return inputs
 
-    def measured(
+    def compute_measurements(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
         """Return where each thing stands in the end, as the setting `things` has it."""

@@ -73,14 +73,14 @@ class Deviation:
 
     Attributes:
         levels: root mean square over the object, in levels of 255.
-        logits: mean difference of the margin.
+        margin_bias: mean difference of the margin.
         allowed_levels: levels that are allowed.
         n_traced: images that were traced to measure it.
         allowed_margin_bias: difference of the margin that is allowed.
     """
 
     levels: float
-    logits: float
+    margin_bias: float
     allowed_levels: float
     n_traced: int
     allowed_margin_bias: float = MAX_MARGIN_BIAS
@@ -99,7 +99,7 @@ class Deviation:
         margin_limit = max(MAX_MARGIN_BIAS, MAX_BIAS_FRACTION * margin_change)
         return cls(
             levels=_root(square),
-            logits=statistics.fmean(view.margin_bias for view in views),
+            margin_bias=statistics.fmean(view.margin_bias for view in views),
             allowed_levels=max(MIN_ALLOWED_LEVELS, _root(allowed_square)),
             n_traced=sum(view.n_traced for view in views),
             allowed_margin_bias=margin_limit,
@@ -120,7 +120,7 @@ class Deviation:
     @property
     def is_accepted(self) -> bool:
         """Whether predictions may replace rendered images; False if anything is NaN."""
-        has_accepted_margin = abs(self.logits) <= self.allowed_margin_bias
+        has_accepted_margin = abs(self.margin_bias) <= self.allowed_margin_bias
         return self.has_accepted_levels and has_accepted_margin
 
     @property
@@ -133,7 +133,7 @@ class Deviation:
                 f"{max_levels:.1f} would do"
             )
         return (
-            f"{self.logits:+.2f} off in the margin, where "
+            f"{self.margin_bias:+.2f} off in the margin, where "
             f"{self.allowed_margin_bias:.2f} would do"
         )
 
@@ -152,7 +152,7 @@ def compare_views(compare_view: Callable[[int], ComparedView]) -> Deviation:
     first = Deviation.from_views(views)
     margin_limit = CLEARLY_GOOD * first.allowed_margin_bias
     is_clearly_good = (
-        first.levels_fraction <= CLEARLY_GOOD and abs(first.logits) <= margin_limit
+        first.levels_fraction <= CLEARLY_GOOD and abs(first.margin_bias) <= margin_limit
     )
     may_be_good = first.levels_fraction < CLEARLY_BAD
     if not is_clearly_good and may_be_good:

@@ -152,7 +152,7 @@ class Bank(PredictedSearch):
     def summarize_conditions(self) -> BankOfConditions:
         """Return how the bank has grown, and what its latest comparison found."""
         return BankOfConditions(
-            made=self._count_conditions(self._latest_step),
+            created=self._count_conditions(self._latest_step),
             dropped=self._n_dropped,
             grown=len(self.growth_steps),
             gap=self.gaps[-1] if self.gaps else None,

@@ -443,7 +443,7 @@ def check_truth(
     """
     try:
         # `each` has the facts of every thing if all are judged, else it is empty
-        for facts_of_thing in facts.each.values() or (facts,):
+        for facts_of_thing in facts.facts_of_thing.values() or (facts,):
             task.check(facts_of_thing)
     except InputError as error:
         # a stated label is wrong, and the task's own message says how

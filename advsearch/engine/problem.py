@@ -314,7 +314,7 @@ class Problem:
         for judgement in judged:
             # `of` checks that the margin is finite; it takes no metrics, which are
             # added below
-            without_objective = Judgement.of(
+            without_objective = Judgement.from_margin(
                 judgement.score,
                 judgement.margin,
                 judgement.prediction,
@@ -969,7 +969,7 @@ class Problem:
             most_frequent = most_frequent_judgement(judged)
             score = mean([judgement.score for judgement in judged])
             margin = mean([judgement.margin for judgement in judged])
-            return Judgement.of(
+            return Judgement.from_margin(
                 score, margin, most_frequent.prediction, most_frequent.payload
             )
         with torch.no_grad():

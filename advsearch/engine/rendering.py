@@ -249,9 +249,9 @@ class Rendering:
             model=self.model,
             task=self.task,
             spp=self.spp,
-            image_formation=Formation.of(self.formation),
-            up=None if up is None else MeshUp.of(up),
-            views=[ViewPredictions.of(view) for view in self.views],
+            image_formation=Formation.from_values(self.formation),
+            up=None if up is None else MeshUp.from_values(up),
+            views=[ViewPredictions.from_values(view) for view in self.views],
             warnings=list(warnings),
         )
 
@@ -645,7 +645,7 @@ def make_facts(
         {mesh: make_thing_facts(mesh) for mesh in (OBJECT, *description.things)}
     )
     if judge == ALL_THINGS:
-        return replace(facts_by_mesh[OBJECT], each=facts_by_mesh)
+        return replace(facts_by_mesh[OBJECT], facts_of_thing=facts_by_mesh)
     return facts_by_mesh[judge]
 
 

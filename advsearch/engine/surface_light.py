@@ -223,7 +223,7 @@ class SurfaceLight(PredictedSearch):
         if self.problem.conditions is None:
             return None
         return BankOfConditions(
-            made=self._n_lights, dropped=self.renderer.n_dropped, grown=0, gap=None
+            created=self._n_lights, dropped=self.renderer.n_dropped, grown=0, gap=None
         )
 
     def measure_size(self) -> tuple[int, int]:

@@ -302,10 +302,10 @@ class PredictedSearch(ABC):
         entries, n_bytes = self.measure_size()
         error = None  # of the latest comparison
         if self.deviations:
-            error = PredictionError.of(self.deviations[-1])
+            error = PredictionError.from_values(self.deviations[-1])
         return LinearTransport(
             used=True,
-            way=self.method,
+            method=self.method,
             reason=self.tracing_reason,
             window=self.window,
             conditions=self.summarize_conditions(),

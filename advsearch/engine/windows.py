@@ -231,7 +231,7 @@ def measure_outside(
     return Deviation(
         # without noise, the mean square can be below 0 by chance
         levels=math.sqrt(max(0.0, sum(squared_differences) / count)),
-        logits=sum(margin_biases) / count,
+        margin_bias=sum(margin_biases) / count,
         allowed_levels=MAX_LEVELS,
         n_traced=count,
         allowed_margin_bias=allowed_bias,
@@ -338,6 +338,6 @@ def _describe(deviation: Deviation) -> str:
             f"by {deviation.levels:.2f} levels of 255, where {max_levels:.2f} would do"
         )
     return (
-        f"by {deviation.logits:+.2f} in the margin, where "
+        f"by {deviation.margin_bias:+.2f} in the margin, where "
         f"{deviation.allowed_margin_bias:.2f} would do"
     )

@@ -595,7 +595,7 @@ def format_workers(shared: SharedWork | None) -> str:
     """
     if shared is None:
         return ""
-    texts = [f"{shared.most} at most"]
+    texts = [f"{shared.max_running} at most"]
     if shared.utilisation is not None:
         alive = format_seconds(shared.alive)
         texts.append(f"busy {percent(shared.utilisation)} of {alive}")

@@ -34,9 +34,9 @@ class ListedRun:
     controls: tuple[str, ...]
     rows: int
     state: str
-    answer: str
+    outcome: str
     kinds: Mapping[str, int]
-    begun: bool
+    started: bool
     when: float | None
     fault: str = ""
 
@@ -120,9 +120,9 @@ def _make_damaged_run(path: Path) -> ListedRun:
         controls=(),
         rows=0,
         state="damaged",
-        answer="",
+        outcome="",
         kinds={},
-        begun=False,
+        started=False,
         when=None,
     )
 
@@ -178,9 +178,9 @@ def _make_listed_run(
         controls=tuple(map(str, controls)),
         rows=sum(kinds.values()),
         state=_find_state(result, running),
-        answer=result.brief if result else "",
+        outcome=result.brief if result else "",
         kinds=kinds,
-        begun=bool(config),
+        started=bool(config),
         when=_find_start_time(path),
     )
 

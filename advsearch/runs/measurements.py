@@ -78,7 +78,7 @@ class Measurements:
         Raises:
             OutOfTime: they would have to be measured, and the time is up.
         """
-        return row_type.of(self.get(key, lambda: measure().to_dict()))
+        return row_type.from_values(self.get(key, lambda: measure().to_dict()))
 
     def get_rows(
         self,
@@ -97,7 +97,7 @@ class Measurements:
             OutOfTime: they would have to be measured, and the time is up.
         """
         return [
-            row_type.of(row)
+            row_type.from_values(row)
             for row in self.get(key, lambda: [row.to_dict() for row in measure()])
         ]
 

@@ -91,7 +91,7 @@ class Fields(BaseModel):
     model_config = ConfigDict(frozen=True, from_attributes=True, populate_by_name=True)
 
     @classmethod
-    def of(cls, source: object) -> Self:
+    def from_values(cls, source: object) -> Self:
         """Return the fields with the values that the attributes, or the keys, of
         something have.
         """
@@ -716,7 +716,7 @@ class PredictionError(Fields):
 class BankOfConditions(Fields):
     """The conditions that matrices were made for."""
 
-    made: int = Field(description="how many")
+    created: int = Field(description="how many")
     dropped: int = Field(description="of them made room for newer ones")
     grown: int = Field(
         description="comparisons with unseen conditions after which "
@@ -732,7 +732,7 @@ class LinearTransport(Fields):
     """What predicted the pictures of the searches."""
 
     used: bool
-    way: str | None = optional_field(
+    method: str | None = optional_field(
         "by what: `matrix`, `basis pictures` (of a sweep), `surface light`, or `crop`, "
         "which renders a part of each picture"
     )
@@ -768,7 +768,7 @@ class PrintTerms(Fields):
 class SharedWork(Fields):
     """How the workers did that shared the work, in this sitting."""
 
-    most: int = Field(description="workers that had work at once, at most")
+    max_running: int = Field(description="workers that had work at once, at most")
     lost: int = Field(description="that died or went away")
     refused: int = Field(description="that could not do it")
     retried: int = Field(description="batches that this process gave out again")

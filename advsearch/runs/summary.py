@@ -90,7 +90,7 @@ def read_stored_result(folder: Path) -> Result:
             path, f"one of the command {str(values.get('command'))[:40]!r}"
         )
     try:
-        return kind.of(values)
+        return kind.from_values(values)
     except ValidationError as error:
         # The message states the first error only, and no values, which may be long.
         first = error.errors(include_url=False, include_input=False)[0]

@@ -449,7 +449,7 @@ def compute_visible_normals(scene: SceneData) -> Float64Array:
     points = (scene.base_vertices - camera[:3, 3]) @ camera[:3, :3]
     faces = scene.object.mesh.faces.astype(np.int64)
     faces = faces[(points[faces][..., 2] > MIN_DEPTH).all(axis=1)]
-    frame = Frame.of(scene.get_number("camera.fov"), scene.aspect)
+    frame = Frame.from_fov(scene.get_number("camera.fov"), scene.aspect)
     pixel_width, shape = _choose_metering_shape(frame)
     tangents = points[faces][..., :2] / points[faces][..., 2:]
     # minus half a pixel, since the raster's coordinates are 0 at the center of its

@@ -72,7 +72,7 @@ class Frame:
     high: float
 
     @staticmethod
-    def of(
+    def from_fov(
         fov: float, aspect: float = 1.0, shift: tuple[float, float] = (0.0, 0.0)
     ) -> Frame:
         """Return the frame of a camera.

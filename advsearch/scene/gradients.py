@@ -60,12 +60,12 @@ class Group:
     step: float = 0.0  # half-width of a difference in u; 0 where none is taken
     # The difference in u that moves the fastest outline by a pixel; that of the group
     # where nothing moves.
-    pixel: float = 0.0
+    pixel_step: float = 0.0
     reason: str = ""  # why this estimator is used, as a text
     # the caller named the estimator, or nobody uses the derivative: it is not compared
     is_forced: bool = False
     # variance x time of each valid one, where measured
-    measured: Mapping[str, float] = field(default_factory=dict)
+    estimator_costs: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def coordinates(self) -> slice:
@@ -82,10 +82,10 @@ class Group:
         """Why the step has its width, as a text; empty where none is taken."""
         if self.estimator not in DIFFERENCE_ESTIMATORS:
             return ""
-        if self.step == self.pixel:
+        if self.step == self.pixel_step:
             return "an outline moves by a pixel, or nothing moves"
         return (
-            f"{self.step / self.pixel:.2g} times as wide as moves an outline by a "
+            f"{self.step / self.pixel_step:.2g} times as wide as moves an outline by a "
             "pixel, so that a search can follow"
         )
 
@@ -218,7 +218,7 @@ class GradientPlan:
 
         They are for smooth losses, which bend over wider ones.
         """
-        return self._change_groups(lambda group: {"step": group.pixel})
+        return self._change_groups(lambda group: {"step": group.pixel_step})
 
     def _change_groups(self, change: Callable[[Group], dict[str, Any]]) -> GradientPlan:
         """Return the plan with fields of each group replaced."""
@@ -248,7 +248,7 @@ class GradientPlan:
         for group in self.groups:
             entries = {name: getattr(group, name) for name in STORED_FIELDS}
             entries["valid"] = list(group.valid)
-            entries["variance_x_seconds"] = dict(group.measured)
+            entries["variance_x_seconds"] = dict(group.estimator_costs)
             groups.append(entries)
         return {"renders_per_gradient": self.renders, "spp": self.spp, "groups": groups}
 
@@ -321,7 +321,7 @@ def _plan_group(
     # With the smallest step, no coordinate of the group moves an outline by more than a
     # pixel.
     pixel_step = float(steps[group.coordinates].min()) if group.size else 0.0
-    group = replace(group, pixel=pixel_step)
+    group = replace(group, pixel_step=pixel_step)
     if not group.valid:
         return replace(
             group, estimator="none", reason="a discrete choice has no derivative"
@@ -361,9 +361,9 @@ def _choose_step(group: Group, image_size: float) -> float:
     # both estimators are right only for what moves no outline
     moves_outlines = not {"adjoint", "image"} & {*group.valid}
     if group.size != 1 or not moves_outlines:
-        return group.pixel
-    widest_step = SEARCH_FRACTION * image_size * group.pixel
-    return max(group.pixel, min(SEARCH_STEP, widest_step))
+        return group.pixel_step
+    widest_step = SEARCH_FRACTION * image_size * group.pixel_step
+    return max(group.pixel_step, min(SEARCH_STEP, widest_step))
 
 
 def _check_is_valid(group: Group, estimator: str) -> None:

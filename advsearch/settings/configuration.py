@@ -202,7 +202,7 @@ def settings(config: type[Config]) -> tuple[Setting, ...]:
     """
     completed = []
     for field, info in config.model_fields.items():
-        if field in config.without:
+        if field in config.excluded_settings:
             continue
         extra: Any = info.json_schema_extra
         declared: Setting = extra["declared"]
@@ -323,10 +323,10 @@ class Config(BaseModel):
 
     command: ClassVar[str]
     # settings of a class above that the command does not have
-    without: ClassVar[tuple[str, ...]] = ()
+    excluded_settings: ClassVar[tuple[str, ...]] = ()
     clashes: ClassVar[tuple[Clash, ...]] = ()
     # they decide no number: they may change before a run goes on
-    free: ClassVar[tuple[str, ...]] = (*RUN_LOCATION, "threads")
+    changeable_settings: ClassVar[tuple[str, ...]] = (*RUN_LOCATION, "threads")
 
     _python_only_parts: tuple[PythonOnly, ...] = PrivateAttr(())
     _python_objects: dict[tuple[str, str], Any] = PrivateAttr(default_factory=dict)
@@ -385,7 +385,7 @@ class Config(BaseModel):
         A command does not have the settings in `without`, although its class inherits
         them. `clashes` lists the settings that contradict others.
         """
-        for name in self.without:
+        for name in self.excluded_settings:
             field = type(self).model_fields[name]
             if getattr(self, name) != field.get_default(call_default_factory=True):
                 raise InputError(
@@ -394,7 +394,7 @@ class Config(BaseModel):
                 )
         defaults = {setting.field: setting.default for setting in settings(type(self))}
         for clash in self.clashes:
-            if clash.setting in self.without:
+            if clash.setting in self.excluded_settings:
                 continue
             is_set = getattr(self, clash.setting) != defaults[clash.setting]
             if is_set and clash.with_others(self):
@@ -485,7 +485,7 @@ class Config(BaseModel):
             setting.name: getattr(self, setting.field)
             for setting in settings(type(self))
             if setting.power is not no_power
-            and setting.name in self.free
+            and setting.name in self.changeable_settings
             and setting.name not in RUN_LOCATION
         }
 
@@ -521,7 +521,13 @@ class Config(BaseModel):
             for base in cls.__mro__
             if issubclass(base, Config) and isinstance(other, base)
         )
-        excluded = (*RUN_LOCATION, "workers", "cluster", *cls.without, *other.without)
+        excluded = (
+            *RUN_LOCATION,
+            "workers",
+            "cluster",
+            *cls.excluded_settings,
+            *other.excluded_settings,
+        )
         return {
             name: getattr(other, name)
             for name in common_class.model_fields
@@ -639,7 +645,7 @@ class Config(BaseModel):
         values = {
             name: value
             for name, value in self.to_json().items()
-            if name not in self.free
+            if name not in self.changeable_settings
         }
         for name in FILES:
             value = values.get(name)

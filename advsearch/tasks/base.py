@@ -78,7 +78,7 @@ class Judgement:
     metrics: Mapping[str, float | None] | None = None
 
     @classmethod
-    def of(
+    def from_margin(
         cls,
         score: float,
         margin: float,
@@ -171,7 +171,7 @@ class Facts:
             ("pose.yaw"), in the units that rows have.
         compute_sight: computes what is visible in the image, see `mask` and `depth`;
             None if the facts belong to no configuration.
-        each: the facts of each evaluated thing by name, the object first; empty if only
+        facts_of_thing: the facts of each evaluated thing by name, the object first; empty if only
             the object is evaluated.
         others: the facts of every other thing in the scene, the object included if
             another thing is evaluated.
@@ -184,7 +184,7 @@ class Facts:
     object_label: str | None = None
     describe_values: Callable[[], Mapping[str, float]] = dict
     compute_sight: Callable[[], Sight] | None = None
-    each: Mapping[str, Facts] = field(default_factory=dict)
+    facts_of_thing: Mapping[str, Facts] = field(default_factory=dict)
     others: tuple[Facts, ...] = ()
     views: tuple[Facts, ...] = ()
     gives_copies: ClassVar[bool] = True
@@ -555,7 +555,7 @@ class Task(ABC):
             margins = (0.0 - self.loss(output, truth)).tolist()
             predictions = self.describe(output, truth, margins)
             return [
-                Judgement.of(score, margin, prediction, payload)
+                Judgement.from_margin(score, margin, prediction, payload)
                 for score, margin, (prediction, payload) in zip(
                     scores, margins, predictions, strict=True
                 )

@@ -294,7 +294,7 @@ class Classification(ClassTask):
         margins = 0.0 - losses  # not `-losses`, which would be -0.0 for 0
         top_predictions = [top for (top,) in self._rank_classes(logits, count=1)]
         return [
-            Judgement.of(score, margin, prediction)
+            Judgement.from_margin(score, margin, prediction)
             for score, margin, prediction in zip(
                 scores.tolist(), margins.tolist(), top_predictions, strict=True
             )

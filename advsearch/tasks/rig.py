@@ -244,7 +244,7 @@ class Rig(tasks.JointTask):
             self._find_deciding_judgement(judgements, margin)
         )
         payload = {"pictures": image_payloads, **outcome}
-        return tasks.Judgement.of(score, margin, prediction, payload)
+        return tasks.Judgement.from_margin(score, margin, prediction, payload)
 
     def _find_deciding_judgement(
         self, judgements: Sequence[tasks.Judgement], margin: float

@@ -321,7 +321,7 @@ class EnsembleTask(JointTask):
             payload |= make_outcome_payload(worst)
         prediction = join_predictions(judgement.prediction for judgement in judgements)
         score = min(judgement.score for judgement in judgements)
-        return Judgement.of(score, margin, prediction, payload)
+        return Judgement.from_margin(score, margin, prediction, payload)
 
     def marks(self, output: Sequence[Outputs], truth: Truths) -> list[list[Mark]]:
         """Return what is drawn over each image.
@@ -384,11 +384,13 @@ class EachThingTask(JointTask):
         return replace(self, part=self.part.after_calibration(output, first_truth))
 
     def check(self, facts: Facts) -> None:
-        for thing in facts.each.values():
+        for thing in facts.facts_of_thing.values():
             self.part.check(thing)
 
     def truth(self, facts: Facts) -> TruthByThing:
-        return {name: self.part.truth(thing) for name, thing in facts.each.items()}
+        return {
+            name: self.part.truth(thing) for name, thing in facts.facts_of_thing.items()
+        }
 
     def loss(self, output: Output, truth: TruthByThing) -> Tensor:
         """Compute the largest loss over the things, (N,)."""

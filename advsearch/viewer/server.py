@@ -151,7 +151,7 @@ def _run_row(name: str, run: listing.ListedRun, can_compare: bool) -> Html:
             scope="row",
         )
     )
-    outcome = join_html(run.state, f": {run.answer}" if run.answer else None)
+    outcome = join_html(run.state, f": {run.outcome}" if run.outcome else None)
     fault = make_element("div", run.fault, class_="remarks") if run.fault else None
     cells.append(make_element("td", outcome, fault))
     start = ""

@@ -192,6 +192,6 @@ def test_a_configuration_whose_check_is_interrupted_is_told_and_verified_later(
     said = "What was found so far is not verified: the model calls this mug a vase."
     assert first.summary.ending == "interrupted" and first.summary.verified is None and first.search is not None
     assert said in text_of(first.summary) and said in (run / "report.html").read_text()
-    assert list_runs(tmp_path)[0].answer == "vase, unverified"
+    assert list_runs(tmp_path)[0].outcome == "vase, unverified"
     done = advsearch.attack(scene, wrong, **asked, resume=True)
-    assert done.found and torch.equal(done.u, first.u) and list_runs(tmp_path)[0].answer == "6/6"
+    assert done.found and torch.equal(done.u, first.u) and list_runs(tmp_path)[0].outcome == "6/6"

@@ -76,7 +76,7 @@ def test_a_region_fills_the_box_in_which_the_prediction_stays() -> None:
     region = grow_box(lambda u, _: bool(((u >= low) & (u <= high)).all()), torch.tensor([0.5, 0.5, 0.4]), seed=1)
     assert bool((region.low >= low).all()) and bool((region.high <= high).all())
     assert region.volume > 0.8 * float((high - low).prod())
-    assert region.same == region.samples == 200 and region.interval[0] > 0.97
+    assert region.n_same == region.samples == 200 and region.interval[0] > 0.97
 
 
 def test_a_region_in_a_disc_keeps_what_it_promises() -> None:

@@ -67,7 +67,7 @@ def test_processes_of_this_machine_are_killed_and_nothing_is_lost(capfd: pytest.
                 workers[0].kill()
         assert len(seen) == 400 and list(lost) == [301]
         facts = executor.stats
-        assert facts is not None and facts.lost >= 4 and facts.most == 2
+        assert facts is not None and facts.lost >= 4 and facts.max_running == 2
     assert not own_workers() and "printed" not in capfd.readouterr().out
 
 

@@ -51,7 +51,7 @@ def test_ranges_are_shared_and_few_are_under_way() -> None:
         assert len(taken) - count <= 4 and result.items in taken
     assert pool.most <= 4
     facts = workers.stats
-    assert facts.most == facts.workers == 4 and facts.batches == 1250 and facts.retried == facts.lost == 0
+    assert facts.max_running == facts.workers == 4 and facts.batches == 1250 and facts.retried == facts.lost == 0
     assert facts.busy / facts.alive > 0.99 and facts.busy == pytest.approx(10_000.0)
     assert facts.loading == 4 * pool.load
 

@@ -51,7 +51,7 @@ def test_a_silhouette_has_the_area_of_what_it_shows() -> None:
     window = (found.window.right - found.window.left) * (found.window.high - found.window.low)
     assert found.mask.mean() * window == pytest.approx(share, rel=0.04)
     behind = rasterise_silhouette(points - np.array([0.0, 0.0, 6.0]), ball.faces)
-    aside = rasterise_silhouette(points + np.array([9.0, 0.0, 0.0]), ball.faces, Frame.of(35.0))
+    aside = rasterise_silhouette(points + np.array([9.0, 0.0, 0.0]), ball.faces, Frame.from_fov(35.0))
     assert behind is None and aside is None
 
 

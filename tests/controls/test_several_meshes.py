@@ -67,7 +67,7 @@ def test_a_setting_and_a_control_mean_the_same(scene: SceneDescription) -> None:
 
 
 def test_every_such_control_reaches_its_mesh_alone(scene: SceneDescription) -> None:
-    able = [kind for kind in CONTROLS if CONTROLS[kind].of_a_mesh]
+    able = [kind for kind in CONTROLS if CONTROLS[kind].targets_mesh]
     assert set(able) == {"pose", "texture", "material", "geometry", "body"}
     for kind in ("pose", "texture", "material"):
         space = make_space([make_control(f"{kind}:post")], scene)

@@ -58,8 +58,8 @@ def test_a_search_follows_a_loss_of_the_texture(scene: advsearch.Scene) -> None:
     wanted = before + (PINK - before).clamp(-0.1, 0.1)
     assert float((found - wanted).abs().mean()) < 0.25 * float((before - wanted).abs().mean())
     tried = result.summary.tried_objective
-    assert tried is not None and tried.answer is not None
-    assert tried.answer.mean == pytest.approx(float(pinker(PINK, PINK, PINK, found[None])), abs=1e-5)
+    assert tried is not None and tried.adversarial is not None
+    assert tried.adversarial.mean == pytest.approx(float(pinker(PINK, PINK, PINK, found[None])), abs=1e-5)
 
 
 def test_the_derivative_is_that_of_the_picture_and_that_of_what_was_asked_for(scene: advsearch.Scene) -> None:

@@ -174,7 +174,7 @@ def test_a_resumed_search_and_one_with_workers_have_the_same_rows(tmp_path: Path
     """Window and surroundings are found again, also after a comparison and for the ranking."""
     settings = {**SMALL, "deterministic": True}
     whole = attack_once(AttackConfig(**settings, run=str(tmp_path / "whole"))).summary
-    assert whole.transport is not None and whole.transport.way == "crop"
+    assert whole.transport is not None and whole.transport.method == "crop"
     assert whole.transport.window is not None and whole.transport.renewed == 1
     assert whole.renders["products"] == 0 and whole.renders["search"] > 22
     config = AttackConfig(**settings, run=str(tmp_path / "parts"))

@@ -232,7 +232,7 @@ class DimControl(NumberControl):
     def on_picture(self, values: Any, image: Tensor) -> Tensor:
         return image.mul_(1.0 - values["amount"])
 
-    def measured(self, values: Any, earlier_inputs: Mapping[str, Tensor]) -> dict[str, Any]:
+    def compute_measurements(self, values: Any, earlier_inputs: Mapping[str, Tensor]) -> dict[str, Any]:
         destroy([*earlier_inputs.values(), *values.values()])
         return {}
 

@@ -81,10 +81,10 @@ def test_rates_of_one_drive_are_those_worked_out_by_hand(
     """Five frames in four seconds, from five distances away to one, with the camera as high as the object."""
     monkeypatch.setattr(swept_scene, "make_renderer", Timed)
     (said,), _ = clocked(frames, **DRIVE, size=1.0, set={"camera.elevation": 0.0, "camera.distance": 1.0})
-    assert (said.drives, said.frames, said.seconds, said.never_seen) == (1, 5, 4.0, int(first is None))
+    assert (said.drives, said.frames, said.seconds, said.never_right) == (1, 5, 4.0, int(first is None))
     assert (said.right.mean, said.longest_gap.mean, said.flicker.mean) == pytest.approx((right, gap, flicker))
     assert said.right.interval is None and said.right.worst == said.right.mean
-    assert (said.first_seen and said.first_seen.mean) == (None if first is None else pytest.approx(first, abs=1e-3))
+    assert (said.first_right and said.first_right.mean) == (None if first is None else pytest.approx(first, abs=1e-3))
 
 
 @pytest.mark.medium
@@ -176,7 +176,7 @@ def test_repeats_of_one_drive_that_differ_in_noise_are_one_drive(
         (said,), result = clocked(frames, **REPEATED, run=path)
     assert (said.drives, said.repeats) == (1, 6)
     assert said.right.mean == pytest.approx(0.4) and said.right.interval is None
-    assert said.first_seen is not None and said.first_seen.interval is None and said.longest_gap.interval is None
+    assert said.first_right is not None and said.first_right.interval is None and said.longest_gap.interval is None
     swept = result.summary
     assert (swept.units, swept.accuracy, swept.interval) == (1, pytest.approx(0.4), None)
     assert "all 6 repeats are of one drive and differ in noise alone" in " ".join(swept.warnings)
@@ -229,7 +229,7 @@ def test_an_attack_over_a_path_keeps_its_adversarial_scene_along_the_drive(tmp_p
     ).summary
     assert found.drive is not None and found.adversarial is not None
     assert (found.drive.frames, found.drive.seconds, found.drive.clean) == (24, 5.0, 24)
-    assert found.drive.answer is not None and 0 <= found.drive.answer <= 24
+    assert found.drive.adversarial is not None and 0 <= found.drive.adversarial <= 24
     for name in ("drive", "drive-clean"):
         with Image.open(path / "images" / f"{name}.webp") as kept:
             assert getattr(kept, "n_frames", 1) == 24

@@ -68,7 +68,7 @@ def test_each_is_tried_until_it_is_clear_and_a_lucky_one_does_not_hold() -> None
     assert [one.holds for one in told.listed] == [True, False, True, False]
     assert [one.verified.trials for one in told.listed if one.verified][0::2] == [14, 14]
     assert told.listed[3].verified is not None and told.listed[3].verified.trials == 2
-    assert (told.tried, told.held, told.found) == (4, 2, 30)
+    assert (told.tried, told.verified, told.found) == (4, 2, 30)
 
 
 def test_no_more_are_tried_than_is_said_and_the_rest_is_a_claim() -> None:

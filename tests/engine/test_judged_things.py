@@ -65,7 +65,7 @@ def test_all_things_have_to_be_right() -> None:
         )
         for name, mask in masks.items()
     }
-    truth = own.truth(Facts("car", "car", each=each))
+    truth = own.truth(Facts("car", "car", facts_of_thing=each))
     right = torch.zeros(1, 2, 2, 4)
     right[0, 0, :, :2], right[0, 1, :, 2:] = 3.0, 2.0
     wrong = right.clone()

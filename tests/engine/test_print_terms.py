@@ -33,11 +33,11 @@ def test_predictions_are_nearer_to_ink() -> None:
     with_terms = advsearch.attack("mug", easy(), printable=True, **SHORT)
     without = advsearch.attack("mug", easy(), **SHORT)
     found = with_terms.summary.printability
-    assert found is not None and found.answer is not None and without.summary.printability is None
+    assert found is not None and found.adversarial is not None and without.summary.printability is None
     plain = without.artifacts["texture"]
-    cost = found.answer.variation + found.answer.off_print
+    cost = found.adversarial.variation + found.adversarial.off_print
     assert cost < 0.6 * float(mean_variation(plain) + printable_distance(plain))
-    assert found.answer.off_print < 0.3 * float(printable_distance(plain))
+    assert found.adversarial.off_print < 0.3 * float(printable_distance(plain))
     assert with_terms.found and without.found
     clean = with_terms.artifacts["texture-original"]
     priced = found.cost
@@ -46,7 +46,7 @@ def test_predictions_are_nearer_to_ink() -> None:
     assert ours is not None and plainly is not None and priced.margin_with == ours.margin
     assert priced.cost == pytest.approx(priced.margin_with - priced.margin_without) and priced.cost > 0.0
     assert priced.margin_without == pytest.approx(plainly.margin, rel=0.1), "as of an attack without"
-    assert priced.terms.variation + priced.terms.off_print > found.answer.variation + found.answer.off_print
+    assert priced.terms.variation + priced.terms.off_print > found.adversarial.variation + found.adversarial.off_print
     spent, plain_spent = with_terms.summary.renders, without.summary.renders
     assert spent["products"] == 2 * plain_spent["products"] and "unprinted" not in plain_spent
     assert spent["verification"] == plain_spent["verification"] + 6
@@ -69,7 +69,7 @@ def test_a_stopped_run_tells_the_same_cost(tmp_path: Path, monkeypatch: pytest.M
         patched.setattr(Stages, "begin", stopping)
         stopped = attack_once(config).summary
     assert stopped.ending == "interrupted" and stopped.printability is not None and stopped.printability.cost is None
-    assert stopped.printability.answer is not None and print_cost_text(stopped) == ""
+    assert stopped.printability.adversarial is not None and print_cost_text(stopped) == ""
     resumed = attack_once(config, resumed=tmp_path / "stopped").summary
     assert resumed.printability == whole.printability and whole.printability is not None
     assert whole.printability.cost is not None and whole.printability.cost.steps == 6

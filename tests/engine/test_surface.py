@@ -87,7 +87,7 @@ def is_the_patch(table: SurfaceTable, run: Path) -> None:
     """Check that a map lights up the patch, and nothing far from it."""
     first = table.strongest[0]
     assert abs(first.u - 0.38) < 0.08 and first.v < 0.4 and first.p <= 0.02  # what is above it is seen with it
-    assert first.seen.accuracy is not None and first.seen.accuracy < 0.2 and first.hidden.correct > MIN_IMAGES
+    assert first.visible.accuracy is not None and first.visible.accuracy < 0.2 and first.hidden.correct > MIN_IMAGES
     assert first.interval[0] < first.difference <= first.interval[1] and first.interval[0] > 0.3
     found = counts_of(run)
     row, column = np.divmod(np.arange(MAP_SIZE**2), MAP_SIZE)

@@ -89,7 +89,7 @@ def test_matrices_predict_what_light_on_surfaces_cannot(monkeypatch: pytest.Monk
     """Where it is too far off before the search."""
     off(monkeypatch, 9.0)
     told = advsearch.attack("mug", **{**SMALL, "steps": 16}).summary.transport
-    assert told is not None and told.way == "matrix" and "9.0 levels of 255 off" in str(told.reason)
+    assert told is not None and told.method == "matrix" and "9.0 levels of 255 off" in str(told.reason)
 
 
 CAMERA: dict[str, Any] = SMALL | {"controls": "camera", "over": (), "draws": None, "steps": 40, "baseline": True}
@@ -106,7 +106,7 @@ def test_a_search_for_a_viewpoint_is_predicted_and_its_ranking_is_traced(viewpoi
     """Two searches of 40 pictures, eight traced ones of each ranking; comparisons of two places after 0, 6, 12 and 24
     pictures. Rows say which were traced."""
     told, renders = viewpoints[1].summary.transport, viewpoints[1].summary.renders
-    assert told is not None and (told.way, told.reason, told.conditions) == ("surface light", None, None)
+    assert told is not None and (told.method, told.reason, told.conditions) == ("surface light", None, None)
     assert (renders["products"], renders["baseline"]) == (80, 8)
     assert renders["search"] == 8 + 4 * acceptance.N_FIRST_VIEWS * 3
     with Store(viewpoints[0] / STORE, read_only=True) as store:

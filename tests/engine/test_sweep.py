@@ -487,23 +487,23 @@ def test_both_rates_stand_side_by_side_with_what_the_pairs_say(
     monkeypatch.setattr(swept_scene, "make_renderer", Turned)
     two = [model(0.5, "one"), model(0.55, "two")]
     result = advsearch.sweep(model=two, adversarial_of=attacked, samples=40, trials=0, run=tmp_path / "run")
-    beside, rows = result.summary.beside, list(result.rows())
-    assert beside is not None and beside.answer == "turned" and [one.model for one in beside.pairs] == ["one", "two"]
+    beside, rows = result.summary.arms, list(result.rows())
+    assert beside is not None and beside.adversarial_run == "turned" and [one.model for one in beside.pairs] == ["one", "two"]
     assert result.summary.controls == ["camera"], "what the attack was over"
     for number, pair in enumerate(beside.pairs):
         right = [bool(row.correct) for row in rows[number::2]]
         pairs = list(zip(right[:40], right[40:], strict=True))
         assert pair.both == pairs.count((True, True)) and pair.neither == pairs.count((False, False))
-        assert pair.clean_only == pairs.count((True, False)) and pair.answer_only == pairs.count((False, True))
-        assert pair.clean.correct == sum(right[:40]) and pair.answer.correct == sum(right[40:])
+        assert pair.clean_only == pairs.count((True, False)) and pair.adversarial_only == pairs.count((False, True))
+        assert pair.clean.correct == sum(right[:40]) and pair.adversarial.correct == sum(right[40:])
         assert pair.difference == pytest.approx((sum(right[40:]) - sum(right[:40])) / 40)
     assert beside.pairs[0].clean_only > 0
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(FakeRenderer, "stops_at", FakeRenderer.calls + 60)
         stopped = advsearch.sweep(model=two, adversarial_of=attacked, samples=40, trials=0, run=tmp_path / "stopped")
-    assert stopped.summary.ending == "interrupted" and stopped.summary.beside is not None
+    assert stopped.summary.ending == "interrupted" and stopped.summary.arms is not None
     again = advsearch.sweep(model=two, adversarial_of=attacked, samples=40, trials=0, run=tmp_path / "stopped")
-    assert again.summary.beside == beside and rows_of(tmp_path / "stopped") == rows_of(tmp_path / "run")
+    assert again.summary.arms == beside and rows_of(tmp_path / "stopped") == rows_of(tmp_path / "run")
 
 
 @pytest.mark.medium

@@ -80,7 +80,7 @@ def test_pictures_are_those_that_are_rendered() -> None:
 class Two:
     """Two workers, which carry out batches in any order, each with scenes of its own."""
 
-    stats = WorkerStats(most=2)
+    stats = WorkerStats(max_running=2)
 
     def __init__(self, job: Any) -> None:
         self.scenes = [SceneLoader(job), SceneLoader(job)]

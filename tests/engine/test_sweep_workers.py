@@ -45,7 +45,7 @@ class Disorder:
     lose: int | None = None
     stop: int | None = None
     stats: WorkerStats | None = field(
-        default_factory=lambda: WorkerStats(most=2, lost=1, busy=9.0, alive=10.0, retried=3)
+        default_factory=lambda: WorkerStats(max_running=2, lost=1, busy=9.0, alive=10.0, retried=3)
     )
 
     def compute(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:

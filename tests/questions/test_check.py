@@ -120,7 +120,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(planning, name, value)
     monkeypatch.setattr(INTERRUPTS, "count", 0)
     row = {"item": "tracing", "what": "tracing", "time_gain": 2.0, "seconds": 1.0, "safe": True}
-    gain = GainRow.of({**row, "picture_difference": 0.0, "gradient_difference": 0.0})
+    gain = GainRow.from_values({**row, "picture_difference": 0.0, "gradient_difference": 0.0})
     monkeypatch.setattr(checking, "measure_gains", lambda *_, **__: [gain])
     length = PathLength(depth=3, full=6, cuts=[], configurations=1, reason="few")
     monkeypatch.setattr(planning, "measure_problem_bounces", lambda *_, **__: length)
@@ -157,5 +157,5 @@ def test_a_check_that_is_stopped_anywhere_goes_on_to_the_same_plan(
         before = len(stopped.rows)
     INTERRUPTS.count = 0
     assert main(["resume", str(folder), "--json", "--quiet"]) in (0, 3)
-    resumed = CheckResult.of(json.loads(capsys.readouterr().out))
+    resumed = CheckResult.from_values(json.loads(capsys.readouterr().out))
     assert timeless(resumed) == timeless(whole) == timeless(kept(folder)) and is_finished(folder)

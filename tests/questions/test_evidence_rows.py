@@ -63,7 +63,7 @@ def test_every_share_is_that_of_the_rows(tmp_path: Path, capsys: pytest.CaptureF
 
 
 def test_rules_are_claims_and_triggering_conditions_and_say_whether_they_are_confirmed() -> None:
-    result = ExplainResult.of(samples.EXPLAIN)
+    result = ExplainResult.from_values(samples.EXPLAIN)
     first, *_ = collect_claims(result)
     assert first.kind == "measured" and first.extent is not None and first.extent.total == 97
     assert "camera.elevation over 60 degrees (rule 1)" in first.statement and "fresh renders" in first.statement
@@ -73,7 +73,7 @@ def test_rules_are_claims_and_triggering_conditions_and_say_whether_they_are_con
         ({**rule["confirmed"], "held": False}, "Not confirmed: "),
         (None, "Counted on rows that did not choose it, not rendered: "),
     ):
-        told = ExplainResult.of({**samples.EXPLAIN, "rules": [{**rule, "confirmed": confirmed}]})
+        told = ExplainResult.from_values({**samples.EXPLAIN, "rules": [{**rule, "confirmed": confirmed}]})
         assert list_triggering_conditions(told)[0].startswith(said)
 
 

@@ -104,7 +104,7 @@ def test_the_nearest_right_prediction_differs_in_one_value(
     result = advsearch.explain(swept, confirm=0, pairs=1, clusters=0, run=tmp_path / "run")
     (pair,) = result.pairs
     assert pair.parameter == "camera.elevation" and float(pair.wrong_at) > HIGH >= float(pair.right_at) > 50.0
-    assert (pair.answered, pair.answered_there) == ("bowl", "mug") and result.pairs_sought == 1
+    assert (pair.failure_label, pair.right_label) == ("bowl", "mug") and result.pairs_sought == 1
     several = advsearch.explain(swept, confirm=0, pairs=12, clusters=0, run=tmp_path / "several")
     assert several.pairs_sought == 12 and several.pairs[0] == pair and len(several.pairs) >= 6
     assert len({str(one.values) for one in several.pairs}) == len(several.pairs)
@@ -121,8 +121,8 @@ def test_of_predictions_without_a_law_it_is_said_that_nothing_decides_and_how_ma
     assert "No parameter is shown to decide anything" in said
     kept = read_result(tmp_path / "run")
     assert isinstance(kept, ExplainResult) and kept.rules == []
-    rule = kept.not_told
-    assert rule is not None and rule.chance > rule.asked == 0.01 and f"right in {rule.right} of {rule.total}" in said
+    rule = kept.rejected_rule
+    assert rule is not None and rule.chance > rule.p_value_limit == 0.01 and f"right in {rule.right} of {rule.total}" in said
     assert rule.rows is None or (
         rule.rows > 600 and f"About {rule.rows:,} rows with these shares would tell it" in said
     )
@@ -154,12 +154,12 @@ def test_failures_are_grouped_by_what_the_model_decides_by(
     monkeypatch.setattr(explaining.Renders, "render_again", again)
     result = advsearch.explain(swept, confirm=0, pairs=0, clusters=50, run=tmp_path / "run")
     found = result.clusters
-    assert found is not None and found.apart and found.failures == 50 == len(set(asked)) and result.renders == 50
+    assert found is not None and found.are_separated and found.failures == 50 == len(set(asked)) and result.renders == 50
     with Store(swept / NAME, read_only=True) as store:
         assert all(not row.correct for row in store.rows("sweep") if row.step in asked)
     odd = sum(number % 2 for number in asked)
     assert sorted(one.failures for one in found.listed) == sorted([odd, 50 - odd])
-    assert all(sum(one.answers.values()) == one.failures and "bowl" in one.answers for one in found.listed)
+    assert all(sum(one.labels.values()) == one.failures and "bowl" in one.labels for one in found.listed)
     shades = {round(float(iio.imread(tmp_path / "run" / one.picture).mean()) / 255.0, 1) for one in found.listed}
     assert shades == {0.2, 0.8}
 

@@ -175,7 +175,7 @@ def test_a_run_trains_on_what_it_found_and_measures_scene_by_scene(
     assert [one.robust for one in result.rounds[:2]] == [one.robust for one in first.rounds]
     assert result.ending == "done" and result.weights and result.hardened is None
     assert result.before is not None and result.before.count == 1 and result.gained is not None
-    assert [one.lessons for one in result.rounds] == [0, 5, 9] and sum(one.kept for one in result.rounds) == 1
+    assert [one.lessons for one in result.rounds] == [0, 5, 9] and sum(one.is_selected for one in result.rounds) == 1
     kept = json.loads((Path(str(result.pictures)) / "round-001" / "annotations.json").read_text())
     assert [one["file_name"][6:] for one in kept["images"]] == ["plain.png"] * 3 + ["worst.png"]
     assert {one["category_id"] for one in kept["annotations"]} == {0}

@@ -68,7 +68,7 @@ def test_a_region_ends_where_the_object_leaves_the_picture(tmp_path: Path) -> No
     small: dict[str, Any] = {"samples": 20, "set": {"camera.distance": 0.4}, "exposure": -3.0, **DETECTED}
     model = small_models.finds_cars()
     found = advsearch.region("mug", model, controls={"pose": {"y": [-3.0, 3.0]}}, run=tmp_path / "run", **small)
-    assert found.verdict == "right" and found.box is not None and found.same == found.samples
+    assert found.verdict == "right" and found.box is not None and found.n_same == found.samples
     assert -1.0 < found.box[0].low < found.box[0].high < 1.0, found.box
     with pytest.raises(InputError, match="20 of 20"):
         advsearch.region("mug", model, controls=BESIDE, run=tmp_path / "none", **small)

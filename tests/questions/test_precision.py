@@ -218,7 +218,7 @@ def test_a_part_that_is_measured_is_kept_and_not_measured_again(
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(measuring, "PictureBench", lambda *_: pytest.fail("measured again"))
         assert main(["resume", str(folder), "--json", "--quiet"]) == 0
-    report = PrecisionResult.of(json.loads(capsys.readouterr().out))
+    report = PrecisionResult.from_values(json.loads(capsys.readouterr().out))
     assert report.ending == "done" and is_finished(folder) and len(report.figures) == 2
     pictures = [one.to_dict() for one in report.points if one.quantity != "gradient"]
     assert pictures == [one.to_dict() for one in stopped.points]

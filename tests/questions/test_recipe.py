@@ -184,8 +184,8 @@ def test_what_is_drawn_has_the_mean_and_the_deviation_that_a_search_answers_with
         "camera.roll": {"value": 0.0, "unit": "degrees", "low": -30.0, "high": 30.0},
         "camera.distance": {"value": 2.0, "unit": "object sizes", "low": 1.0, "high": 4.0},
     }
-    found = SearchDistribution.of({"mean": searched, "deviation": [0.1, 0.05, 2.0, 0.1]})
-    ranges = {name: FoundValue.of(value) for name, value in searched.items()}
+    found = SearchDistribution.from_values({"mean": searched, "deviation": [0.1, 0.05, 2.0, 0.1]})
+    ranges = {name: FoundValue.from_values(value) for name, value in searched.items()}
     drawn = carrying_out.sample_around(SweepConfig(object="mug"), found, ranges)
     assert isinstance(drawn, SweepConfig) and drawn.sampler == "random"
     camera: Any = drawn.controls["camera"]

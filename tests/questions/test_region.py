@@ -47,7 +47,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RegionResult]
 def test_viewpoints_are_predicted_and_fresh_samples_are_rendered(whole: tuple[Path, RegionResult]) -> None:
     """Rows say which: a predicted one has the four rays of a pixel, and no seed."""
     run, result = whole
-    assert result.transport is not None and result.transport.way == "surface light"
+    assert result.transport is not None and result.transport.method == "surface light"
     with Store(run / STORE, read_only=True) as store:
         found = [(kind, one.seed is None, one.spp) for kind in ("region", "map") for one in store.rows(kind)]
     predicted, checked = found.count(("region", True, 4)), found.count(("region", False, 16))

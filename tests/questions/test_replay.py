@@ -109,8 +109,8 @@ def test_what_changes_only_after_rendering_renders_nothing(attacked: Path, tmp_p
 def make_rows(**counts: int) -> list[ReplayRow]:
     """Return rows of photographs by status, and one of another condition that holds."""
     endings = [ending.replace("_", " ") for ending, count in counts.items() for _ in range(count)]
-    rows = [ReplayRow(way=PHOTOGRAPH, condition=f"{index}.jpg", ending=ending) for index, ending in enumerate(endings)]
-    return [ReplayRow(way="as verified", condition="as verified", ending="found"), *rows]
+    rows = [ReplayRow(change=PHOTOGRAPH, condition=f"{index}.jpg", ending=ending) for index, ending in enumerate(endings)]
+    return [ReplayRow(change="as verified", condition="as verified", ending="found"), *rows]
 
 
 def test_photographs_are_counted_where_the_clean_scene_is_right() -> None:
@@ -148,7 +148,7 @@ def test_a_texture_of_a_room_is_tried_in_photographs(tmp_path: Path) -> None:
         run = tmp_path / name
         attack_once(AttackConfig(**SHORT | settings | scene, run=str(run)))
         replayed = advsearch.replay(run, backdrop=folder, trials=6, run=tmp_path / f"{name}-replay")
-        assert [row.way for row in replayed.table[1:]] == [PHOTOGRAPH] * (len(replayed.table) - 1)
+        assert [row.change for row in replayed.table[1:]] == [PHOTOGRAPH] * (len(replayed.table) - 1)
         assert replayed.transfer is not None
         transfers.append(replayed.transfer)
     assert [transfer.photographs for transfer in transfers] == [6, 5], "not in the photograph that was searched"

@@ -46,7 +46,7 @@ def everything() -> Iterator[tuple[str, dict[str, Any] | None, Result]]:
             yield ending, rate, samples.attack(ending=ending, verified=rate, **own, **goal)
     for ending, rate in product(ENDINGS, RATES):
         cell = {**samples.REPLAY["table"][0], "ending": ending, "verified": rate}
-        yield ending, rate, ReplayResult.of({**samples.REPLAY, "table": [cell]})
+        yield ending, rate, ReplayResult.from_values({**samples.REPLAY, "table": [cell]})
         if rate is not None:
             tested = [{"model": "reference", "ending": ending, "verified": rate}]
             row = {**samples.MATRIX["table"][0], "tested": tested}
@@ -94,8 +94,8 @@ def test_what_was_stopped_claims_nothing_whatever_it_has_counted(ending: str) ->
     stopped = [
         samples.attack(ending=ending), samples.sweep(ending=ending), samples.curve(ending=ending),
         samples.region(ending=ending), samples.matrix(ending=ending),
-        HardenResult.of({**samples.HARDEN, "ending": ending}), ExplainResult.of({**samples.EXPLAIN, "ending": ending}),
-        ReplayResult.of({**samples.REPLAY, "ending": ending}),
+        HardenResult.from_values({**samples.HARDEN, "ending": ending}), ExplainResult.from_values({**samples.EXPLAIN, "ending": ending}),
+        ReplayResult.from_values({**samples.REPLAY, "ending": ending}),
     ]  # fmt: skip
     for result in stopped:
         (claim,) = collect_claims(result)

@@ -178,10 +178,10 @@ def test_intervals_of_what_decides_hold(accuracy: tuple[float, ...], rows: int) 
 
 def test_the_envelope_leaves_out_what_fails_and_little_else() -> None:
     box = find_envelope(*split_in_halves(planted("red"), 0), accuracy=0.9)
-    assert box is not None and box.held and box.interval[0] >= 0.9
+    assert box is not None and box.confirmed and box.interval[0] >= 0.9
     assert [one.text for one in box.conditions] == ["colour blue or green"]
     whole = find_envelope(*split_in_halves(planted("none"), 0), accuracy=0.9)
-    assert whole is not None and whole.held and whole.conditions == []
+    assert whole is not None and whole.confirmed and whole.conditions == []
     assert find_envelope(*split_in_halves(planted("red"), 0), accuracy=0.99) is None
 
 
@@ -230,7 +230,7 @@ def test_planted_kinds_are_told_with_the_most_typical_first(kinds: int) -> None:
     noise = 0.35 * generator.standard_normal((len(truth), 40))
     noise[np.cumsum(sizes) - 1] = 0.0
     found = find_clusters(3.0 * (centres[truth] + noise), 0)
-    assert found.apart and found.silhouette is not None and found.silhouette > 0.3
+    assert found.are_separated and found.silhouette is not None and found.silhouette > 0.3
     assert [set(truth[list(members)]) for members in found.members] == [{k} for k in range(kinds)]
     assert [members[0] for members in found.members] == list(np.cumsum(sizes) - 1)
 

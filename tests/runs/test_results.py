@@ -32,10 +32,10 @@ class Measured:
 
 
 def test_a_result_is_json_without_what_was_not_asked_for_and_reads_back() -> None:
-    result = Outer(inner=Inner.of(Measured()))
+    result = Outer(inner=Inner.from_values(Measured()))
     written = json.dumps(result.to_dict(), allow_nan=False)
     assert written == '{"schema": 1, "command": "outer", "inner": {"value": null, "interval": [0.0, null]}}'
-    again = Outer.of(json.loads(written))
+    again = Outer.from_values(json.loads(written))
     assert again.inner is not None and math.isnan(again.inner.value) and again.extra is None
     assert Outer(inner=None, extra=3).to_dict() == {"schema": 1, "command": "outer", "inner": None, "extra": 3}
 
@@ -53,10 +53,10 @@ class Timed(AttackSummary):
 
 def test_a_field_that_is_declared_as_a_fact_is_in_terminal_page_and_json(tmp_path: Path) -> None:
     earlier = attack().to_dict()
-    old, new = Timed.of(earlier), Timed.of({**earlier, "picture_bytes": 768})
+    old, new = Timed.from_values(earlier), Timed.from_values({**earlier, "picture_bytes": 768})
     assert "picture_bytes" not in old.to_dict() and new.to_dict()["picture_bytes"] == 768
-    assert old.to_dict()["renders_a_second"] == Timed.of(old.to_dict()).renders_a_second == 101 / 14.6
-    assert AttackSummary.of(new.to_dict()) == attack()
+    assert old.to_dict()["renders_a_second"] == Timed.from_values(old.to_dict()).renders_a_second == 101 / 14.6
+    assert AttackSummary.from_values(new.to_dict()) == attack()
     page = attack_page(tmp_path, new)
     for name, text in (("picture bytes", "768"), ("renders a second", "6.92")):
         assert re.search(rf"^  {name} +{text}$", check_text(new), re.M)

@@ -466,7 +466,7 @@ def test_runs_are_listed_with_their_state(home: Path) -> None:
     assert [one.state for one in found] == ["stopped", "found", "stopped", "finished", "stopped"]
     assert during["c-ctrl-c"] == "running" and during["b-found"] == "found"
     assert [one.rows for one in found] == [3, 2, 2, 2, 0]
-    assert [one.answer for one in found] == ["", "19/20", "vase, unverified", "right in 7 of 8", ""]
+    assert [one.outcome for one in found] == ["", "19/20", "vase, unverified", "right in 7 of 8", ""]
     assert [is_finished(Path(one.path)) for one in found] == [False, True, False, True, False]
 
 

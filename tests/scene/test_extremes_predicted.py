@@ -85,7 +85,7 @@ def lit(
     ]
     finite = bool(torch.isfinite(picture).all() and torch.isfinite(gradient).all()) and light.non_finite == 0
     measured = {"entries": float(light.n_entries), "derivative": wanted, "hidden numbers": float(hidden.sum())}
-    return CaseOutcome(checks, finite, error, measured=measured)
+    return CaseOutcome(checks, finite, error, measurements=measured)
 
 
 HALF = np.repeat(np.repeat(np.array([1.0, 0.0], np.float32), 16)[None, :, None], 3, axis=2).repeat(16, axis=0)

@@ -364,8 +364,8 @@ def test_everybody_can_use_the_pages(
 @pytest.mark.parametrize(
     "result",
     [
-        matrix(), curve(), region(), ExplainResult.of(EXPLAIN), HardenResult.of(HARDEN), RecipeResult.of(RECIPE),
-        ReplayResult.of(REPLAY), StabilityResult.of(STABILITY),
+        matrix(), curve(), region(), ExplainResult.from_values(EXPLAIN), HardenResult.from_values(HARDEN), RecipeResult.from_values(RECIPE),
+        ReplayResult.from_values(REPLAY), StabilityResult.from_values(STABILITY),
     ],
     ids=lambda result: type(result).__name__,
 )  # fmt: skip

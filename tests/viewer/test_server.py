@@ -235,7 +235,7 @@ class NoPhotographs:
         raise InputError("none")
 
     def agreement(self, run: Path) -> PhotoAgreement:
-        return PhotoAgreement.of(
+        return PhotoAgreement.from_values(
             dict.fromkeys(("photos", "right_right", "right_wrong", "wrong_right", "wrong_wrong"), 0)
             | {"agreement": None, "interval": None, "renderings": []}
         )

@@ -131,7 +131,7 @@ class CorruptionControl(Control):
     """
 
     kind = "corruption"
-    amount = "severity"
+    strength_parameter = "severity"
     parameters = (
         replace(
             Parameter.named(
@@ -155,7 +155,7 @@ class CorruptionControl(Control):
             "seed",
             0,
             "Which draw of the noise, the snow, the wrinkles: a whole number from 0.",
-            whole=(0, 2**32 - 1),
+            integer_bounds=(0, 2**32 - 1),
         ),
     )
 
@@ -179,7 +179,7 @@ class CorruptionControl(Control):
             int(self.chosen["seed"]),
         )
 
-    def measured(
+    def compute_measurements(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
         """Return the severity that is applied: a whole one for stepped corruptions."""

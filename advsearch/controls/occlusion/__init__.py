@@ -127,7 +127,7 @@ class OcclusionControl(Control):
     """A second object between the camera and the object, hiding a fraction of it."""
 
     kind = "occlusion"
-    amount = "coverage"
+    strength_parameter = "coverage"
     # none is changed; but it comes after whatever moves the camera or the object
     refines = frozenset(geometry.OCCLUDER_INPUTS)
     parameters = (
@@ -258,7 +258,7 @@ class OcclusionControl(Control):
             inputs[f"{part}.to_world"] = _compute_pose(camera, placement, values)
         return inputs
 
-    def measured(
+    def compute_measurements(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
         """Return how much is hidden, and the true size and distance of the occluder."""
@@ -304,9 +304,9 @@ class OcclusionControl(Control):
                 object.
         """
         requested = {name: float(value.detach()) for name, value in values.items()}
-        view = _ObjectView.of(self.scene, earlier_inputs)
+        view = _ObjectView.from_scene(self.scene, earlier_inputs)
         # "distance" is a fraction of the distance from the camera to the object
-        requested_distance = requested["distance"] * view.far
+        requested_distance = requested["distance"] * view.center_distance
         if view.directions is None or requested["coverage"] <= 0.0:
             return _make_hidden_placement(requested["size"], requested_distance)
         mesh = _load_asset(self._select_option(values)).mesh
@@ -314,7 +314,7 @@ class OcclusionControl(Control):
         # vertices of the turned occluder, centered on the origin, largest extent 1
         points = mesh.vertices.astype(np.float64) @ turn.T
         size, distance = _fit_occluder(
-            points, requested["size"], requested_distance, view.near
+            points, requested["size"], requested_distance, view.nearest_distance
         )
         cover = silhouettes.rasterise_silhouette(
             _to_facing_camera(points, size, distance), mesh.faces
@@ -387,11 +387,11 @@ class _ObjectView:
     # (M, 3) directions spread over the full image
     directions_of_image: assets.Float64Array
     rim: assets.Float64Array  # (K, 3) those at its edge
-    near: float  # distance of its nearest vertex from the camera
-    far: float  # distance of the middle of its bounding box
+    nearest_distance: float  # distance of its nearest vertex from the camera
+    center_distance: float  # distance of the middle of its bounding box
 
     @staticmethod
-    def of(
+    def from_scene(
         scene: SceneDescription, earlier_inputs: Mapping[str, Tensor]
     ) -> _ObjectView:
         """Compute how the camera sees a scene's object, without derivatives.
@@ -454,7 +454,9 @@ def _image_frame(
     scene_fov = np.array([scene.get_number("camera.fov")])
     fov = float(_input_or(earlier_inputs, "camera.fov", scene_fov)[0])
     shift = _input_or(earlier_inputs, "camera.shift", np.zeros(2))
-    return geometry.Frame.of(fov, scene.aspect, (float(shift[0]), float(shift[1])))
+    return geometry.Frame.from_fov(
+        fov, scene.aspect, (float(shift[0]), float(shift[1]))
+    )
 
 
 def _directions_through_lens(

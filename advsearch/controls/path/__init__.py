@@ -207,7 +207,7 @@ class PathControl(Control):
             "seconds",
             DEFAULT_SECONDS,
             "How long it takes; a file says so itself, but for KITTI's poses.",
-            most=MAX_SECONDS,
+            max_value=MAX_SECONDS,
         ),
         Choice(
             "reach",
@@ -215,14 +215,14 @@ class PathControl(Control):
             "How far it goes, in distances of the scene's own camera: where "
             "approach begins, half of what pass "
             "takes.",
-            most=1000.0,
+            max_value=1000.0,
         ),
         Choice(
             "shutter",
             None,
             "Seconds that each row is exposed: motion blur.",
             "shutter",
-            most=60.0,
+            max_value=60.0,
         ),
         Choice(
             "rolling",
@@ -230,7 +230,7 @@ class PathControl(Control):
             "Seconds in which the rows are read, one after the "
             "other; below 0 from the bottom.",
             "rolling",
-            most=60.0,
+            max_value=60.0,
             signed=True,
         ),
         Choice(
@@ -715,7 +715,7 @@ class PathControl(Control):
             inputs["object.to_world"] = make_object_pose(start, shift, heading)
         return inputs
 
-    def measured(
+    def compute_measurements(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
         """Return the distance of the camera from the object."""

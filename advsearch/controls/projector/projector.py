@@ -173,14 +173,14 @@ class ProjectorControl(PictureControl):
         ),
     )
     choices: ClassVar[tuple[Choice, ...]] = (
-        Choice("resolution", 64, "Rows of texels.", whole=(2, 512)),
-        Choice("aspect", 1.0, "Width of the picture over its height.", most=4.0),
+        Choice("resolution", 64, "Rows of texels.", integer_bounds=(2, 512)),
+        Choice("aspect", 1.0, "Width of the picture over its height.", max_value=4.0),
         Choice(
             "fov",
             None,
             "Angle of the picture's width, degrees; by default it just "
             "covers the object.",
-            most=150.0,
+            max_value=150.0,
         ),
         Choice(
             "start",
@@ -202,7 +202,7 @@ class ProjectorControl(PictureControl):
             "Radius of that ball, display-referred; by default "
             "every picture is inside.",
             "epsilon",
-            most=PictureControl.MAX_EPSILON,
+            max_value=PictureControl.MAX_EPSILON,
         ),
         Choice(
             "picture",
@@ -478,7 +478,7 @@ class ProjectorControl(PictureControl):
         """Return the illuminance () of white as a multiple of the ambient light's."""
         return self._lux(values) / values["ambient"]
 
-    def measured(
+    def compute_measurements(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
         """Return how bright white is, and the mean of the pattern."""
@@ -494,7 +494,7 @@ class ProjectorControl(PictureControl):
             ),
         }
 
-    def kept_pictures(
+    def make_artifact_images(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the pattern, and the pattern enlarged for printing."""

@@ -51,7 +51,7 @@ class SpotControl(ProjectorControl):
     """The spot of a torch or a laser on the object."""
 
     kind = "spot"
-    amount = "lumens"
+    strength_parameter = "lumens"
     parameters = (
         _lit(
             "x",
@@ -102,14 +102,14 @@ class SpotControl(ProjectorControl):
             "resolution",
             64,
             "Rows of texels of the picture that it is made of.",
-            whole=(2, 512),
+            integer_bounds=(2, 512),
         ),
         Choice(
             "fov",
             None,
             "Angle in which it may fall, degrees; by default it just "
             "covers the object.",
-            most=150.0,
+            max_value=150.0,
         ),
     )
 
@@ -130,10 +130,10 @@ class SpotControl(ProjectorControl):
     ) -> dict[str, Value]:
         return Control.describe(self, u, earlier_inputs)
 
-    def kept_pictures(
+    def make_artifact_images(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        return Control.kept_pictures(self, values, earlier_inputs)
+        return Control.make_artifact_images(self, values, earlier_inputs)
 
     def check_choices(self) -> None:
         self.chosen = {"aspect": 1.0, "picture": None, **self.chosen}
@@ -189,7 +189,7 @@ class SpotControl(ProjectorControl):
         spot = torch.exp(-0.5 * squared_distance / std**2) * image_area / integral
         return spot[..., None] * color.combine_channels(values)
 
-    def measured(
+    def compute_measurements(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
         """Return how bright the brightest point of the spot is."""

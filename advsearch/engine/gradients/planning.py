@@ -159,7 +159,9 @@ def choose_estimators(
         best = min(scores, key=lambda name: scores[name])
         reason = _explain_scores(scores, best, bench.spp, count_renders)
         group_by_name = {
-            group.name: replace(group, estimator=best, reason=reason, measured=scores)
+            group.name: replace(
+                group, estimator=best, reason=reason, estimator_costs=scores
+            )
             for group in groups
         }
         plan = replace(

@@ -167,8 +167,8 @@ def make_ambient_parts(summary: AttackSummary) -> list[ResultPart]:
     if light is None:
         return []
     limit = "also in direct sun"
-    if light.ends_at is not None:
-        limit = f"no longer at {light.ends_at:.3g} lux"
+    if light.limit_lux is not None:
+        limit = f"no longer at {light.limit_lux:.3g} lux"
     factor = light.holds_to / light.lux
     text = (
         f"Works up to {light.holds_to:.3g} lux, {factor:.3g} times the light that is "
@@ -196,11 +196,11 @@ def make_ambient_parts(summary: AttackSummary) -> list[ResultPart]:
 
 def failures_text(failures: DifferentFailures) -> str:
     """Return where different failures were found, and how many hold."""
-    where = f"{failures.found} of {words.format_count(failures.seen, 'draw')}"
-    if failures.places is not None:  # the space was divided into cells
+    where = f"{failures.found} of {words.format_count(failures.examined, 'draw')}"
+    if failures.cells is not None:  # the space was divided into cells
         where = (
-            f"{failures.found} of {failures.places} cells over "
-            f"{' and '.join(failures.over)} ({failures.seen} were seen)"
+            f"{failures.found} of {failures.cells} cells over "
+            f"{' and '.join(failures.over)} ({failures.examined} were seen)"
         )
     if failures.share is not None:
         where += (
@@ -213,7 +213,7 @@ def failures_text(failures: DifferentFailures) -> str:
     if not failures.tried:
         return f"claimed in {where}; none of these was tried with fresh renders"
     return (
-        f"claimed in {where}; with fresh renders {failures.held} of the "
+        f"claimed in {where}; with fresh renders {failures.verified} of the "
         f"{failures.tried} "
         "that were tried hold"
     )

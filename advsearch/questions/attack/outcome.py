@@ -256,7 +256,7 @@ def _summarize(
         label_set=list(task.truth_names(problem.find_truth())),
         goal=task.goal,
         target=list(task.target_names) or None,
-        image_formation=Formation.of(problem.renderer.formation),
+        image_formation=Formation.from_values(problem.renderer.formation),
         gradient_plan=problem.summarize_plan(problem.plan),
         light_path_segments=PathSegments(
             search=problem.search_depth or max_depth, verification=max_depth
@@ -311,12 +311,12 @@ def _summarize_verification(problem: Problem, findings: RunState) -> dict[str, A
         "verified": _make_rate(verification),
         "tried_objective": TriedObjective(
             clean=_compute_objective_values(findings.clean_trials),
-            answer=_compute_objective_values(adversarial_trials),
+            adversarial=_compute_objective_values(adversarial_trials),
         ),
         "baseline": _summarize_baseline(problem, findings),
         "answer_from": None if outdone is None else "random",
         "policy_verified": _make_rate(outdone),
-        "sample_count": samples and VerificationSamples.of(samples),
+        "sample_count": samples and VerificationSamples.from_values(samples),
     }
 
 
@@ -398,7 +398,9 @@ def _make_clean_prediction(
     return CleanPrediction(
         **vars(_make_prediction(picture.judgement, picture.trial)),
         correct=picture.judgement.right,
-        moved=[MovedValue.of(value) for value in problem.space.adjusted_defaults],
+        moved=[
+            MovedValue.from_values(value) for value in problem.space.adjusted_defaults
+        ],
         control=control,
     )
 
@@ -437,7 +439,7 @@ def _summarize_ambient(findings: RunState) -> AmbientLight | None:
     return AmbientLight(
         lux=points[0].lux,
         holds_to=points[n_holding - 1].lux,
-        ends_at=points[n_holding].lux if n_holding < len(points) else None,
+        limit_lux=points[n_holding].lux if n_holding < len(points) else None,
         points=points,
     )
 
@@ -540,7 +542,10 @@ def _summarize_distribution(
         return None
     mean_values = problem.describe(problem.domain.project(distribution.mean))
     return SearchDistribution(
-        mean={name: DescribedValue.of(value) for name, value in mean_values.items()},
+        mean={
+            name: DescribedValue.from_values(value)
+            for name, value in mean_values.items()
+        },
         deviation=distribution.deviation.tolist(),
     )
 
@@ -606,7 +611,9 @@ def _summarize_printability(problem: Problem, findings: RunState) -> Printabilit
             terms=unprinted_terms,
         )
     clean = measure_print_terms(problem.searched_space, problem.domain.start)
-    return Printability(clean=clean, answer=measure_terms(findings.search), cost=cost)
+    return Printability(
+        clean=clean, adversarial=measure_terms(findings.search), cost=cost
+    )
 
 
 def _describe_configuration(problem: Problem, u: Tensor) -> dict[str, FoundValue]:
@@ -867,11 +874,13 @@ def describe_failures(problem: Problem, findings: RunState) -> DifferentFailures
     return DifferentFailures(
         over=[problem.domain.names[column] for column in known.over],
         found=known.n_failures,
-        seen=known.n_visited,
-        places=known.n_cells,
-        share=known.failure_rate and FailingShare.of(known.failure_rate),
+        examined=known.n_visited,
+        cells=known.n_cells,
+        share=known.failure_rate and FailingShare.from_values(known.failure_rate),
         tried=n_verified,
-        held=sum(verification.ending is Ending.FOUND for verification in verifications),
+        verified=sum(
+            verification.ending is Ending.FOUND for verification in verifications
+        ),
         listed=listed,
     )
 
@@ -891,7 +900,7 @@ def _describe_failure(
         verification: verification of the failure; None if it was not tried.
     """
     configuration = {
-        name: DescribedValue.of(value)
+        name: DescribedValue.from_values(value)
         for name, value in problem.describe(failure.u).items()
     }
     ranges = _describe_failure_ranges(problem, failure)

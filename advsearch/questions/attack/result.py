@@ -645,7 +645,7 @@ def evaluate_drive(
         seconds=seconds,
         paths=[str(name) for name in paths],
         clean=right_counts["drive-clean"],
-        answer=right_counts.get("drive"),
+        adversarial=right_counts.get("drive"),
         spp=spp,
     )
 

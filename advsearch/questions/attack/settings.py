@@ -44,8 +44,8 @@ class AttackConfig(DerivativeConfig):
     command: ClassVar[str] = "attack"
     list_settings: ClassVar[tuple[str, ...]] = ("object", "epsilon", "model")
 
-    free: ClassVar[tuple[str, ...]] = (
-        *DerivativeConfig.free,
+    changeable_settings: ClassVar[tuple[str, ...]] = (
+        *DerivativeConfig.changeable_settings,
         "log",
         "workers",
         "cluster",

@@ -92,7 +92,7 @@ class TriedObjective(Fields):
     clean: ObjectiveValues | None = Field(
         description="of the clean scene; null where it was not tried"
     )
-    answer: ObjectiveValues | None = Field(
+    adversarial: ObjectiveValues | None = Field(
         description="of the adversarial scene; null where nothing was verified"
     )
 
@@ -109,7 +109,7 @@ class AlongDrive(Fields):
     clean: int = Field(
         description="frames of the clean scene in which the model is right"
     )
-    answer: int | None = Field(
+    adversarial: int | None = Field(
         description="likewise, with the adversarial one; null if nothing was searched"
     )
     spp: int = Field(description="samples a pixel")
@@ -191,13 +191,13 @@ class DifferentFailures(Fields):
         description="cells in which the search saw a success, or such "
         "draws: its own claim"
     )
-    seen: int = Field(description="cells, or draws, that it looked at")
-    places: int | None = Field(
+    examined: int = Field(description="cells, or draws, that it looked at")
+    cells: int | None = Field(
         description="cells that there are; null where there are none"
     )
     share: FailingShare | None = optional_field("null where it can't be told")
     tried: int = Field(description="failures that were tried with fresh seeds")
-    held: int = Field(description="of these, verified")
+    verified: int = Field(description="of these, verified")
     listed: list[DifferentFailure] = Field(
         description="the worst, then whichever is farthest from all before it"
     )
@@ -277,7 +277,7 @@ class Printability(Fields):
     """What `printable` was about, and what it cost."""
 
     clean: PrintTerms = Field(description="of the clean scene")
-    answer: PrintTerms | None = Field(
+    adversarial: PrintTerms | None = Field(
         description="of the adversarial scene; null if nothing was searched"
     )
     cost: PrintCost | None = optional_field(
@@ -301,7 +301,7 @@ class AmbientLight(Fields):
         description="lux, the most in which it was verified, as in "
         "all less that was tried"
     )
-    ends_at: float | None = Field(
+    limit_lux: float | None = Field(
         description="lux, the least in which it was not; null: it holds in direct sun"
     )
     points: list[AmbientPoint] = Field(
@@ -355,7 +355,7 @@ class AttackSummary(SceneResult):
     baseline: BaselineSearch | None = optional_field(
         "the random search; absent without `baseline`"
     )
-    answer_from: str | None = optional_field(
+    adversarial_from: str | None = optional_field(
         "`random` where the run's adversarial scene is the random search's"
     )
     policy_verified: VerifiedRate | None = optional_field(

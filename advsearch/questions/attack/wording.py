@@ -118,7 +118,7 @@ def _name_thing(summary: AttackSummary) -> str:
 
 def _random_search_remark(summary: AttackSummary, verified: VerifiedRate) -> str:
     """Return a remark on a found scene if the random search did as well; else empty."""
-    if summary.answer_from == "random":
+    if summary.adversarial_from == "random":
         return " Random search found it, and the policy nothing as bad."
     random_rate = summary.baseline.verified if summary.baseline else None
     if random_rate is None or verified.rate <= 0:
@@ -183,7 +183,7 @@ def _baseline_remark(summary: AttackSummary) -> str:
     # the policy's own, if the random search's configuration became the scene
     policy_rate = summary.policy_verified
     random_rate = summary.baseline.verified if summary.baseline else None
-    if summary.answer_from == "random" and policy_rate:
+    if summary.adversarial_from == "random" and policy_rate:
         return (
             "The random search beside it found a worse configuration than the policy "
             f"did ({policy_rate.successes} of {policy_rate.trials} with a margin of "
@@ -226,7 +226,7 @@ def objective_text(summary: AttackSummary) -> str:
     objective = summary.tried_objective
     if objective is None or summary.objective in words.SUCCESS_ABOVE_ZERO:
         return ""
-    arms = (("clean", objective.clean), ("adversarial", objective.answer))
+    arms = (("clean", objective.clean), ("adversarial", objective.adversarial))
     parts = [
         f"{name} {values.mean:.3g} (from {values.low:.3g} to {values.high:.3g})"
         for name, values in arms
@@ -241,8 +241,8 @@ def drive_text(summary: AttackSummary) -> str:
     if drive is None:
         return ""
     text = f"right in {drive.clean} of {drive.frames} frames of the clean scene"
-    if drive.answer is not None:
-        text += f", {drive.answer} of the adversarial one"
+    if drive.adversarial is not None:
+        text += f", {drive.adversarial} of the adversarial one"
     if len(drive.paths) > 1:
         text += f", {len(drive.paths)} paths"
     return text
@@ -555,11 +555,11 @@ def _printability_text(summary: AttackSummary) -> str:
         f"printable colours {terms.off_print:.3g}"
         for name, terms in (
             ("clean", printability.clean),
-            ("answer", printability.answer),
+            ("answer", printability.adversarial),
         )
         if terms is not None
     ]
-    unit = " (sRGB)" if printability.answer else ""
+    unit = " (sRGB)" if printability.adversarial else ""
     return "; ".join(texts) + unit
 
 
@@ -581,9 +581,9 @@ def transport_text(summary: AttackSummary) -> str:
         text = "every picture was rendered"
         return f"{text}: {transport.reason}" if transport.reason else text
     n_predicted = format_count(summary.renders.get("products"), "picture")
-    if transport.way == "crop":
+    if transport.method == "crop":
         parts = ["only the part of each picture was rendered that can change"]
-    elif transport.way == "surface light":
+    elif transport.method == "surface light":
         parts = [f"light on surfaces predicted {n_predicted}"]
     else:
         parts = [f"a matrix predicted {n_predicted}"]

@@ -33,7 +33,10 @@ class CheckConfig(DerivativeConfig):
     """The settings of `check`: gradients of a scene against differences."""
 
     command: ClassVar[str] = "check"
-    free: ClassVar[tuple[str, ...]] = (*DerivativeConfig.free, "seconds")
+    changeable_settings: ClassVar[tuple[str, ...]] = (
+        *DerivativeConfig.changeable_settings,
+        "seconds",
+    )
 
     clashes: ClassVar[tuple[settings.Clash, ...]] = (
         *DerivativeConfig.clashes,

@@ -51,7 +51,7 @@ class CompareConfig(SweepConfig):
     """
 
     command: ClassVar[str] = "compare"
-    without: ClassVar[tuple[str, ...]] = (
+    excluded_settings: ClassVar[tuple[str, ...]] = (
         "model",
         "adversarial_of",
         "surface",

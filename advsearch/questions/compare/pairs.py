@@ -73,7 +73,7 @@ def compare_sides(
         worse=worse,
         better=better,
         parts=parts,
-        shown=[],
+        discordant_pictures=[],
     )
 
 

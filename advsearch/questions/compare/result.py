@@ -19,7 +19,7 @@ class ComparedSide(results.CountedPredictions):
     run: str = Field(description="folder of the sweep that has its rows")
     object: str
     model: str
-    answer: str = Field(
+    adversarial_run: str = Field(
         default="",
         description="the run whose adversarial scene was swept; absent without",
     )
@@ -147,7 +147,7 @@ class ComparedPair(PairCounts):
     parts: list[PairPart] = Field(
         description="by the values of each parameter, cut as the sweep's tables are"
     )
-    shown: list[PairPicture] = Field(
+    discordant_pictures: list[PairPicture] = Field(
         description="pairs that one side alone gets right, the farthest apart first"
     )
 
@@ -445,7 +445,7 @@ def _pictures_of(name: str, pair: ComparedPair) -> Iterator[ResultPart]:
     lines: list[list[str]] = []
     lines_without_pictures: list[str] = []
     groups: list[list[views.Picture]] = []
-    for example in pair.shown:
+    for example in pair.discordant_pictures:
         if example.right != name:
             continue
         line = "; ".join([*_captions(example, pair), _values_text(example)])

@@ -29,12 +29,12 @@ class Clusters:
         members: indices of the failures of each, the most typical first; the largest
             cluster first.
         silhouette: the mean; None where all are one cluster.
-        apart: whether clusters of a cloud without any are less far apart.
+        are_separated: whether clusters of a cloud without any are less far apart.
     """
 
     members: tuple[tuple[int, ...], ...]
     silhouette: float | None
-    apart: bool
+    are_separated: bool
 
 
 def find_clusters(features: FloatArray, seed: int) -> Clusters:
@@ -57,7 +57,7 @@ def find_clusters(features: FloatArray, seed: int) -> Clusters:
     directions = features / np.maximum(lengths, 1e-12)  # not divided by 0
     if len(directions) < MIN_FAILURES:
         all_failures = tuple(range(len(directions)))
-        return Clusters((all_failures,), silhouette=None, apart=False)
+        return Clusters((all_failures,), silhouette=None, are_separated=False)
     decomposition = rules.import_library("sklearn.decomposition")
     n_components = min(N_COMPONENTS, *directions.shape)
     points = decomposition.PCA(n_components, random_state=0).fit_transform(directions)
@@ -71,8 +71,8 @@ def find_clusters(features: FloatArray, seed: int) -> Clusters:
     ]
     members.sort(key=len, reverse=True)
     if len(members) < 2:
-        return Clusters(tuple(members), silhouette=None, apart=False)
-    return Clusters(tuple(members), silhouette=silhouette, apart=is_apart)
+        return Clusters(tuple(members), silhouette=None, are_separated=False)
+    return Clusters(tuple(members), silhouette=silhouette, are_separated=is_apart)
 
 
 def _is_clearer_than_noise(seed: int, points: FloatArray, silhouette: float) -> bool:

@@ -63,7 +63,7 @@ def find_envelope(
     conditions = [condition.row for condition in box]
     is_held = counts.interval[0] >= accuracy
     return EnvelopeRow(
-        conditions=conditions, **vars(counts), accuracy=accuracy, held=is_held
+        conditions=conditions, **vars(counts), accuracy=accuracy, confirmed=is_held
     )
 
 

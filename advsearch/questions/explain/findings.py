@@ -57,7 +57,7 @@ def make_rejected_rule(
     return RejectedRule(
         **describe_rule(rule),
         chance=rule.p_value,
-        asked=rules.SIGNIFICANCE,
+        p_value_limit=rules.SIGNIFICANCE,
         rows=n_needed,
     )
 

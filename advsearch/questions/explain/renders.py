@@ -158,7 +158,7 @@ class Renders:
             return None
         elsewhere = rule.elsewhere.assign(unit=rule.elsewhere["unit"].astype(str))
         fresh_rule = rules.CountedRule(rule.conditions, fresh_rows, elsewhere)
-        return Confirmation(**vars(count_right(fresh_rows)), held=fresh_rule.holds)
+        return Confirmation(**vars(count_right(fresh_rows)), confirmed=fresh_rule.holds)
 
     def _render_inside(
         self,
@@ -302,8 +302,8 @@ class Renders:
             unit=self.table.attrs["units"][factor],
             wrong_at=wrong_value,
             right_at=values[nearest_row],
-            answered=frame_a["label"][failure_row],
-            answered_there=frame_a["label"][nearest_row],
+            failure_label=frame_a["label"][failure_row],
+            right_label=frame_a["label"][nearest_row],
             pictures=self._list_thumbnails(f"{run_name}-0", (failure_row, nearest_row)),
         )
 
@@ -404,7 +404,7 @@ class Renders:
             features=compute_features.source,
             failures=len(sampled),
             silhouette=clusters.silhouette,
-            apart=clusters.apart,
+            are_separated=clusters.are_separated,
             listed=described_clusters,
         )
 
@@ -460,7 +460,7 @@ class Renders:
         path = self.context.run.save_image(f"cluster-{number}", image)
         return FailureCluster(
             failures=len(rows),
-            answers=dict(Counter(rows["label"]).most_common()),
+            labels=dict(Counter(rows["label"]).most_common()),
             values=read_values(rows, rows.index[0]),
             picture=str(path.relative_to(self.context.run.path)),
         )

@@ -53,7 +53,7 @@ class RightCounts(results.Fields):
 class Confirmation(RightCounts):
     """Fresh renders inside a rule that no rule before it covers."""
 
-    held: bool = Field(
+    confirmed: bool = Field(
         default=False,
         description="whether they confirm it: they alone, beside the "
         "rows elsewhere, tell the rule",
@@ -83,7 +83,7 @@ class RejectedRule(RightCounts):
     chance: float = Field(
         description="how likely so few right predictions are by chance"
     )
-    asked: float = Field(description="how unlikely they would have to be")
+    p_value_limit: float = Field(description="how unlikely they would have to be")
     rows: int | None = Field(
         description="of so many rows, with these shares, it would "
         "be told; null where of none"
@@ -112,7 +112,7 @@ class EnvelopeRow(RightCounts):
         description="all of which hold; empty for everything that was looked at"
     )
     accuracy: float = Field(description="what was asked for")
-    held: bool = Field(
+    confirmed: bool = Field(
         description="whether the rows that did not choose the box show it"
     )
 
@@ -125,8 +125,8 @@ class NearestRight(results.Fields):
     unit: str
     wrong_at: str | float
     right_at: str | float
-    answered: str = Field(description="what the model says of the failure")
-    answered_there: str = Field(description="what it says of the other")
+    failure_label: str = Field(description="what the model says of the failure")
+    right_label: str = Field(description="what it says of the other")
     pictures: list[str] = Field(
         description="files in the run's folder: of the failure, and of the other"
     )
@@ -136,7 +136,7 @@ class FailureCluster(results.Fields):
     """Failures that look alike to the model."""
 
     failures: int = Field(description="how many of those that were rendered again")
-    answers: dict[str, int] = Field(
+    labels: dict[str, int] = Field(
         description="what the model says of them, and how often"
     )
     values: dict[str, str | float] = Field(description="of the most typical one")
@@ -151,7 +151,7 @@ class FailureClusters(results.Fields):
     silhouette: float | None = Field(
         description="how well they are apart, -1 to 1; null where all are one cluster"
     )
-    apart: bool = Field(
+    are_separated: bool = Field(
         description="whether they are farther apart than groups of a cloud without any"
     )
     listed: list[FailureCluster] = Field(description="the largest first")
@@ -176,7 +176,7 @@ class ExplainResult(RunResult, RightCounts):
     )
     parameters: list[str] = Field(description="what varies in all of the rows")
     rules: list[RuleRow]
-    not_told: RejectedRule | None = Field(
+    rejected_rule: RejectedRule | None = Field(
         default=None, description="the next rule, which is not told; absent without"
     )
     importance: list[ParameterWeight] = Field(
@@ -281,10 +281,10 @@ def _pair_section(pair: NearestRight) -> ResultPart:
     wrong_value = _format_value(pair.wrong_at)
     right_value = _format_value(pair.right_at)
     text = (
-        f"{pair.parameter} {wrong_value}{unit}: {pair.answered}; "
-        f"at {right_value}{unit}: {pair.answered_there}."
+        f"{pair.parameter} {wrong_value}{unit}: {pair.failure_label}; "
+        f"at {right_value}{unit}: {pair.right_label}."
     )
-    captions = (f"wrong: {pair.answered}", f"right: {pair.answered_there}")
+    captions = (f"wrong: {pair.failure_label}", f"right: {pair.right_label}")
     # There are no images if they could not be stored.
     pictures = [
         views.Picture(file, caption)
@@ -309,7 +309,7 @@ def describe_rule_row(number: int, rule: RuleRow) -> str:
     )
     if rule.confirmed is None:
         return text
-    verdict = "confirmed" if rule.confirmed.held else "not confirmed"
+    verdict = "confirmed" if rule.confirmed.confirmed else "not confirmed"
     return f"{text} Fresh renders inside it: right in {rule.confirmed.text}; {verdict}."
 
 
@@ -318,7 +318,7 @@ def list_rule_triggers(result: ExplainResult) -> Iterator[str]:
     for number, rule in enumerate(result.rules, start=1):
         state = "Counted on rows that did not choose it, not rendered"
         if rule.confirmed is not None:
-            state = "Confirmed" if rule.confirmed.held else "Not confirmed"
+            state = "Confirmed" if rule.confirmed.confirmed else "Not confirmed"
         yield f"{state}: {describe_rule_row(number, rule)}"
 
 
@@ -327,7 +327,7 @@ def describe_rejected_rule(result: ExplainResult) -> str:
 
     Empty if there is none.
     """
-    rule = result.not_told
+    rule = result.rejected_rule
     if rule is None:
         return ""
     text = (
@@ -342,7 +342,7 @@ def describe_rejected_rule(result: ExplainResult) -> str:
         return f"{text}, which is no difference that more rows would tell."
     chance = (
         f"chance does that with a probability of {rule.chance:.2g}, and at most "
-        f"{rule.asked:g} is asked"
+        f"{rule.p_value_limit:g} is asked"
     )
     return (
         f"{text}; {chance}. About {rule.rows:,} rows with these shares would tell "
@@ -356,7 +356,7 @@ def describe_envelope(result: ExplainResult) -> str:
     if box is None:
         return "No box of enough rows promises the accuracy that was asked for."
     where = wording.format_conditions(box.conditions)
-    if not box.held:
+    if not box.confirmed:
         return (
             f"Not shown: inside {where} the rows that did not choose it are right "
             f"in {box.text}."
@@ -389,7 +389,7 @@ def _cluster_section(clusters: FailureClusters) -> ResultPart:
     text = f"One kind: {failures} are alike by {clusters.features}."
     if clusters.silhouette is not None:
         reservation = ""
-        if not clusters.apart:
+        if not clusters.are_separated:
             reservation = (
                 "; they shade into one another: groups of any cloud may be as far apart"
             )
@@ -399,7 +399,7 @@ def _cluster_section(clusters: FailureClusters) -> ResultPart:
         )
     pictures = []
     for cluster in clusters.listed:
-        common_labels = list(cluster.answers.items())[:MAX_LABELS]
+        common_labels = list(cluster.labels.items())[:MAX_LABELS]
         labels = ", ".join(f"{label} {count}" for label, count in common_labels)
         pictures.append(views.Picture(cluster.picture, f"{cluster.failures}: {labels}"))
     return ResultPart("Kinds of failures", [text], pictures=[pictures])
@@ -412,7 +412,7 @@ def make_explain_claims(result: ExplainResult) -> Iterator[views.Claim]:
     for number, rule in enumerate(result.rules, 1):
         yield _make_rule_claim(number, rule)
     box = result.envelope
-    if box is not None and box.held and box.total:
+    if box is not None and box.confirmed and box.total:
         yield _make_envelope_claim(box)
     elif not result.rules:
         reason = "no box of values was shown to keep the accuracy that was asked for"

@@ -503,7 +503,7 @@ class Hardening:
                 for measurement in MEASUREMENTS
             }
             if None not in shares.values():
-                rows.append(HardenedControl.of({"control": control, **shares}))
+                rows.append(HardenedControl.from_values({"control": control, **shares}))
         return rows
 
     def _make_split_rows(self) -> dict[str, SplitSide]:

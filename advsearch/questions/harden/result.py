@@ -61,7 +61,7 @@ class HardenConfig(AttackConfig):
     # fmt: off
     command: ClassVar[str] = "harden"
     list_settings: ClassVar[tuple[str, ...]] = ("object", "environment")
-    without: ClassVar[tuple[str, ...]] = (
+    excluded_settings: ClassVar[tuple[str, ...]] = (
         "smallest", "ensemble", "printable", "aov", "metrics", "log", "target",
         "minimise", "over", "draws", "path", "shutter", "rolling", "average",
         "baseline", "seconds", "camera", "up", "facing", "size", "unit", "label",
@@ -193,7 +193,7 @@ class TrainingRound(results.Fields):
     robust: float = Field(
         description="share of the worst pictures, searched for against these weights"
     )
-    kept: bool = Field(description="whether its weights are the result")
+    is_selected: bool = Field(description="whether its weights are the result")
 
 
 class SplitSide(results.Fields):
@@ -461,6 +461,6 @@ def make_harden_claims(result: HardenResult) -> Iterator[views.Claim]:
                 f"{wording.format_interval(share.interval)}) held-out "
                 "scenes. This does not show that there is none."
             )
-            yield views.Claim.of(
+            yield views.Claim.from_values(
                 {"kind": "measured", "statement": text, "extent": extent}
             )

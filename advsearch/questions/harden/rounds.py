@@ -291,7 +291,7 @@ class Rounds:
         self.config = trainer.config
         self.progress = trainer.work.progress
         self.results = [
-            TrainingRound.of(fields)
+            TrainingRound.from_values(fields)
             for fields in json.loads(run.store.read_note(ROUNDS_NOTE) or "[]")
         ]
 
@@ -473,7 +473,7 @@ class Rounds:
                 part=interpolation,
                 clean=score.clean,
                 robust=score.robust,
-                kept=False,
+                is_selected=False,
             )
         )
         stored_results = [

@@ -127,7 +127,7 @@ def _make_result(
         loss=config.loss,
         spp=problem.spp,
         goal=config.error,
-        image_formation=results.Formation.of(problem.renderer.formation),
+        image_formation=results.Formation.from_values(problem.renderer.formation),
         machine=Machine(**context.machine, threads=count_threads()),
         points=points,
         slopes=slopes,
@@ -278,7 +278,7 @@ class QuantityMeasurer:
             )
             budget = TimeBudget(seconds_left * planned.fraction / fraction_left)
             sitting = read_or_measure(planned.name, partial(planned.measure, budget))
-            seconds_left = max(0.0, seconds_left - sitting.took)
+            seconds_left = max(0.0, seconds_left - sitting.seconds)
             yield sitting
 
     def round_up(self, point: PrecisionPoint, samples: float) -> int:
@@ -431,7 +431,7 @@ class QuantityMeasurer:
             points=_summarize_settings(bench, measured),
             references=references,
             left_out=_describe_skipped(title, measured),
-            took=time.perf_counter() - start_time,
+            seconds=time.perf_counter() - start_time,
         )
 
     def _begin_stage(self, name: str, budget: TimeBudget) -> Callable[..., None]:

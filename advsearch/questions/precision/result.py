@@ -207,12 +207,12 @@ class Sitting(results.Fields):
 
     points: list[PrecisionPoint] = Field(default=[])
     references: list[PrecisionReference] = Field(default=[])
-    again: list[PrecisionPoint] = Field(
+    confirmations: list[PrecisionPoint] = Field(
         default=[], description="recommended settings, measured anew"
     )
     warnings: list[str] = Field(default=[])
     left_out: list[str] = Field(default=[])
-    took: float = Field(default=0.0, description="seconds by the clock")
+    seconds: float = Field(default=0.0, description="seconds by the clock")
 
 
 class Machine(results.Fields):

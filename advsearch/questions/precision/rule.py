@@ -214,7 +214,7 @@ def summarize_samples(
     for name in ("seconds", "wall_seconds"):
         if name in samples[0]:
             fields[name] = median_time([numbers[name] for numbers in samples])
-    return PrecisionPoint.of({**vars(setting), **fields})
+    return PrecisionPoint.from_values({**vars(setting), **fields})
 
 
 def _average_cosine(samples: Sequence[Numbers]) -> float | None:

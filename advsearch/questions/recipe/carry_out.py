@@ -608,7 +608,7 @@ def _write_figures(
             number += 1
             for suffix, data in draw_files(figure).items():
                 recipe_run.write_file(f"images/figure-{number}.{suffix}", data)
-            yield RecipeFigure.of({"figure": kind, **vars(figure)})
+            yield RecipeFigure.from_values({"figure": kind, **vars(figure)})
 
 
 def _read_frame(

@@ -40,7 +40,10 @@ class RecipeConfig(Config):
     """
 
     command: ClassVar[str] = "recipe"
-    free: ClassVar[tuple[str, ...]] = (*Config.free, "photographs")
+    changeable_settings: ClassVar[tuple[str, ...]] = (
+        *Config.changeable_settings,
+        "photographs",
+    )
     clashes: ClassVar[tuple[settings.Clash, ...]] = SceneConfig.clashes
 
     # fmt: off

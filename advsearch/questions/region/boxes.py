@@ -36,7 +36,7 @@ class GrownBox:
     Attributes:
         center: the point that it grew around (d,).
         low, high: its corners (d,).
-        same: how many of the final samples had the center's prediction.
+        n_same: how many of the final samples had the center's prediction.
         samples: the final samples.
         renders: images in all.
     """
@@ -44,7 +44,7 @@ class GrownBox:
     center: Tensor
     low: Tensor
     high: Tensor
-    same: int
+    n_same: int
     samples: int
     renders: int
 
@@ -56,7 +56,7 @@ class GrownBox:
         (Bonferroni).
         """
         return statistics.intervals.clopper_pearson(
-            self.same, self.samples, 1.0 - 0.05 / ATTEMPTS
+            self.n_same, self.samples, 1.0 - 0.05 / ATTEMPTS
         )
 
     @property
@@ -121,7 +121,7 @@ def grow_box(
         center=center,
         low=box.low,
         high=box.high,
-        same=samples - n_exceptions,
+        n_same=samples - n_exceptions,
         samples=samples,
         renders=box.n_evaluated,
     )

@@ -260,9 +260,9 @@ class RegionSearch:
         return GrownRegion(
             verdict="wrong" if self._is_wrong_at_center else "right",
             box=sides,
-            same=grown.same,
+            n_same=grown.n_same,
             samples=grown.samples,
-            rate=grown.same / grown.samples,
+            rate=grown.n_same / grown.samples,
             interval=grown.interval,
             volume=grown.volume,
             spp=verifier.state.spp,

@@ -31,7 +31,7 @@ class RegionConfig(SceneConfig):
     """
 
     command: ClassVar[str] = "region"
-    without: ClassVar[tuple[str, ...]] = ("spp",)
+    excluded_settings: ClassVar[tuple[str, ...]] = ("spp",)
 
     around: str | None = setting(
         None,
@@ -110,7 +110,7 @@ class GrownRegion(results.Fields):
     box: list[BoxSide] | None = Field(
         default=None, description="for each parameter, the range of its values"
     )
-    same: int | None = Field(
+    n_same: int | None = Field(
         default=None, description="fresh samples of the box that had that verdict"
     )
     samples: int | None = Field(default=None, description="all fresh samples of it")
@@ -150,7 +150,7 @@ class RegionResult(views.InNotebook, GrownRegion, results.SceneResult):
     def brief(self) -> str:
         """The result in a few words."""
         return (
-            f"{self.verdict} in {self.same} of {self.samples} samples of the box"
+            f"{self.verdict} in {self.n_same} of {self.samples} samples of the box"
             if self.samples
             else ""
         )
@@ -168,7 +168,7 @@ def make_region_view(result: RegionResult) -> ShownResult:
         "unit": "{0.unit}",
     }
     return ShownResult(
-        f"The model is {result.verdict} in {result.same} of {result.samples} fresh "
+        f"The model is {result.verdict} in {result.n_same} of {result.samples} fresh "
         "samples of this box: with 95 % "
         f"confidence in at least {wording.percent(result.interval[0])} of it.",
         [ResultPart.make_table(result.box, box, title="The box")],
@@ -184,7 +184,7 @@ def make_region_claims(result: RegionResult) -> Iterator[views.Claim]:
     # An interrupted run has no box.
     if (
         not result.samples
-        or result.same is None
+        or result.n_same is None
         or result.interval is None
         or result.verdict is None
     ):
@@ -192,7 +192,7 @@ def make_region_claims(result: RegionResult) -> Iterator[views.Claim]:
     description = f"samples that are {result.verdict}"
     extent = results.Extent.from_count(
         description,
-        result.same,
+        result.n_same,
         result.samples,
         result.interval,
         counts_right=result.verdict == "right",

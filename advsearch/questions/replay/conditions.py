@@ -631,7 +631,7 @@ class _Table:
         """Add rows of conditions that were not rendered, with the reason."""
         for condition in conditions:
             self.rows[condition] = ReplayRow(
-                way=condition.name,
+                change=condition.name,
                 condition=condition.description,
                 ending=NOT_DONE,
                 reason=reason,
@@ -695,7 +695,7 @@ class _Table:
             # "answer" is the kind of the stored rows
             verification = retrials.try_adversarial("answer", self.u, retrial)
             self.rows[condition] = ReplayRow(
-                way=condition.name,
+                change=condition.name,
                 condition=condition.description,
                 ending=verification.ending.value,
                 clean=clean_results[condition],

@@ -131,7 +131,7 @@ CLEAN_IS_WRONG = "already wrong"
 class ReplayRow(results.Fields):
     """Trials of the clean and of the adversarial scene under one condition."""
 
-    way: str = Field(description="what is changed; `as verified` where nothing is")
+    change: str = Field(description="what is changed; `as verified` where nothing is")
     condition: str = Field(description="to what")
     ending: str = Field(
         description="`found` where the adversarial scene holds under it, as for an "
@@ -175,8 +175,8 @@ class ReplayResult(views.InNotebook, results.SceneResult):
 
     command: ClassVar[str] = "replay"
 
-    answer: str = Field(description="the run whose adversarial scene it is")
-    answered: str = Field(description="how that run ended")
+    adversarial_run: str = Field(description="the run whose adversarial scene it is")
+    run_ending: str = Field(description="how that run ended")
     table: list[ReplayRow]
     transfer: PhotographTransfer | None = Field(
         None,
@@ -241,7 +241,7 @@ def count_transfer(
         method: which rows count: `PHOTOGRAPH` for photographs that the attack did not
             use, `SEARCHED_PHOTOGRAPH` for those that it used.
     """
-    rows = [row for row in table if row.way == method and row.ending != NOT_DONE]
+    rows = [row for row in table if row.change == method and row.ending != NOT_DONE]
     if not rows:
         return None
     n_clean_right = sum(row.ending != CLEAN_IS_WRONG for row in rows)
@@ -287,21 +287,21 @@ def make_replay_view(result: ReplayResult) -> ShownResult:
         note=TRIALS_NOTE,
     )
     about = [
-        f"{PurePath(result.answer).name} ({result.answered})",
+        f"{PurePath(result.adversarial_run).name} ({result.run_ending})",
         result.object,
         ", ".join(result.controls),
     ]
-    facts = {"attack": result.answer, "model": result.model}
+    facts = {"attack": result.adversarial_run, "model": result.model}
     return ShownResult(summarize_replay(result), [table], facts, about)
 
 
 def make_cells(row: ReplayRow) -> list[str]:
     """Return the cells of a condition under `HEADS`."""
-    condition = "" if row.way == row.condition else row.condition
+    condition = "" if row.change == row.condition else row.condition
     if row.clean is None or row.verified is None:
-        return [row.way, condition, "", "", "", "", f"{NOT_DONE}: {row.reason}"]
+        return [row.change, condition, "", "", "", "", f"{NOT_DONE}: {row.reason}"]
     return [
-        row.way,
+        row.change,
         condition,
         *wording.format_rate_cells(row.clean),
         *wording.format_rate_cells(row.verified),
@@ -311,10 +311,10 @@ def make_cells(row: ReplayRow) -> list[str]:
 
 def make_replay_claims(result: ReplayResult) -> Iterator[views.Claim]:
     """Yield a claim for each condition, and one over the photographs."""
-    run_name = PurePath(result.answer).name
+    run_name = PurePath(result.adversarial_run).name
     for row in result.table:
-        name = f"the adversarial scene of {run_name}, {row.way}"
-        if row.way != row.condition:
+        name = f"the adversarial scene of {run_name}, {row.change}"
+        if row.change != row.condition:
             name += f": {row.condition}"
         yield views.Claim.from_case(name, row.ending, row.verified)
     transfer = result.transfer
@@ -340,7 +340,8 @@ def summarize_replay(result: ReplayResult) -> str:
     changed = [
         row
         for row in other_rows
-        if row.ending != NOT_DONE and row.way not in (PHOTOGRAPH, SEARCHED_PHOTOGRAPH)
+        if row.ending != NOT_DONE
+        and row.change not in (PHOTOGRAPH, SEARCHED_PHOTOGRAPH)
     ]
     text = f"As verified, the adversarial scene {_describe_unchanged(unchanged)}"
     has_photographs = result.transfer is not None or result.searched is not None
@@ -356,7 +357,7 @@ def summarize_replay(result: ReplayResult) -> str:
         text += f" {describe_transfer(result.searched, 'searched')}"
     clean_wrong = [row for row in changed if row.ending == CLEAN_IS_WRONG]
     if clean_wrong:
-        names = ", ".join(f"{row.way}: {row.condition}" for row in clean_wrong)
+        names = ", ".join(f"{row.change}: {row.condition}" for row in clean_wrong)
         text += f" The clean scene itself fails under {names}, where it says nothing."
     return text
 

@@ -701,7 +701,7 @@ def describe_run(
         claims=list(claims),
         about=_describe_subject(result, recorded),
         searched=describe_searched(result, run_settings),
-        measured=_describe_measurement(result, run_settings, recorded),
+        method=_describe_measurement(result, run_settings, recorded),
         excluded=_describe_excluded(result, claims),
         settings=setting_texts,
         cost={
@@ -1237,7 +1237,7 @@ def _make_unfinished_run(folder: Path) -> EvidenceRun:
         claims=[claim],
         about={name: text for name, text in subject.items() if text},
         searched=[],
-        measured={},
+        method={},
         excluded=[NO_CLAIM],
         cost={},
         made_with=collect_versions(folder, []) or {"versions and files": NOT_NOTED},

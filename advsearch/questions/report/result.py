@@ -31,7 +31,7 @@ class EvidenceRun(results.Fields):
     command: str
     ending: str
     claims: list[views.Claim]
-    begun: str = Field(
+    started: str = Field(
         "", description="when the run was begun, UTC; empty where that is not known"
     )
     criterion: list[str] = Field(
@@ -60,13 +60,15 @@ class EvidenceRun(results.Fields):
     domain: dict[str, str] = Field(
         {}, description="the operational design domain in words, by its parts"
     )
-    not_shown: list[str] = Field([], description="what a reader must not take from it")
+    limitations: list[str] = Field(
+        [], description="what a reader must not take from it"
+    )
     pictures: list[str] = Field([], description="files beside this one")
     about: dict[str, str] = Field(
         description="object, environment, model, task and what counts as right"
     )
     searched: list[str] = Field(description="what could change, and how far")
-    measured: dict[str, str] = Field(
+    method: dict[str, str] = Field(
         description="policy, seed, samples and the like, by name"
     )
     settings: dict[str, str] = Field(
@@ -178,8 +180,8 @@ def make_sections(run: EvidenceRun) -> dict[str, list[str]]:
         return [f"{name}: {text}" for name, text in texts.items()]
 
     versions = list_named(run.made_with)
-    if run.begun:
-        versions.insert(0, f"begun: {run.begun}")
+    if run.started:
+        versions.insert(0, f"begun: {run.started}")
     twins = [] if run.twins is None else [wording.format_twin_evidence(run.twins)]
     lines_of_title = {
         "Photographs": twins,
@@ -187,10 +189,10 @@ def make_sections(run: EvidenceRun) -> dict[str, list[str]]:
         "Triggering conditions": run.triggering,
         "Exposure": run.exposure,
         "Operational design domain": list_named(run.domain),
-        "Not shown": run.not_shown,
+        "Not shown": run.limitations,
         "On what": list_named(run.about),
         "What varied": run.searched,
-        "Measured how": list_named({"ended as": run.ending, **run.measured}),
+        "Measured how": list_named({"ended as": run.ending, **run.method}),
         "Settings": list_named(run.settings),
         "Excluded, and to be known": run.excluded,
         "Budget": list_named(run.cost),

@@ -32,7 +32,10 @@ class StabilityConfig(Config):
     """
 
     command: ClassVar[str] = "stability"
-    free: ClassVar[tuple[str, ...]] = (*Config.free, "seconds")
+    changeable_settings: ClassVar[tuple[str, ...]] = (
+        *Config.changeable_settings,
+        "seconds",
+    )
     clashes: ClassVar[tuple[settings.Clash, ...]] = tuple(
         clash for clash in SceneConfig.clashes if clash.setting == "overwrite"
     )
@@ -89,8 +92,8 @@ class Check(results.Fields):
 
     what: str
     value: results.JsonFloat
-    least: float | None
-    most: float | None
+    min_value: float | None
+    max_value: float | None
     ok: bool
 
     def __str__(self) -> str:
@@ -98,13 +101,13 @@ class Check(results.Fields):
         1)``.
         """
         bounds = []
-        if self.least is not None:
-            bounds.append(f"at least {self.least:.4g}")
-        if self.most is not None:
-            bounds.append(f"at most {self.most:.4g}")
+        if self.min_value is not None:
+            bounds.append(f"at least {self.min_value:.4g}")
+        if self.max_value is not None:
+            bounds.append(f"at most {self.max_value:.4g}")
         expected = " and ".join(bounds)
-        if len(bounds) == 2 and self.least == self.most:
-            expected = f"exactly {self.most:.4g}"
+        if len(bounds) == 2 and self.min_value == self.max_value:
+            expected = f"exactly {self.max_value:.4g}"
         text = f"{self.what}: {self.value:.4g}"
         return f"{text} (expected {expected})" if expected else text
 
@@ -124,7 +127,7 @@ def check_range(
         ok = ok and least <= value
     if most is not None:
         ok = ok and value <= most
-    return Check(what=what, value=value, least=least, most=most, ok=ok)
+    return Check(what=what, value=value, min_value=least, max_value=most, ok=ok)
 
 
 def check_condition(what: str, truth: bool) -> Check:
@@ -155,7 +158,7 @@ class CaseRow(results.Fields):
         description="of the case's search; `refused` where its input was"
     )
     checks: list[Check]
-    measured: dict[str, results.JsonFloat] = Field(
+    measurements: dict[str, results.JsonFloat] = Field(
         description="further numbers, such as condition numbers and biases"
     )
     seconds: float = Field(description="what the case took")
@@ -197,7 +200,7 @@ def make_view(result: StabilityResult) -> ShownResult:
     """Lay out a result: cases, condition numbers, and those that fell short."""
     condition_numbers = []
     for row in result.rows:
-        for name, value in row.measured.items():
+        for name, value in row.measurements.items():
             if name.startswith("condition number"):
                 condition_numbers.append([f"{row.case}: {name}", f"{value:.3g}"])
     n_rows = len(result.rows)
@@ -230,14 +233,14 @@ class CaseOutcome:
             one.
         ending: status of the case's search, "refused" if its input was rejected, or
             empty.
-        measured: further numbers to report.
+        measurements: further numbers to report.
     """
 
     checks: Sequence[Check]
     finite: bool = True
     relative_error: float | None = None
     ending: str = ""
-    measured: Mapping[str, float] = field(default_factory=dict)
+    measurements: Mapping[str, float] = field(default_factory=dict)
 
     def with_checks(self, *more: Check, **known: Any) -> CaseOutcome:
         """Return the outcome with more checks, and changed fields."""
@@ -299,7 +302,7 @@ class Case:
             "decides": decisive,
             "seconds": time.perf_counter() - start,
         }
-        return CaseRow.of({**vars(self), **vars(outcome), **fields})
+        return CaseRow.from_values({**vars(self), **vars(outcome), **fields})
 
 
 # every case, in the order in which they run

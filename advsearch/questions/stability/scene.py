@@ -240,7 +240,7 @@ def check_scene(
         finite=is_finite and renderer.non_finite == 0,
         relative_error=relative_error,
         ending=result.ending.value,
-        measured=measured,
+        measurements=measured,
     )
 
 

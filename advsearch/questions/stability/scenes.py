@@ -237,7 +237,7 @@ def leave_plateau(low: float, high: float) -> CaseOutcome:
     return CaseOutcome(
         [start_check, *checks],
         ending=", ".join(endings),
-        measured={"evaluations without a gradient": float(n_flat)},
+        measurements={"evaluations without a gradient": float(n_flat)},
     )
 
 

@@ -1081,7 +1081,7 @@ def _is_described_by_base(control: Control) -> bool:
     control_type = type(control)
     return (
         control_type.describe == Control.describe
-        and control_type.measured == Control.measured
+        and control_type.compute_measurements == Control.compute_measurements
     )
 
 

@@ -334,9 +334,9 @@ def _text_sections(
         summary: summary of the sweep.
         axes: rows of each axis by its name, from `_group_axes`.
     """
-    if summary.beside is not None and summary.ending != INTERRUPTED:
-        for pair in summary.beside.pairs:
-            yield _arms_table(summary.beside.answer, pair, summary.task)
+    if summary.arms is not None and summary.ending != INTERRUPTED:
+        for pair in summary.arms.pairs:
+            yield _arms_table(summary.arms.adversarial_run, pair, summary.task)
     distance = find_detection_distance(summary)
     if distance:
         yield ResultPart(text=[distance_sentence(distance)])
@@ -348,7 +348,7 @@ def _text_sections(
     # The axis "answer" is the two scenes, clean and adversarial: `_arms_table` has it.
     if axes.keys() - {"answer"}:
         introduction = READING
-        if summary.beside:
+        if summary.arms:
             introduction = (
                 "Of the clean scene and the adversarial one together: "
                 f"{READING[0].lower()}{READING[1:]}"
@@ -371,7 +371,7 @@ def _arms_table(answer: str, pair: PairedRates, task: str) -> ResultPart:
         pair: counts of the model in both arms.
         task: name of the task.
     """
-    arms = (("clean", pair.clean), (answer, pair.answer))
+    arms = (("clean", pair.clean), (answer, pair.adversarial))
     has_outcomes = any(counts.outcomes for _, counts in arms)
     rows = []
     for name, counts in arms:
@@ -486,10 +486,10 @@ def _verdict(summary: SweepSummary) -> str:
             f"Interrupted after {summary.looked_at} of {summary.planned} "
             f"configurations: right in {summary.correct} ({rate}){outcomes}."
         )
-    if summary.beside and summary.beside.pairs:
+    if summary.arms and summary.arms.pairs:
         return " ".join(
-            format_paired_rates(summary.beside.answer, pair)
-            for pair in summary.beside.pairs
+            format_paired_rates(summary.arms.adversarial_run, pair)
+            for pair in summary.arms.pairs
         )
     configurations = format_count(summary.configurations, "configuration")
     return (
@@ -576,10 +576,10 @@ def make_sweep_claims(result: SweepSummary) -> Iterator[Claim]:
     if result.accuracy is None or result.ending != "finished":
         return
     population, note = _describe_population(result)
-    if result.beside:
-        for pair in result.beside.pairs:
-            yield from _arm_claims(result.beside.answer, pair, population, note)
-        if result.beside.pairs:
+    if result.arms:
+        for pair in result.arms.pairs:
+            yield from _arm_claims(result.arms.adversarial_run, pair, population, note)
+        if result.arms.pairs:
             return  # the other claims are about both scenes together
     yield from _accuracy_claims(result, population, note)
     distance = find_detection_distance(result)
@@ -662,7 +662,7 @@ def _arm_claims(
     """
     arms = {
         "the clean scene": pair.clean,
-        f"the adversarial scene of {answer}": pair.answer,
+        f"the adversarial scene of {answer}": pair.adversarial,
     }
     for arm, counts in arms.items():
         extent = _accuracy_extent(
@@ -753,7 +753,11 @@ def drive_title(rates: DriveRates) -> str:
         f"{format_count(rates.drives, 'drive')} of {rates.frames} frames in {rates.seconds:g} "
         f"s{repeats}, {rates.model}"
     )
-    return title if rates.answer is None else f"{title}, with {rates.answer}"
+    return (
+        title
+        if rates.adversarial_run is None
+        else f"{title}, with {rates.adversarial_run}"
+    )
 
 
 def drive_rows(drive_rates: DriveRates) -> list[tuple[str, str, str, str]]:
@@ -762,13 +766,13 @@ def drive_rows(drive_rates: DriveRates) -> list[tuple[str, str, str, str]]:
     A rate that is not known has no row; without an interval there is a dash.
     """
     tracks = drive_rates.tracks
-    never = f", never in {drive_rates.never_seen}" if drive_rates.never_seen else ""
+    never = f", never in {drive_rates.never_right}" if drive_rates.never_right else ""
     # tuples of a name, the values, their unit, and a remark after the mean
     rates: list[tuple[str, OverDrives | None, str, str]] = [
         ("frames in which it is right", drive_rates.right, PERCENT, ""),
         (
             "first right at a distance of",
-            drive_rates.first_seen,
+            drive_rates.first_right,
             f" {drive_rates.unit}",
             never,
         ),
@@ -820,7 +824,7 @@ def surface_sentences(surface: SurfaceMap) -> list[str]:
         cells = format_count(table.compared, table.part)
         if not table.compared:
             text = (
-                f"no {table.part} was seen in {surface.least} pictures and hidden in "
+                f"no {table.part} was seen in {surface.min_pictures} pictures and hidden in "
                 "as many, so nothing is compared."
             )
         elif not table.worse + table.better:
@@ -834,7 +838,7 @@ def surface_sentences(surface: SurfaceMap) -> list[str]:
                 first = table.strongest[0]
                 text += (
                     f" The clearest, at u {first.u:.2f} and v {first.v:.2f}: wrong in "
-                    f"{wrong_text(first.seen)} that see it, "
+                    f"{wrong_text(first.visible)} that see it, "
                     f"{wrong_text(first.hidden)} that do not."
                 )
         names = f"{shorten_name(table.object)}, {shorten_name(table.model)}"
@@ -904,7 +908,7 @@ def find_detection_distance(summary: SweepSummary) -> DetectionDistance | None:
     is_detection = summary.task.partition("=")[0] == "detection"
     # names of several objects or models stand with commas
     is_single = "," not in summary.object and "," not in summary.model
-    is_comparison = summary.beside is not None
+    is_comparison = summary.arms is not None
     # Frames of a drive are not independent, nor are samples of a point where nothing is
     # sampled.
     are_independent = summary.drives is None and summary.units is None

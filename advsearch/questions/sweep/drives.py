@@ -343,7 +343,7 @@ class Drives:
         max_flicker = (n_frames - 1) / self.seconds
         return DriveRates(
             model=self._job.models[model].name,
-            answer=arm or None,
+            adversarial_run=arm or None,
             drives=n_drives,
             repeats=math.ceil(len(drives.flags) / n_drives),
             frames=n_frames,
@@ -356,16 +356,16 @@ class Drives:
             longest_gap=summarize_drives(
                 self._longest_gaps(drives.flags), max, (0.0, max_gap), drive
             ),
-            first_seen=self._first_detection(
+            first_right=self._first_detection(
                 first_distance[has_right], drive[has_right]
             ),
             unit=self._distance_unit,
-            never_seen=n_drives - n_right_drives,
+            never_right=n_drives - n_right_drives,
             flicker=summarize_drives(
                 self._changes_per_second(drives.flags), max, (0.0, max_flicker), drive
             ),
             tracks=self._compute_track_rates(model, drives.steps, drive),
-            each=drive_records,
+            per_drive=drive_records,
         )
 
     def _describe_drives(
@@ -386,7 +386,7 @@ class Drives:
                 row=step,
                 path=self._path_of_step.get(step),
                 right=float(right_fraction[index]),
-                first_seen=_finite_or_none(first_distance[index]),
+                first_right=_finite_or_none(first_distance[index]),
                 longest_gap=float(longest_gap[index]),
                 flicker=float(flicker[index]),
             )

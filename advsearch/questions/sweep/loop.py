@@ -513,7 +513,8 @@ class Sweep:
         worst = WorstConfiguration(
             configuration=row_number,
             values={
-                name: DescribedValue.of(value) for name, value in query.values.items()
+                name: DescribedValue.from_values(value)
+                for name, value in query.values.items()
             },
             seed=query.seed,
             label_set=self._find_right_labels(scene, model, query),
@@ -699,7 +700,7 @@ class Sweep:
         if self._scenes.scene is None:
             return None, gains
         renderer = next(iter(self._scenes.scene.renderer_of_size.values()))
-        formation = Formation.of(renderer.formation)
+        formation = Formation.from_values(renderer.formation)
         if len(self.job.scenes) <= MAX_LISTED_GAINS:
             for named_scene in self.job.scenes:
                 description = fit_camera(
@@ -720,7 +721,7 @@ class Sweep:
             return None
         models = [model.name for model in self.job.models]
         pairs = predictions.compare_arms(models, self.units)
-        return ArmComparison(answer=adversarial, pairs=pairs)
+        return ArmComparison(adversarial_run=adversarial, pairs=pairs)
 
     def _count_renders(self, verified: WorstVerified | None) -> dict[str, int]:
         """Return how many images were traced, and how many predicted instead."""

@@ -330,10 +330,10 @@ def verdict_text(summary: SweepSummary) -> str:
         if summary.out_of_view:
             return "The object is in no picture."
         return "No configuration was looked at."
-    if summary.beside and summary.beside.pairs:
+    if summary.arms and summary.arms.pairs:
         return " ".join(
-            format_paired_rates(summary.beside.answer, pair)
-            for pair in summary.beside.pairs
+            format_paired_rates(summary.arms.adversarial_run, pair)
+            for pair in summary.arms.pairs
         )
     so_far = ""
     if summary.looked_at != summary.planned:

@@ -630,7 +630,7 @@ class SweepPredictor:
         error = None
         if self.deviations:
             worst = max(self.deviations, key=lambda deviation: deviation.levels)
-            error = PredictionError.of(worst)
+            error = PredictionError.from_values(worst)
         reason = None
         if self.rendered_groups:
             reason = (
@@ -645,7 +645,7 @@ class SweepPredictor:
         )
         return LinearTransport(
             used=True,
-            way=self.method.name,
+            method=self.method.name,
             reason=reason,
             entries=0,  # of a matrix, which sweeps do not use
             bytes=self.method.bytes + predictor_bytes,

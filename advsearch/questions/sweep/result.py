@@ -270,10 +270,10 @@ def _compare_pairs(
     return PairedRates(
         model=model,
         clean=count_by_unit(clean, draws, clean_outcome),
-        answer=count_by_unit(adversarial, draws, adversarial_outcome),
+        adversarial=count_by_unit(adversarial, draws, adversarial_outcome),
         both=int((clean & adversarial).sum()),
         clean_only=int((clean & ~adversarial).sum()),
-        answer_only=int((~clean & adversarial).sum()),
+        adversarial_only=int((~clean & adversarial).sum()),
         neither=int((~clean & ~adversarial).sum()),
         difference=difference,
         interval=interval,

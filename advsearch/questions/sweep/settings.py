@@ -48,8 +48,8 @@ class SweepConfig(SceneConfig):
     command: ClassVar[str] = "sweep"
     blind_changes: ClassVar[Mapping[str, str]] = BLIND
     harmless_changes: ClassVar[Mapping[str, str]] = HARMLESS
-    free: ClassVar[tuple[str, ...]] = (
-        *SceneConfig.free,
+    changeable_settings: ClassVar[tuple[str, ...]] = (
+        *SceneConfig.changeable_settings,
         "surface",
         "workers",
         "cluster",

@@ -96,10 +96,10 @@ class SurfacePart(Fields):
     face: int = Field(description="number of the triangle in its middle")
     u: float = Field(description="its middle, across the map")
     v: float = Field(description="its middle, up the map, whose bottom row is 0")
-    place: tuple[float, float, float] = Field(
+    center: tuple[float, float, float] = Field(
         description="its middle, in the mesh's coordinates, z up"
     )
-    seen: CountedPredictions = Field(description="pictures that see it")
+    visible: CountedPredictions = Field(description="pictures that see it")
     hidden: CountedPredictions = Field(description="the other ones")
     difference: float = Field(
         description="share of wrong predictions where it is "
@@ -124,7 +124,7 @@ class SurfaceTable(Fields):
     unwrapped: bool = Field(
         description="whether the map is a new one, and not that of the object's texture"
     )
-    seen: int = Field(description="how many were seen at all")
+    visible: int = Field(description="how many were seen at all")
     compared: int = Field(
         description="how many were seen often enough, and hidden often enough"
     )
@@ -142,7 +142,7 @@ class SurfaceMap(Fields):
 
     file: str = Field(description="the counts, in the folder")
     cells: int = Field(description="along each side of the map")
-    least: int = Field(
+    min_pictures: int = Field(
         description="pictures with and without a part that a comparison takes"
     )
     tables: list[SurfaceTable] = Field(
@@ -158,10 +158,10 @@ class PairedRates(Fields):
 
     model: str
     clean: CountedPredictions = Field(description="without the adversarial scene")
-    answer: CountedPredictions = Field(description="with it")
+    adversarial: CountedPredictions = Field(description="with it")
     both: int = Field(description="pairs that are right in both")
     clean_only: int = Field(description="pairs that are right without it alone")
-    answer_only: int = Field(description="pairs that are right with it alone")
+    adversarial_only: int = Field(description="pairs that are right with it alone")
     neither: int = Field(description="pairs that are right in none")
     difference: float = Field(
         description="accuracy with the adversarial scene less that without"
@@ -175,7 +175,7 @@ class PairedRates(Fields):
 class ArmComparison(Fields):
     """The clean scene and the adversarial one of a run under the same draws."""
 
-    answer: str = Field(description="the run")
+    adversarial_run: str = Field(description="the run")
     pairs: list[PairedRates] = Field(description="for each model")
 
 
@@ -198,7 +198,7 @@ class DriveRecord(Fields):
         description="its path; null where all drives have the same"
     )
     right: float = Field(description="share of frames in which the model is right")
-    first_seen: float | None = Field(
+    first_right: float | None = Field(
         description="distance at the first of these; null without one"
     )
     longest_gap: float = Field(
@@ -232,7 +232,7 @@ class DriveRates(Fields):
     """
 
     model: str
-    answer: str | None = Field(
+    adversarial_run: str | None = Field(
         description="the adversarial scene of a run; null without"
     )
     drives: int = Field(description="how many there are with all their frames")
@@ -247,19 +247,19 @@ class DriveRates(Fields):
     longest_gap: OverDrives = Field(
         description="seconds of the longest run of frames in which it is not"
     )
-    first_seen: OverDrives | None = Field(
+    first_right: OverDrives | None = Field(
         description="distance at the first frame in which it is right, of drives that "
         "have one; `interval` is null "
         "where the plan does not say between which distances drives are"
     )
     unit: str = Field(default="object sizes", description="of that distance")
-    never_seen: int = Field(description="drives without a frame in which it is right")
+    never_right: int = Field(description="drives without a frame in which it is right")
     flicker: OverDrives = Field(description="changes between right and wrong a second")
     tracks: TrackRates | None = optional_field(
         "what a [tracker](drives.md#tracks) makes of the boxes; absent without a "
         "detector"
     )
-    each: list[DriveRecord] = Field(
+    per_drive: list[DriveRecord] = Field(
         default=[], description="the numbers of each drive, the first 1,000"
     )
 
@@ -312,7 +312,7 @@ class SweepSummary(CountedPredictions, RunResult):
         description="over the first two axes with several values; null where there are "
         "fewer, or more than 4096 pairs"
     )
-    beside: ArmComparison | None = optional_field(
+    arms: ArmComparison | None = optional_field(
         "the clean scene beside [an adversarial "
         "one](sweeps.md#an-adversarial-scene-beside-the-clean-one); absent without"
     )
@@ -372,11 +372,11 @@ class SweepSummary(CountedPredictions, RunResult):
     @property
     def brief(self) -> str:
         """The result in a few words."""
-        if self.beside and self.beside.pairs:
-            rates = self.beside.pairs[0]
+        if self.arms and self.arms.pairs:
+            rates = self.arms.pairs[0]
             return (
                 f"accuracy {rates.clean.accuracy:.1%}, {rates.answer.accuracy:.1%} "
-                f"with {self.beside.answer}"
+                f"with {self.arms.answer}"
             )
         return (
             f"right in {self.correct} of {self.configurations}"

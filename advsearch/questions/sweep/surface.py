@@ -372,7 +372,9 @@ class SurfaceCounts:
             model=model,
             part=kind,
             unwrapped=self.parts.is_unwrapped,
-            seen=int((counts.visible_counts[self.parts.part_slices[kind]] > 0).sum()),
+            visible=int(
+                (counts.visible_counts[self.parts.part_slices[kind]] > 0).sum()
+            ),
             compared=int(compared.compared.sum()),
             worse=int(is_worse.sum()),
             better=int(is_better.sum()),
@@ -416,8 +418,8 @@ class SurfaceCounts:
             face=int(self.parts.face[part]),
             u=u,
             v=v,
-            place=self.parts.centers[part].tolist(),
-            seen=count_independent(n_visible - n_visible_wrong, n_visible),
+            center=self.parts.centers[part].tolist(),
+            visible=count_independent(n_visible - n_visible_wrong, n_visible),
             hidden=count_independent(n_hidden - n_hidden_wrong, n_hidden),
             difference=float(compared.difference[part]),
             interval=(float(compared.low[part]), float(compared.high[part])),
@@ -646,7 +648,9 @@ def _write_map(
         tables += _make_tables(models, object_counts, comparisons, name)
     _write_arrays(run, arrays)
     _save_figure(panels[:MAX_PANELS], run)
-    return SurfaceMap(file=COUNTS_FILE, cells=MAP_SIZE, least=MIN_IMAGES, tables=tables)
+    return SurfaceMap(
+        file=COUNTS_FILE, cells=MAP_SIZE, min_pictures=MIN_IMAGES, tables=tables
+    )
 
 
 def _make_tables(

@@ -111,7 +111,7 @@ def try_suite(
     tester = ClaimTester(context, loaded_suite, start_time=start, warnings=remarks)
     suite_run = _SuiteRun(tester, planned, counterexamples.read_expected(config.suite))
     context.ending = suite_run.run_claims()
-    if added is not None and suite_run.results[0].answer != FAILED:
+    if added is not None and suite_run.results[0].verdict != FAILED:
         counterexamples.delete_counterexample(added)
         raise InputError(
             f"add: the adversarial scene of {config.add} is not kept: "
@@ -200,7 +200,7 @@ class _SuiteRun:
             for number, claim in enumerate(self.planned, start=1):
                 self._add_result(claim, self._test_claim(claim))
                 last = self.results[-1]
-                tester.progress.message(f"{claim.name}: {last.answer}: {last.reason}")
+                tester.progress.message(f"{claim.name}: {last.verdict}: {last.reason}")
                 if number < len(self.planned):
                     # The summary of the claims so far is written after each claim, so
                     # that it can be read even if the run is killed.
@@ -231,7 +231,7 @@ class _SuiteRun:
         tester = self.tester
         noted = tester.run.store.read_json_note(key)
         if noted is not None:
-            return ClaimResult.of(noted)
+            return ClaimResult.from_values(noted)
         # for example because a counterexample has failed or the time is over
         untested = self._refuse_claim(claim)
         if untested is not None:
@@ -292,7 +292,7 @@ class _SuiteRun:
             name=claim.name,
             kind=claim.kind,
             statement=text,
-            answer=UNDECIDED,
+            verdict=UNDECIDED,
             reason=reason,
             cause=cause,
         )
@@ -352,7 +352,7 @@ class _SuiteRun:
             model=_join_distinct(config.model for config in configs),
             environment=_join_distinct(config.environment_name for config in configs),
             controls=list(dict.fromkeys(controls)),
-            answer=combine_verdicts(claims),
+            verdict=combine_verdicts(claims),
             confidence=tester.suite.confidence,
             claims=claims,
             ending=ending,
@@ -378,7 +378,7 @@ class _SuiteRun:
             The claims with their new expected verdicts, and a sentence for each change.
         """
         verdicts = {
-            claim.name: claim.answer
+            claim.name: claim.verdict
             for claim in claims
             if claim.cause is not Cause.COUNTEREXAMPLE_FAILED
         }

@@ -61,7 +61,7 @@ class ClaimResult(results.Fields):
         "`must_not_change` or `counterexample`"
     )
     statement: str = Field(description="what is claimed, in words")
-    answer: str = Field(description="`held`, `failed` or `undecided`")
+    verdict: str = Field(description="`held`, `failed` or `undecided`")
     reason: str = Field(description="why, with the numbers")
     expected: str = Field(
         HELD, description="what it said when `update` was given last; absent for `held`"
@@ -97,7 +97,7 @@ class ClaimResult(results.Fields):
     @property
     def accepted(self) -> bool:
         """Whether the verdict is at least as good as expected."""
-        return VERDICTS.index(self.answer) <= VERDICTS.index(self.expected)
+        return VERDICTS.index(self.verdict) <= VERDICTS.index(self.expected)
 
 
 class SuiteResult(views.InNotebook, RunResult):
@@ -109,7 +109,7 @@ class SuiteResult(views.InNotebook, RunResult):
     title: str = Field(description="what it is about")
     object: str = Field(description="of all claims, with commas between them")
     model: str = Field(description="the model that the claims are about")
-    answer: str = Field(
+    verdict: str = Field(
         description="`failed` if a claim is that was not expected to be, else "
         "`undecided` likewise, else `held`"
     )
@@ -128,7 +128,7 @@ class SuiteResult(views.InNotebook, RunResult):
     @property
     def brief(self) -> str:
         """The number of claims by verdict: ``3 held, 1 failed``."""
-        answers = [claim.answer for claim in self.claims]
+        answers = [claim.verdict for claim in self.claims]
         texts = []
         for name in (HELD, FAILED, UNDECIDED):
             if name in answers:
@@ -138,13 +138,13 @@ class SuiteResult(views.InNotebook, RunResult):
     @property
     def status(self) -> int:
         """The exit status of the command."""
-        return 0 if self.added is not None else EXIT_STATUS[self.answer]
+        return 0 if self.added is not None else EXIT_STATUS[self.verdict]
 
 
 def combine_verdicts(claims: list[ClaimResult]) -> str:
     """Return the worst verdict among claims that are worse than expected, else HELD."""
     return max(
-        (claim.answer for claim in claims if not claim.accepted),
+        (claim.verdict for claim in claims if not claim.accepted),
         key=VERDICTS.index,
         default=HELD,
     )
@@ -181,11 +181,11 @@ def make_view(result: SuiteResult) -> ShownResult:
     ]
     for claim in result.claims:
         # These were not tested, so there is nothing to tell about them.
-        if claim.answer == HELD or claim.cause is Cause.COUNTEREXAMPLE_FAILED:
+        if claim.verdict == HELD or claim.cause is Cause.COUNTEREXAMPLE_FAILED:
             continue
         pictures = []
         if claim.picture:
-            caption = f"{claim.statement}: {claim.answer}. {claim.reason}."
+            caption = f"{claim.statement}: {claim.verdict}. {claim.reason}."
             pictures.append([views.Picture(claim.picture, caption)])
         rows = [["repeat", claim.repeat]]
         sections.append(ResultPart(claim.name, rows=rows, pictures=pictures))
@@ -459,9 +459,9 @@ def make_table_rows(result: SuiteResult) -> list[list[str]]:
     """Return the rows of the table of claims."""
     rows = []
     for claim in result.claims:
-        verdict = claim.answer
+        verdict = claim.verdict
         if claim.expected != HELD:
-            if claim.answer == claim.expected:
+            if claim.verdict == claim.expected:
                 verdict += " (as expected)"
             else:
                 verdict += f" (expected: {claim.expected})"
@@ -474,13 +474,15 @@ def describe_suite(result: SuiteResult) -> str:
     """Describe the result of a suite in a sentence."""
     if result.added is not None:
         return f"Kept as {result.added}."
-    n_expected = sum(claim.answer != HELD and claim.accepted for claim in result.claims)
+    n_expected = sum(
+        claim.verdict != HELD and claim.accepted for claim in result.claims
+    )
     expected = f", {n_expected} of them as expected" if n_expected else ""
     beginnings = {
         results.RUNNING: "Running, so far",
         results.INTERRUPTED: "Stopped, so far",
     }
-    beginning = beginnings.get(result.ending, result.answer.capitalize())
+    beginning = beginnings.get(result.ending, result.verdict.capitalize())
     return f"{beginning}: {result.brief or 'no claims'}{expected}."
 
 
@@ -500,14 +502,14 @@ def list_claims(result: SuiteResult) -> Iterator[views.Claim]:
     """Yield what the result of each claim says, for `advsearch report`."""
     for tested in result.claims:
         text = (
-            f"{tested.name}: that {tested.statement} is {tested.answer}: "
+            f"{tested.name}: that {tested.statement} is {tested.verdict}: "
             f"{tested.reason}."
         )
         kind = "measured"
-        if tested.answer == UNDECIDED:
+        if tested.verdict == UNDECIDED:
             kind = "nothing claimed"
         elif tested.kind in ("not_broken", "counterexample"):
-            kind = "found" if tested.answer == FAILED else "not found"
+            kind = "found" if tested.verdict == FAILED else "not found"
         else:
             confidence = wording.percent(result.confidence)
             text += (
@@ -540,7 +542,7 @@ def format_junit(result: SuiteResult) -> str:
     Failed claims are failures, and undecided claims are errors. Claims that are failed
     or undecided as expected count as skipped, so that they do not break a build.
     """
-    answers = [(claim.answer, claim.accepted) for claim in result.claims]
+    answers = [(claim.verdict, claim.accepted) for claim in result.claims]
     attributes = {
         "tests": str(len(answers)),
         "failures": str(answers.count((FAILED, False))),
@@ -585,18 +587,18 @@ def _add_test_case(
             "time": f"{claim.seconds:.3f}",
         },
     )
-    if claim.answer == HELD:
+    if claim.verdict == HELD:
         output = ElementTree.SubElement(case, "system-out")
         output.text = _escape_xml(f"{claim.statement}\n{claim.reason}")
         return
     # "error" of a claim without a verdict
-    tag = "failure" if claim.answer == FAILED else "error"
+    tag = "failure" if claim.verdict == FAILED else "error"
     if claim.accepted:  # as it was expected to be
         tag = "skipped"
-    message = _escape_xml(f"{claim.answer}: {claim.reason}")
+    message = _escape_xml(f"{claim.verdict}: {claim.reason}")
     outcome = ElementTree.SubElement(case, tag, {"message": message})
     if tag != "skipped":
-        outcome.set("type", claim.answer)
+        outcome.set("type", claim.verdict)
     lines = [claim.statement, _picture_path(result, claim), claim.repeat]
     outcome.text = _escape_xml("\n".join(filter(None, lines)))
 
@@ -623,7 +625,7 @@ def format_sarif(result: SuiteResult) -> str:
     sarif_results = [
         _sarif_result(result, claim, kinds.index(claim.kind), suite_lines)
         for claim in result.claims
-        if claim.answer != HELD
+        if claim.verdict != HELD
     ]
     driver = {"name": "advsearch", "version": __version__, "rules": rules}
     invocation = {
@@ -651,7 +653,7 @@ def _sarif_result(
         suite_lines: lines of the suite's file, for the location.
     """
     message = (
-        f"{claim.name}: {claim.answer}: {claim.reason}. Claimed: {claim.statement}."
+        f"{claim.name}: {claim.verdict}: {claim.reason}. Claimed: {claim.statement}."
     )
     location = {
         "artifactLocation": {"uri": quote(result.suite)},
@@ -665,7 +667,7 @@ def _sarif_result(
     return {
         "ruleId": claim.kind,
         "ruleIndex": rule_index,
-        "level": "error" if claim.answer == FAILED else "warning",
+        "level": "error" if claim.verdict == FAILED else "warning",
         "message": {"text": message},
         "locations": [{"physicalLocation": location}],
         # A fingerprint identifies the same finding in the next run.
@@ -702,7 +704,9 @@ def format_markdown(result: SuiteResult) -> str:
         ", ".join(fact_texts),
     ]
     commands = [
-        claim.repeat for claim in result.claims if claim.answer != HELD and claim.repeat
+        claim.repeat
+        for claim in result.claims
+        if claim.verdict != HELD and claim.repeat
     ]
     if commands:
         lines += ["", "```sh", *commands, "```"]

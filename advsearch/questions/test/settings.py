@@ -30,8 +30,8 @@ class SuiteConfig(Config):
 
     # fmt: off
     command: ClassVar[str] = "test"
-    free: ClassVar[tuple[str, ...]] = (
-        *Config.free, "seconds", "workers", "cluster", "junit", "sarif", "markdown", "update",
+    changeable_settings: ClassVar[tuple[str, ...]] = (
+        *Config.changeable_settings, "seconds", "workers", "cluster", "junit", "sarif", "markdown", "update",
         "twins",
     )
     clashes: ClassVar[tuple[settings.Clash, ...]] = (
@@ -120,7 +120,7 @@ class SampledConfig(SceneConfig):
     """Settings of pictures that are sampled from the ranges of the controls."""
 
     command: ClassVar[str] = "test"
-    without: ClassVar[tuple[str, ...]] = ("spp",)
+    excluded_settings: ClassVar[tuple[str, ...]] = ("spp",)
 
     verify_spp: int = setting_as_in(
         AttackConfig,

@@ -394,7 +394,7 @@ class ViewTracer:
         side = mi.Float(0.0)
         for grid, mask in zip(self._grids, masks, strict=True):
             if not grid.is_ground:  # it is one of the searched texture
-                side = dr.select(mask, -1.0 if grid.side < 0 else 1.0, side)
+                side = dr.select(mask, -1.0 if grid.face_side < 0 else 1.0, side)
         radiance = dr.select(
             side != 0.0, 0.0, diffuse_radiance * dr.select(valid, diffuse, 1.0)
         )

@@ -43,7 +43,9 @@ class TexelGrid:
     # rate) of a level plane whose cells are small about its center: coordinate = center
     # + scale sinh(rate s), s in [-1, 1]
     warp: tuple[float, float, float, float] | None = None
-    side: int = 0  # side of the faces that it lies on: 1 the front, -1 the back, 0 both
+    face_side: int = (
+        0  # side of the faces that it lies on: 1 the front, -1 the back, 0 both
+    )
 
     @property
     def is_ground(self) -> bool:
@@ -186,7 +188,7 @@ def _trace_batch(
     # Other rays meet a texel, or a shape without texels, which counts as dark (-1).
     masks = find_hit_grids(mitsuba_scene, grids, si, direction)
     for grid, is_hit in zip(grids, masks, strict=True):
-        if not grid.is_ground and grid.side == 0:
+        if not grid.is_ground and grid.face_side == 0:
             # A surface with a single grid has texels on its fronts only; hits on its
             # backs stay -1.
             is_hit &= dr.dot(si.n, direction) < 0.0
@@ -345,7 +347,7 @@ def find_hit_grids(
     return [
         si.is_valid()
         & (si.shape == mi.ShapePtr(shapes[grid.name]))
-        & side_masks[grid.side]
+        & side_masks[grid.face_side]
         for grid in grids
     ]
 

@@ -119,7 +119,7 @@ def make_mesh_texels(
     texel_of_covered = np.cumsum(charts.is_covered.ravel()) - 1
     rows, columns = np.nonzero(charts.is_covered)
     return LitTexels(
-        grids=(TexelGrid(name, 0, charts.is_covered.shape, warp=None, side=side),),
+        grids=(TexelGrid(name, 0, charts.is_covered.shape, warp=None, face_side=side),),
         positions=position[rows, columns],
         normals=normal[rows, columns],
         cells=np.flatnonzero(charts.is_covered),

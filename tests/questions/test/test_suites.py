@@ -93,9 +93,9 @@ def attacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_every_claim_is_held_failed_or_undecided_and_stops_when_it_is(tested: tuple[SuiteResult, Path]) -> None:
     result, folder = tested
     found = {one.name: one for one in result.claims}
-    answers = {name: one.answer for name, one in found.items()}
+    answers = {name: one.verdict for name, one in found.items()}
     assert answers == {"in-front": "held", "behind": "failed", "too-few": "undecided", "no-worse": "held"}
-    assert (result.answer, result.status, result.brief) == ("failed", 1, "2 held, 1 failed, 1 undecided")
+    assert (result.verdict, result.status, result.brief) == ("failed", 1, "2 held, 1 failed, 1 undecided")
     assert 6 <= found["in-front"].pictures < 20 and found["in-front"].interval[0] >= 0.5  # type: ignore[index]
     assert found["behind"].rate == 0.0 and "right in 0 of" in found["behind"].reason
     picture = advsearch.load_run(folder / "run").run  # type: ignore[union-attr]
@@ -170,7 +170,7 @@ def test_a_suite_that_was_stopped_goes_on_where_it_was_whoever_shares_its_pictur
     monkeypatch.setattr(workbench, "open_executor", worked)
     chosen, suite = ("in-front", "no-worse", "too-few"), written(tmp_path, CLAIMS)
     config = SuiteConfig(suite=suite, only=",".join(chosen), workers=workers, run=str(tmp_path / "run"))
-    whole = {one.name: (one.answer, one.reason, one.interval) for one in tested[0].claims if one.name in chosen}
+    whole = {one.name: (one.verdict, one.reason, one.interval) for one in tested[0].claims if one.name in chosen}
     front = next(one.pictures for one in tested[0].claims if one.name == "in-front")
     real, done, last = Problem.judge, 0, 4
 
@@ -211,7 +211,7 @@ def planted() -> advsearch.Model:
 def test_a_model_that_is_broken_on_purpose_fails_where_its_like_holds_with_the_picture(
     tested: tuple[SuiteResult, Path], tmp_path: Path
 ) -> None:
-    assert next(one for one in tested[0].claims if one.name == "in-front").answer == "held"
+    assert next(one for one in tested[0].claims if one.name == "in-front").verdict == "held"
     advsearch.allow_code("test_suites:planted")
     config = SuiteConfig(suite=written(tmp_path, CLAIMS), only="in-front", model="test_suites:planted")
     (one,) = carry_out(config.model_copy(update={"run": str(tmp_path / "run")})).claims
@@ -284,7 +284,7 @@ def test_the_command_writes_what_machines_read_and_its_status_is_the_result(
 
 def test_texts_of_others_stay_texts(tested: tuple[SuiteResult, Path]) -> None:
     result, _ = tested
-    odd = ClaimResult(name="odd", kind="right", statement="<b>|`\x00", answer="failed", reason="a | b\n<script>")
+    odd = ClaimResult(name="odd", kind="right", statement="<b>|`\x00", verdict="failed", reason="a | b\n<script>")
     odd_result = result.model_copy(update={"claims": [odd], "title": "T\x07 & <x>"})
     root = ElementTree.fromstring(words.format_junit(odd_result).partition("\n")[2])
     assert root.find("testsuite") is not None and root[0].get("name") == "T? & <x>"
@@ -328,7 +328,7 @@ def test_assertions_pass_and_fail_with_the_picture_and_what_repeats_them(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     easy, small = small_models.easy(), {**SMALL, "verify_spp": 2}
-    assert assert_right("mug", easy, at_least=0.5, pictures=20, controls=FRONT, **small).answer == "held"
+    assert assert_right("mug", easy, at_least=0.5, pictures=20, controls=FRONT, **small).verdict == "held"
     with pytest.raises(AssertionError) as caught:
         assert_right("mug", easy, at_least=0.5, pictures=20, controls=BACK, **small)
     text = str(caught.value)
