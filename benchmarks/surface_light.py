@@ -261,7 +261,7 @@ def swept(scene: str, rows: int, label: str | None) -> None:
     error = (
         ""
         if told.error is None
-        else (f"{told.error.levels:.2f} levels off, {told.error.logits:+.2f} logits; ")
+        else (f"{told.error.levels:.2f} levels off, {told.error.margin_bias:+.2f} logits; ")
     )
     print(f"  {error}{told.reason or 'all predicted'}", flush=True)
 

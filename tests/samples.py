@@ -112,7 +112,7 @@ MATRIX: dict[str, Any] = {
 }  # fmt: skip
 REGION: dict[str, Any] = {
     **RUN, "schema": 1, "command": "region", "run": "runs/mug-pose-002", "object": "mug", "controls": ["pose"],
-    "model": "reference", "task": "classification", "verdict": "wrong", "same": 200, "samples": 200, "rate": 1.0,
+    "model": "reference", "task": "classification", "verdict": "wrong", "n_same": 200, "samples": 200, "rate": 1.0,
     "interval": [0.982, 1.0],
     "volume": 0.12, "spp": 64, "image_formation": FORMATION, "clean": {"moved": []}, "renders": {"verification": 300},
     "box": [{"name": "pose.yaw", "unit": "degrees", "low": 10.0, "high": 55.5, "centre": 30.0}],
@@ -125,10 +125,10 @@ EXPLAIN: dict[str, Any] = {
     **RUN, "run": "runs/mug-explain-001", "controls": ["camera"], "right": 396, "of": 600, "interval": [0.62, 0.7],
     "sweeps": ["runs/mug-sweep-001"], "object": "mug", "model": "reference", "parameters": ["camera.elevation"],
     "rules": [{**COUNTED, "conditions": [HIGH], "elsewhere": COUNTED, "confirmed": COUNTED}],
-    "not_told": {**COUNTED, "conditions": [HIGH], "elsewhere": COUNTED, "chance": 0.03, "asked": 0.01, "rows": 460},
+    "rejected_rule": {**COUNTED, "conditions": [HIGH], "elsewhere": COUNTED, "chance": 0.03, "p_value_limit": 0.01, "rows": 460},
     "importance": [{"parameters": ["camera.elevation", "light.power"], "share": 0.9, "interval": [0.8, 1.0],
                     "parts": 36}],
-    "envelope": {**COUNTED, "conditions": [HIGH], "accuracy": 0.9, "held": True}, "pairs": [], "renders": 0,
+    "envelope": {**COUNTED, "conditions": [HIGH], "accuracy": 0.9, "confirmed": True}, "pairs": [], "renders": 0,
 }  # fmt: skip
 SHARE = {"accuracy": 0.75, "interval": [0.35, 0.97], "right": 6, "count": 8}
 SIDE = {"objects": ["mug", "bowl"], "environments": ["studio", "noon"], "scenes": 4, "views": 8}
@@ -143,17 +143,17 @@ HARDEN: dict[str, Any] = {
     "search": "auto, 16 steps", "stronger_search": "portfolio, 48 steps",
     "split": {"training": SIDE, "validation": SIDE, "held out": SIDE},
     "rounds": [
-        {"lessons": 8 * n, "part": 0.7 * n, "clean": 1.0, "robust": 0.5, "kept": n == 1} for n in range(2)
+        {"lessons": 8 * n, "part": 0.7 * n, "clean": 1.0, "robust": 0.5, "is_selected": n == 1} for n in range(2)
     ],
     "hardened": "reference@hardened.safetensors", "weights": "hardened.safetensors", "pictures": "artifacts/pictures",
 }  # fmt: skip
 REPLAY: dict[str, Any] = {
-    **RUN, "run": "runs/mug-replay-001", "controls": ["texture"], "answer": "runs/mug-texture-001", "answered": "found",
+    **RUN, "run": "runs/mug-replay-001", "controls": ["texture"], "adversarial_run": "runs/mug-texture-001", "run_ending": "found",
     "object": "mug", "model": "reference", "task": "classification", "renders": 80,
     "table": [
-        {"way": "curve", "condition": "reinhard, highlights rolled off, x / (1 + x)", "ending": "found",
+        {"change": "curve", "condition": "reinhard, highlights rolled off, x / (1 + x)", "ending": "found",
          "clean": ATTACK["clean"]["control"], "verified": rated()},
-        {"way": "cycles", "condition": "Blender's Cycles", "ending": "not done", "reason": "there is no Blender here"},
+        {"change": "cycles", "condition": "Blender's Cycles", "ending": "not done", "reason": "there is no Blender here"},
     ],
 }  # fmt: skip
 RECIPE: dict[str, Any] = {
@@ -170,7 +170,7 @@ STABILITY: dict[str, Any] = {
     "rows": [
         {"case": "ties", "group": "objective", "control": "pose", "finite": True, "relative_error": 0.0125,
          "ending": "found", "rule": "<b>a tie is not wrong</b>", "status": "ok", "decides": "", "holds": "",
-         "checks": [], "measured": {"condition number": 12.5}, "seconds": 1.5}],
+         "checks": [], "measurements": {"condition number": 12.5}, "seconds": 1.5}],
 }  # fmt: skip
 
 

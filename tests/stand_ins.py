@@ -191,7 +191,9 @@ class StandInWorkers:
     made: InProcess
     lost: tuple[int, ...] = ()
     given: list[int] = field(default_factory=list)
-    stats: WorkerStats | None = field(default_factory=lambda: WorkerStats(workers=2, max_running=2, busy=1.0, alive=2.0))
+    stats: WorkerStats | None = field(
+        default_factory=lambda: WorkerStats(workers=2, max_running=2, busy=1.0, alive=2.0)
+    )
 
     def compute(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
         """The latest comes first."""

@@ -708,7 +708,7 @@ class PredictionError(Fields):
         description="of 255, over the object's pixels (of a crop, over those outside), "
         "root mean square"
     )
-    logits: JsonFloat = Field(
+    margin_bias: JsonFloat = Field(
         description="of the margin, the mean over the pictures that were compared"
     )
 

@@ -14,7 +14,8 @@ from advsearch.engine.record import make_control_group, make_rate
 from advsearch.tasks import Judgement, Prediction
 
 NOTHING = Judgement.from_margin(math.nan, math.nan, Prediction("tench", 0, math.nan))
-RIGHT, WRONG = Judgement.from_margin(-1.0, -1.0, Prediction("mug", 1, 0.9)), Judgement.from_margin(3.0, 3.0, Prediction("vase", 2, 0.8))
+RIGHT = Judgement.from_margin(-1.0, -1.0, Prediction("mug", 1, 0.9))
+WRONG = Judgement.from_margin(3.0, 3.0, Prediction("vase", 2, 0.8))
 
 
 def test_trials_without_a_number_are_counted_and_means_are_of_the_others() -> None:

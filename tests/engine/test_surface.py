@@ -141,6 +141,6 @@ def test_a_stopped_sweep_and_one_that_is_asked_afterwards_have_the_same_map(
     found = json.loads(capsys.readouterr().out)["surface"]
     with store.Store(later / store.NAME, read_only=True) as results:
         assert [(row.seed, row.margin) for row in results.rows()] == before
-    assert [one["part"] for one in found["tables"]] == ["cell", "face"] and found["tables"][0]["seen"] > 500
+    assert [one["part"] for one in found["tables"]] == ["cell", "face"] and found["tables"][0]["visible"] > 500
     assert json.loads((parts / "summary.json").read_text())["surface"] == found
     assert (parts / "artifacts" / "surface.npz").read_bytes() == (later / "artifacts" / "surface.npz").read_bytes()

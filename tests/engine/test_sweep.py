@@ -488,7 +488,8 @@ def test_both_rates_stand_side_by_side_with_what_the_pairs_say(
     two = [model(0.5, "one"), model(0.55, "two")]
     result = advsearch.sweep(model=two, adversarial_of=attacked, samples=40, trials=0, run=tmp_path / "run")
     beside, rows = result.summary.arms, list(result.rows())
-    assert beside is not None and beside.adversarial_run == "turned" and [one.model for one in beside.pairs] == ["one", "two"]
+    assert beside is not None and beside.adversarial_run == "turned"
+    assert [pair.model for pair in beside.pairs] == ["one", "two"]
     assert result.summary.controls == ["camera"], "what the attack was over"
     for number, pair in enumerate(beside.pairs):
         right = [bool(row.correct) for row in rows[number::2]]

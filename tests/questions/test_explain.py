@@ -122,7 +122,8 @@ def test_of_predictions_without_a_law_it_is_said_that_nothing_decides_and_how_ma
     kept = read_result(tmp_path / "run")
     assert isinstance(kept, ExplainResult) and kept.rules == []
     rule = kept.rejected_rule
-    assert rule is not None and rule.chance > rule.p_value_limit == 0.01 and f"right in {rule.right} of {rule.total}" in said
+    assert rule is not None and rule.chance > rule.p_value_limit == 0.01
+    assert f"right in {rule.right} of {rule.total}" in said
     assert rule.rows is None or (
         rule.rows > 600 and f"About {rule.rows:,} rows with these shares would tell it" in said
     )
@@ -154,7 +155,8 @@ def test_failures_are_grouped_by_what_the_model_decides_by(
     monkeypatch.setattr(explaining.Renders, "render_again", again)
     result = advsearch.explain(swept, confirm=0, pairs=0, clusters=50, run=tmp_path / "run")
     found = result.clusters
-    assert found is not None and found.are_separated and found.failures == 50 == len(set(asked)) and result.renders == 50
+    assert found is not None and found.are_separated and found.failures == 50 == len(set(asked))
+    assert result.renders == 50
     with Store(swept / NAME, read_only=True) as store:
         assert all(not row.correct for row in store.rows("sweep") if row.step in asked)
     odd = sum(number % 2 for number in asked)

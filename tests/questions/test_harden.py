@@ -74,7 +74,7 @@ def test_a_run_trains_measures_and_goes_on(
     assert attacks[3:] == both
     (row,) = result.table
     assert row.stronger_before is not None and (row.stronger_before.right, row.stronger.right) == (1, 1)
-    assert result.rounds[:2] == [one.model_copy(update={"kept": result.rounds[k].is_selected}) for k, one in
+    assert result.rounds[:2] == [one.model_copy(update={"is_selected": result.rounds[k].is_selected}) for k, one in
                                  enumerate(first.rounds)]  # fmt: skip
     assert [one.lessons for one in result.rounds] == [0, 3, 6] and sum(one.is_selected for one in result.rounds) == 1
     assert result.before is not None and (result.before.right, result.before.count) == (1, 2)

@@ -133,7 +133,9 @@ def test_a_round_teaches_plain_and_worst_pictures() -> None:
 @pytest.mark.parametrize(("clean_loss", "best"), [(0.0, 0), (0.02, 2), (0.1, 1)])
 def test_the_weights_that_are_kept_lose_no_more_plain_pictures_than_they_may(clean_loss: float, best: int) -> None:
     scores = ((0.9, 0.1), (0.82, 0.9), (0.89, 0.5))
-    done = [TrainingRound(lessons=1, part=1.0, clean=clean, robust=robust, is_selected=False) for clean, robust in scores]
+    done = [
+        TrainingRound(lessons=1, part=1.0, clean=clean, robust=robust, is_selected=False) for clean, robust in scores
+    ]
     noted = json.dumps([one.model_dump() for one in done])
     run: Any = SimpleNamespace(store=SimpleNamespace(read_note=lambda key: noted), path=Path())
     assert Rounds(run, course_of(student(), clean_loss=clean_loss)).best == best

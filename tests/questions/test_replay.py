@@ -109,7 +109,9 @@ def test_what_changes_only_after_rendering_renders_nothing(attacked: Path, tmp_p
 def make_rows(**counts: int) -> list[ReplayRow]:
     """Return rows of photographs by status, and one of another condition that holds."""
     endings = [ending.replace("_", " ") for ending, count in counts.items() for _ in range(count)]
-    rows = [ReplayRow(change=PHOTOGRAPH, condition=f"{index}.jpg", ending=ending) for index, ending in enumerate(endings)]
+    rows = [
+        ReplayRow(change=PHOTOGRAPH, condition=f"{index}.jpg", ending=ending) for index, ending in enumerate(endings)
+    ]
     return [ReplayRow(change="as verified", condition="as verified", ending="found"), *rows]
 
 

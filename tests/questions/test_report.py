@@ -94,7 +94,8 @@ def test_what_was_stopped_claims_nothing_whatever_it_has_counted(ending: str) ->
     stopped = [
         samples.attack(ending=ending), samples.sweep(ending=ending), samples.curve(ending=ending),
         samples.region(ending=ending), samples.matrix(ending=ending),
-        HardenResult.from_values({**samples.HARDEN, "ending": ending}), ExplainResult.from_values({**samples.EXPLAIN, "ending": ending}),
+        HardenResult.from_values({**samples.HARDEN, "ending": ending}),
+        ExplainResult.from_values({**samples.EXPLAIN, "ending": ending}),
         ReplayResult.from_values({**samples.REPLAY, "ending": ending}),
     ]  # fmt: skip
     for result in stopped:

@@ -364,7 +364,8 @@ def test_everybody_can_use_the_pages(
 @pytest.mark.parametrize(
     "result",
     [
-        matrix(), curve(), region(), ExplainResult.from_values(EXPLAIN), HardenResult.from_values(HARDEN), RecipeResult.from_values(RECIPE),
+        matrix(), curve(), region(), ExplainResult.from_values(EXPLAIN),
+        HardenResult.from_values(HARDEN), RecipeResult.from_values(RECIPE),
         ReplayResult.from_values(REPLAY), StabilityResult.from_values(STABILITY),
     ],
     ids=lambda result: type(result).__name__,

@@ -314,7 +314,7 @@ def _summarize_verification(problem: Problem, findings: RunState) -> dict[str, A
             adversarial=_compute_objective_values(adversarial_trials),
         ),
         "baseline": _summarize_baseline(problem, findings),
-        "answer_from": None if outdone is None else "random",
+        "adversarial_from": None if outdone is None else "random",
         "policy_verified": _make_rate(outdone),
         "sample_count": samples and VerificationSamples.from_values(samples),
     }

@@ -592,7 +592,7 @@ def transport_text(summary: AttackSummary) -> str:
             "at the last comparison with a traced one it was off by "
             f"{_short(transport.error.levels)} of 255 levels of the picture's change "
             "(root mean square) and "
-            f"{_short(transport.error.logits)} of the objective"
+            f"{_short(transport.error.margin_bias)} of the objective"
         )
     if transport.renewed:
         parts.append(f"made anew {format_count(transport.renewed, 'time')}")

@@ -186,7 +186,7 @@ def compare(context: RunContext[CompareConfig]) -> CompareResult:
             warnings.append(f"Where one side is worse was not looked for: {error}")
             pair = compare_sides(sides[0], side, config.seed, with_rules=False)
         examples = list(images.list_examples(sides[0], side, number))
-        pairs.append(pair.model_copy(update={"shown": examples}))
+        pairs.append(pair.model_copy(update={"discordant_pictures": examples}))
     return context.result(
         CompareResult,
         **describe_sweeps(config, sides),
@@ -250,7 +250,9 @@ def count_side(side: Side) -> ComparedSide:
     return ComparedSide(
         name=side.name,
         run=str(side.sweep.folder),
-        **side.labels,
+        object=side.labels["object"],
+        model=side.labels["model"],
+        adversarial_run=side.labels["answer"],
         configurations=len(side.rows),
         correct=int(side.is_right.sum()),
         accuracy=rules.estimate_rate(side.rows),

@@ -138,7 +138,7 @@ def explain(context: RunContext[ExplainConfig]) -> ExplainResult:
         # draws, where several rows share one
         units=None if table["unit"].is_unique else table["unit"].nunique(),
         rules=rule_rows,
-        not_told=findings.make_rejected_rule(found_rules.best_rejected, len(table)),
+        rejected_rule=findings.make_rejected_rule(found_rules.best_rejected, len(table)),
         importance=importance,
         envelope=envelope,
         pairs=pairs,

@@ -69,7 +69,7 @@ class RuleRow(RightCounts):
     conditions: list[results.ConditionRow] = Field(description="all of which hold")
     elsewhere: RightCounts = Field(description="rows under no rule so far")
     confirmed: Confirmation | None = Field(
-        description="fresh renders drawn inside the rule, and `held`, whether they "
+        description="fresh renders drawn inside the rule, and `confirmed`, whether they "
         "tell it again; null where none were "
         "asked for"
     )

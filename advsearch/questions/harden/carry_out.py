@@ -462,7 +462,7 @@ class Hardening:
         """Return the rounds so far, the best one marked as kept once all are done."""
         return [
             training_round.model_copy(
-                update={"kept": is_done and number == self.rounds.best}
+                update={"is_selected": is_done and number == self.rounds.best}
             )
             for number, training_round in enumerate(self.rounds.results)
         ]

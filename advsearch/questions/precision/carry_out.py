@@ -136,7 +136,7 @@ def _make_result(
         warnings=[*join("warnings"), *disagreements, *list_cautions(points)],
         recommendations=recommend_settings(
             points,
-            confirmations=join("again"),
+            confirmations=join("confirmations"),
             goal=config.error,
             round_up=measurer.round_up,
             or_steeper=measurer.may_be_steeper,
@@ -356,7 +356,7 @@ class QuantityMeasurer:
         confirmations = self._measure_again(title, bench, recommended, budget)
         seconds = time.perf_counter() - start_time
         return sitting.model_copy(
-            update={"again": confirmations, "warnings": warnings, "took": seconds}
+            update={"confirmations": confirmations, "warnings": warnings, "seconds": seconds}
         )
 
     def _measure_again(

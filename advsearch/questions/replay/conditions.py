@@ -479,8 +479,8 @@ def run_replay(
     rows = table.list_rows(conditions)
     return context.result(
         ReplayResult,
-        answer=str(attack_directory),
-        answered=attack.ending,
+        adversarial_run=str(attack_directory),
+        run_ending=attack.ending,
         object=attack.object,
         model=attack.model,
         task=attack.task,

@@ -996,7 +996,7 @@ def collect_evidence(
         run_pictures = _read_pictures(folder, number)
         pictures |= run_pictures
         run = _make_evidence_run(folder, criterion, exposure or {}, twins)
-        update = {"pictures": list(run_pictures), "begun": _format_start(folder)}
+        update = {"pictures": list(run_pictures), "started": _format_start(folder)}
         evidence_runs.append(run.model_copy(update=update))
     # A misspelled axis would otherwise be ignored silently.
     known_axes = {row.axis for run in evidence_runs for row in run.conditions}
@@ -1118,7 +1118,7 @@ def _make_evidence_run(
             "photographs": count_conditions(result, photo_rows),
             "twins": _find_twins(folder, result, twins),
             "domain": {name: part.text for name, part in domain.items()},
-            "not_shown": _describe_limits(
+            "limitations": _describe_limits(
                 claims_of_photographs, domain, is_weighted=bool(weighted)
             ),
         }

@@ -995,7 +995,7 @@ def light_rotation_texel() -> CaseOutcome:
             "distance from the path of the objective x 1e6", path_difference, most=1e-3
         ),
         ending=ending,
-        measured={
+        measurements={
             "condition number in u": condition_number(hessian),
             "condition number in watts, degrees and sRGB": condition_number(
                 from_unit_box @ hessian @ from_unit_box

@@ -665,7 +665,7 @@ class Sweep:
             "answers": predictions.frequent_wrong_labels,
             "axes": _make_axis_rows(axes, right, units, outcome),
             "cells": make_map(axes, right, predictions.margin[rows]),
-            "beside": self._compare_arms(predictions),
+            "arms": self._compare_arms(predictions),
         }
 
     @property

@@ -375,8 +375,8 @@ class SweepSummary(CountedPredictions, RunResult):
         if self.arms and self.arms.pairs:
             rates = self.arms.pairs[0]
             return (
-                f"accuracy {rates.clean.accuracy:.1%}, {rates.answer.accuracy:.1%} "
-                f"with {self.arms.answer}"
+                f"accuracy {rates.clean.accuracy:.1%}, {rates.adversarial.accuracy:.1%} "
+                f"with {self.arms.adversarial_run}"
             )
         return (
             f"right in {self.correct} of {self.configurations}"

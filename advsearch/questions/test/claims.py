@@ -267,7 +267,7 @@ class ClaimTester:
         )
         return pending.model_copy(
             update={
-                "answer": evaluated.verdict,
+                "verdict": evaluated.verdict,
                 "reason": evaluated.reason,
                 "cause": evaluated.cause,
                 "part": pending.name,
@@ -352,7 +352,7 @@ class ClaimTester:
             (rate,) = _to_claim_scale(claim, sequence.mean)
         return pending.model_copy(
             update={
-                "answer": sample.verdict,
+                "verdict": sample.verdict,
                 "reason": reason,
                 "cause": Cause.OUT_OF_TIME if is_late else None,
                 "interval": _to_claim_scale(claim, *sequence.interval),
@@ -609,7 +609,7 @@ class ClaimTester:
             if sample.outcomes:
                 reasons = [update["reason"], OUT_OF_TIME_REASON]
             update |= {
-                "answer": UNDECIDED,
+                "verdict": UNDECIDED,
                 "reason": "; ".join(reasons),
                 "cause": Cause.OUT_OF_TIME,
             }
@@ -1040,7 +1040,7 @@ def _trials_result(sample: _TrialSample, task: str, *, over: bool) -> dict[str, 
         outcomes=wording.format_outcomes(outcome_counts, task),
     )
     return {
-        "answer": verdict,
+        "verdict": verdict,
         "reason": reason,
         "pictures": len(sample.outcomes),
         "rate": rate,

@@ -31,7 +31,8 @@ class SuiteConfig(Config):
     # fmt: off
     command: ClassVar[str] = "test"
     changeable_settings: ClassVar[tuple[str, ...]] = (
-        *Config.changeable_settings, "seconds", "workers", "cluster", "junit", "sarif", "markdown", "update",
+        *Config.changeable_settings,
+        "seconds", "workers", "cluster", "junit", "sarif", "markdown", "update",
         "twins",
     )
     clashes: ClassVar[tuple[settings.Clash, ...]] = (

@@ -126,7 +126,7 @@ def test_a_search_fails_a_claim_by_a_verified_counterexample_and_never_calls_it_
     }
     result = carry_out(SuiteConfig(suite=written(tmp_path, claims), run=str(tmp_path / "run")))
     little, much = result.claims
-    assert (little.answer, much.answer) == ("held", "failed")
+    assert (little.verdict, much.verdict) == ("held", "failed")
     assert little.reason.startswith("not broken by 8 steps of random") and "no proof" in little.reason
     assert "wrong in 6 of 6 trials (interval 54-100 %), most often a vase" in much.reason
     assert much.picture == "parts/much/images/adversarial.png" and (tmp_path / "run" / much.picture).is_file()
@@ -146,11 +146,11 @@ def test_a_model_that_looks_says_something_else_where_there_is_nothing_and_the_s
     }
     suite = written(tmp_path, asked, settings={"object": "mug", "model": "reference", "resolution": 64})
     result = carry_out(SuiteConfig(suite=suite, run=str(tmp_path / "run")))
-    assert {one.name: one.answer for one in result.claims} == dict.fromkeys(asked, "held")
+    assert {one.name: one.verdict for one in result.claims} == dict.fromkeys(asked, "held")
     assert all("as claimed in" in one.reason for one in result.claims) and len(asked) == 6
     advsearch.allow_code("small_models:blind")
     blind = carry_out(SuiteConfig(suite=suite, model="small_models:blind", run=str(tmp_path / "blind")))
-    answers = {one.name: one.answer for one in blind.claims}
+    answers = {one.name: one.verdict for one in blind.claims}
     assert answers == {name: "failed" if "must-change" in name else "held" for name in asked}
 
 
@@ -186,10 +186,10 @@ def test_a_suite_that_was_stopped_goes_on_where_it_was_whoever_shares_its_pictur
     assert first.is_unfinished and {one.reason for one in first.claims} == {"it was interrupted"}
     done, last = 0, front + 4  # in the middle of `no-worse`
     again = carry_out(config, resumed=tmp_path / "run")
-    assert again.is_unfinished and [one.answer for one in again.claims] == ["held", "undecided", "undecided"]
+    assert again.is_unfinished and [one.verdict for one in again.claims] == ["held", "undecided", "undecided"]
     done, last = 0, -1
     ended = carry_out(config, resumed=tmp_path / "run")
-    assert {one.name: (one.answer, one.reason, one.interval) for one in ended.claims} == whole
+    assert {one.name: (one.verdict, one.reason, one.interval) for one in ended.claims} == whole
     if workers is None:
         judged = sum(one.pictures * (1 + (one.kind == "no_worse")) for one in ended.claims)
         assert done < judged, "what was there was read back"
@@ -215,7 +215,7 @@ def test_a_model_that_is_broken_on_purpose_fails_where_its_like_holds_with_the_p
     advsearch.allow_code("test_suites:planted")
     config = SuiteConfig(suite=written(tmp_path, CLAIMS), only="in-front", model="test_suites:planted")
     (one,) = carry_out(config.model_copy(update={"run": str(tmp_path / "run")})).claims
-    assert one.answer == "failed" and "most wrong where it says vase: light." in one.reason
+    assert one.verdict == "failed" and "most wrong where it says vase: light." in one.reason
     picture = (tmp_path / "run" / str(one.picture)).read_bytes()
     assert base64.b64encode(picture).decode() in (tmp_path / "run" / "report.html").read_text("utf-8")
 
@@ -227,7 +227,7 @@ def test_a_counterexample_is_kept_small_tried_first_and_fails_fast(attacked: Pat
     assert added.status == 0 and added.added == str(tmp_path / "suite.counterexamples" / "found.json")
     assert sum(path.stat().st_size for path in counterexample_directory(suite).iterdir()) < 12_000
     tried = carry_out(SuiteConfig(suite=suite, run=str(tmp_path / "tried")))
-    assert [(one.name, one.answer, one.pictures) for one in tried.claims] == [
+    assert [(one.name, one.verdict, one.pictures) for one in tried.claims] == [
         ("found", "failed", 6),
         ("too-few", "undecided", 0),
     ]
