@@ -69,8 +69,8 @@ def test_rules_are_claims_and_triggering_conditions_and_say_whether_they_are_con
     assert "camera.elevation over 60 degrees (rule 1)" in first.statement and "fresh renders" in first.statement
     (rule, *_) = samples.EXPLAIN["rules"]
     for confirmed, said in (
-        ({**rule["confirmed"], "held": True}, "Confirmed: "),
-        ({**rule["confirmed"], "held": False}, "Not confirmed: "),
+        ({**rule["confirmed"], "confirmed": True}, "Confirmed: "),
+        ({**rule["confirmed"], "confirmed": False}, "Not confirmed: "),
         (None, "Counted on rows that did not choose it, not rendered: "),
     ):
         told = ExplainResult.from_values({**samples.EXPLAIN, "rules": [{**rule, "confirmed": confirmed}]})
