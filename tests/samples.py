@@ -49,7 +49,7 @@ def rated(successes: int = 20, low: float = 0.8316, high: float = 1.0, **changes
 
 
 ATTACK: dict[str, Any] = {
-    **RUN, "schema": 1, "command": "attack", "run": "runs/mug-texture-001", "object": "mug", "model": "reference",
+    **RUN, "schema": 2, "command": "attack", "run": "runs/mug-texture-001", "object": "mug", "model": "reference",
     "task": "classification",
     "controls": ["texture"], "epsilon": 0.1, "norm": "linf", "objective": "margin", "policy": "pgd", "ending": "found",
     "label_set": ["mug"], "goal": "a wrong answer", "target": None, "over": [], "image_formation": FORMATION,
@@ -67,7 +67,7 @@ ATTACK: dict[str, Any] = {
 TARGET: dict[str, Any] = {"goal": "a target answer", "target": ["vase"]}
 EASIER: dict[str, Any] = {"goal": "a right answer", "target": None}
 SWEEP: dict[str, Any] = {
-    **RUN, "schema": 1, "command": "sweep", "run": "runs/mug-sweep-001", "object": "mug", "model": "reference",
+    **RUN, "schema": 2, "command": "sweep", "run": "runs/mug-sweep-001", "object": "mug", "model": "reference",
     "task": "classification",
     "controls": [], "ending": "finished", "image_formation": FORMATION, "configurations": 8, "planned": 8, "correct": 6,
     **ACCURACY, "not_finite": 0, "answers": {}, "axes": [], "cells": None, "worst": None, "grid": {}, "samples": 1,
@@ -75,7 +75,7 @@ SWEEP: dict[str, Any] = {
 }  # fmt: skip
 STUDY: dict[str, Any] = {
     **RUN,
-    "schema": 1,
+    "schema": 2,
     "model": "reference",
     "task": "classification",
     "policy": "auto",
@@ -111,7 +111,7 @@ MATRIX: dict[str, Any] = {
     ],
 }  # fmt: skip
 REGION: dict[str, Any] = {
-    **RUN, "schema": 1, "command": "region", "run": "runs/mug-pose-002", "object": "mug", "controls": ["pose"],
+    **RUN, "schema": 2, "command": "region", "run": "runs/mug-pose-002", "object": "mug", "controls": ["pose"],
     "model": "reference", "task": "classification", "verdict": "wrong", "n_same": 200, "samples": 200, "rate": 1.0,
     "interval": [0.982, 1.0],
     "volume": 0.12, "spp": 64, "image_formation": FORMATION, "clean": {"moved": []}, "renders": {"verification": 300},
@@ -125,7 +125,8 @@ EXPLAIN: dict[str, Any] = {
     **RUN, "run": "runs/mug-explain-001", "controls": ["camera"], "right": 396, "of": 600, "interval": [0.62, 0.7],
     "sweeps": ["runs/mug-sweep-001"], "object": "mug", "model": "reference", "parameters": ["camera.elevation"],
     "rules": [{**COUNTED, "conditions": [HIGH], "elsewhere": COUNTED, "confirmed": COUNTED}],
-    "rejected_rule": {**COUNTED, "conditions": [HIGH], "elsewhere": COUNTED, "chance": 0.03, "p_value_limit": 0.01, "rows": 460},
+    "rejected_rule": {**COUNTED, "conditions": [HIGH], "elsewhere": COUNTED, "chance": 0.03, "p_value_limit": 0.01,
+        "rows": 460},
     "importance": [{"parameters": ["camera.elevation", "light.power"], "share": 0.9, "interval": [0.8, 1.0],
                     "parts": 36}],
     "envelope": {**COUNTED, "conditions": [HIGH], "accuracy": 0.9, "confirmed": True}, "pairs": [], "renders": 0,
@@ -148,12 +149,14 @@ HARDEN: dict[str, Any] = {
     "hardened": "reference@hardened.safetensors", "weights": "hardened.safetensors", "pictures": "artifacts/pictures",
 }  # fmt: skip
 REPLAY: dict[str, Any] = {
-    **RUN, "run": "runs/mug-replay-001", "controls": ["texture"], "adversarial_run": "runs/mug-texture-001", "run_ending": "found",
+    **RUN, "run": "runs/mug-replay-001", "controls": ["texture"],
+    "adversarial_run": "runs/mug-texture-001", "run_ending": "found",
     "object": "mug", "model": "reference", "task": "classification", "renders": 80,
     "table": [
         {"change": "curve", "condition": "reinhard, highlights rolled off, x / (1 + x)", "ending": "found",
          "clean": ATTACK["clean"]["control"], "verified": rated()},
-        {"change": "cycles", "condition": "Blender's Cycles", "ending": "not done", "reason": "there is no Blender here"},
+        {"change": "cycles", "condition": "Blender's Cycles", "ending": "not done",
+         "reason": "there is no Blender here"},
     ],
 }  # fmt: skip
 RECIPE: dict[str, Any] = {

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 
-SCHEMA = 1
+SCHEMA = 2  # version of the fields of results
 INTERRUPTED = "interrupted"  # endings of a run that can go on
 OUT_OF_TIME = "out of time"
 # how a result stands that is read while a process works on its run; none is kept so

@@ -25,7 +25,7 @@ from pydantic import ValidationError
 from advsearch.config import DEFAULT_ENVIRONMENT
 from advsearch.errors import FileFormatError
 from advsearch.files import split_paths
-from advsearch.runs.results import RUNNING, Result, kind_of
+from advsearch.runs.results import RUNNING, SCHEMA, Result, kind_of
 from advsearch.settings.configuration import FILES
 from advsearch.trust.stored_files import (
     list_opened_files,
@@ -85,6 +85,12 @@ def read_stored_result(folder: Path) -> Result:
         raise make_summary_error(path, str(error)) from None
     if not isinstance(values, dict):
         raise make_summary_error(path, type(values).__name__)
+    if values.get("schema", SCHEMA) != SCHEMA:
+        raise make_summary_error(
+            path,
+            f"schema {str(values['schema'])[:40]} of another version (this one writes "
+            f"{SCHEMA}); run it again",
+        )
     if (kind := kind_of(values)) is None:
         raise make_summary_error(
             path, f"one of the command {str(values.get('command'))[:40]!r}"

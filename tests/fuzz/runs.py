@@ -20,7 +20,7 @@ from fuzz.models import Planted
 from fuzz.mutations import as_json, confused, damaged
 
 SUMMARY = {
-    "schema": 1,
+    "schema": 2,
     "command": "attack",
     "object": "mug",
     "controls": ["pose"],

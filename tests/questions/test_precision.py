@@ -168,7 +168,7 @@ def test_a_tiny_scene_from_end_to_end(
     assert main(["precision", *words.split()]) == 0
     assert time.process_time() - before < 40.0  # of one thread: what others do on the machine takes none of it
     report = json.loads(capsys.readouterr().out)
-    assert (report["schema"], report["command"]) == (1, "precision")
+    assert (report["schema"], report["command"]) == (2, "precision")
     assert {one["quantity"] for one in report["points"]} == {"picture", "margin", "gradient"}
     for one in report["points"]:
         assert {"estimator", "spp", "error", "seconds"} <= set(one) and one["seconds"] > 0.0

@@ -119,7 +119,9 @@ def test_damaged_results_are_named(case: str, run: Path, capsys: pytest.CaptureF
         list(opened.store.rows())
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{", "[" * 100_000, '{"a": ' + "9" * 6000 + "}", "\0", '{"ending": NaN'])
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{", "[" * 100_000, '{"a": ' + "9" * 6000 + "}", "\0", '{"ending": NaN', '{"schema": 1}']
+)
 def test_summaries_that_are_none_are_named(text: str, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (run / "summary.json").write_text(text)
     for command in ("show", "resume"):

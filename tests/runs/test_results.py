@@ -34,10 +34,10 @@ class Measured:
 def test_a_result_is_json_without_what_was_not_asked_for_and_reads_back() -> None:
     result = Outer(inner=Inner.from_values(Measured()))
     written = json.dumps(result.to_dict(), allow_nan=False)
-    assert written == '{"schema": 1, "command": "outer", "inner": {"value": null, "interval": [0.0, null]}}'
+    assert written == '{"schema": 2, "command": "outer", "inner": {"value": null, "interval": [0.0, null]}}'
     again = Outer.from_values(json.loads(written))
     assert again.inner is not None and math.isnan(again.inner.value) and again.extra is None
-    assert Outer(inner=None, extra=3).to_dict() == {"schema": 1, "command": "outer", "inner": None, "extra": 3}
+    assert Outer(inner=None, extra=3).to_dict() == {"schema": 2, "command": "outer", "inner": None, "extra": 3}
 
 
 class Timed(AttackSummary):

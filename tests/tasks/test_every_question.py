@@ -129,7 +129,8 @@ def test_a_sweep_counts_and_keeps_the_worst(
         "--denoise", "none", "--spp", "2", "--trials", "6", "--verify-spp", "4", "--surface", "--keep-pictures", "all",
         "--run", str(tmp_path / "run"),
     )  # fmt: skip
-    assert {table["part"]: table["visible"] > 500 for table in swept["surface"]["tables"]} == {"cell": True, "face": True}
+    tables = swept["surface"]["tables"]
+    assert {table["part"]: table["visible"] > 500 for table in tables} == {"cell": True, "face": True}
     assert swept["configurations"] == 4 and swept["worst"]["claimed"]["payload"] is not None
     assert (tmp_path / "run" / "images" / "worst-prediction.png").is_file()
     taker = Photographs()
