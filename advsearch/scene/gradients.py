@@ -234,7 +234,7 @@ class GradientPlan:
         changes: dict[str, dict[str, Any]] = {}
         for group in stored["groups"]:
             change = {name: group[name] for name in RESTORED_FIELDS}
-            change["measured"] = group["variance_x_seconds"]
+            change["estimator_costs"] = group["variance_x_seconds"]
             changes[f"{group['control']}.{group['parameter']}"] = change
         plan = self._change_groups(lambda group: changes[group.name])
         return replace(plan, spp=stored["spp"])
