@@ -206,7 +206,7 @@ def format_paired_rates(run: str, pair: Any) -> str:
         f"{arm.correct} of {arm.configurations} ({percent(arm.accuracy)}, 95 % "
         "interval "
         f"{format_interval(arm.interval)})"
-        for arm in (pair.clean, pair.answer)
+        for arm in (pair.clean, pair.adversarial)
     )
     lower, upper = (100.0 * bound for bound in pair.interval)
     if pair.difference < 0:
@@ -225,7 +225,7 @@ def format_paired_rates(run: str, pair: Any) -> str:
         f"{abs(100.0 * pair.difference):.0f} points {direction} "
         f"(95 % interval of pairs {interval}){doubt}. "
         f"Right in the clean one alone are {pair.clean_only} pairs, "
-        f"with the adversarial one alone {pair.answer_only}."
+        f"with the adversarial one alone {pair.adversarial_only}."
     )
 
 

@@ -44,7 +44,7 @@ def test_an_adversarial_scene_is_rendered_again_under_every_condition(
     assert main(["replay", str(attacked), "--trials", "6", "--model", "small_models:hard", "--code", EASY, "--run",
                  str(run), "--json", "--quiet"]) == 0  # fmt: skip
     said = json.loads(capsys.readouterr().out)
-    rows = {(row["way"], row["condition"]): row for row in said["table"]}
+    rows = {(row["change"], row["condition"]): row for row in said["table"]}
     assert {way for way, _ in rows} == {
         "as verified", "samples", "resolution", "depth", "integrator", "sampler", "denoiser", "curve", "jpeg", "sensor",
         "blender", "model",

@@ -299,7 +299,7 @@ ROUND_COLUMNS: Mapping[str, views.Column] = {
     "part of the way": lambda row: wording.percent(row[1].part),
     "plain pictures right": lambda row: wording.percent(row[1].clean),
     "worst pictures right": lambda row: wording.percent(row[1].robust),
-    "kept": lambda row: "yes" if row[1].kept else "",
+    "kept": lambda row: "yes" if row[1].is_selected else "",
 }
 SPLIT_COLUMNS: Mapping[str, views.Column] = {
     "side": "{0[0]}",

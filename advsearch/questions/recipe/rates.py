@@ -1393,7 +1393,7 @@ def _list_surface_cells(surface_table: Any) -> list[Cell]:
         surface_table.object,
         wording.shorten_name(surface_table.model),
         surface_table.part,
-        surface_table.seen,
+        surface_table.visible,
         surface_table.compared,
         surface_table.worse,
         surface_table.better,

@@ -140,7 +140,7 @@ def sweep(
             without a grid.
         controls: what is drawn by chance, as for `attack`.
         adversarial_of: an attack that was kept, or its folder. Its adversarial scene
-            is swept besides the clean scene, under the same draws; `summary.beside`
+            is swept besides the clean scene, under the same draws; `summary.arms`
             compares the two. If neither `grid` nor `controls` is passed, the conditions
             over which the attack was made robust (its `over`) vary.
         metrics: columns of the rows, by name: functions of (image (H, W, 3) sRGB in [0,

@@ -275,9 +275,9 @@ CHANGE_COLUMNS: dict[str, Column] = {
 }
 SURFACE_COLUMNS: dict[str, Column] = {
     "middle (u, v)": "{0.u:.3f}, {0.v:.3f}",
-    "place (x, y, z)": lambda part: ", ".join(f"{x:.3g}" for x in part.place),
+    "place (x, y, z)": lambda part: ", ".join(f"{x:.3g}" for x in part.center),
     "face": "{0.face}",
-    "wrong where seen": lambda part: wrong_text(part.seen),
+    "wrong where seen": lambda part: wrong_text(part.visible),
     "wrong where not": lambda part: wrong_text(part.hidden),
     "difference": _difference_text,
     "p": "{0.p:.2g}",

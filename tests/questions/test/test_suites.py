@@ -263,7 +263,7 @@ def test_the_command_writes_what_machines_read_and_its_status_is_the_result(
     files = ["--junit", "out.xml", "--sarif", "out.sarif", "--markdown", "out.md"]
     assert main(["test", suite, "--code", EASY, *files, "--json", "--quiet"]) == 1
     said = json.loads(capsys.readouterr().out)
-    assert [one["answer"] for one in said["claims"]] == ["failed", "undecided"] and said["command"] == "test"
+    assert [one["verdict"] for one in said["claims"]] == ["failed", "undecided"] and said["command"] == "test"
     root = ElementTree.parse("out.xml").getroot()
     cases = {one.get("name"): one for one in root.iter("testcase")}
     assert root.get("tests") == "2" and root.get("failures") == root.get("errors") == "1"

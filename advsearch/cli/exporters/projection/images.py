@@ -142,7 +142,7 @@ def describe_settings(control: Any, values: dict[str, Tensor]) -> list[str]:
     number = {name: float(value) for name, value in values.items() if value.ndim == 0}
     unit = "m" if control.scene.object.size_in_metres is not None else "object sizes"
     fov = control.part.fov
-    white = control.measured(values, {})["white"]["value"]
+    white = control.compute_measurements(values, {})["white"]["value"]
     # Half the width of the picture at distance 1. The throw ratio of a projector is
     # distance / width, which is 1 / (2 half_width).
     half_width = math.tan(math.radians(fov) / 2.0)
