@@ -1,11 +1,11 @@
 """Send images to models behind addresses (``http://...``, ``https://...``).
 
 Such a model returns answers, but no gradients. In the plain protocol it gets
-``{"image": PNG in base64, "prompt": text}`` and returns ``{"scores": {name: fraction}}``
-or ``{"text": answer}``. If the path of the address ends in ``/chat/completions``,
-requests follow the protocol of OpenAI's chat. A key from the environment is sent to
-this address only: redirects are not followed, and the key is written to no message, row
-or file.
+``{"image": PNG in base64, "prompt": text}`` and returns ``{"scores": {name:
+fraction}}`` or ``{"text": answer}``. If the path of the address ends in
+``/chat/completions``, requests follow the protocol of OpenAI's chat. A key from the
+environment is sent to this address only: redirects are not followed, and the key is
+written to no message, row or file.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ in and out, in the unit of `money`. `seconds` is the maximum duration of an answ
 MAX_TRIES = 5
 FIRST_DELAY = 1.0
 MAX_DELAY = 60.0
-"""Maximum number of times that a request is sent if the server is busy or fails; and the
-first and the maximum delay between them, in seconds. The delay doubles each time.
+"""Maximum number of times that a request is sent if the server is busy or fails; and
+the first and the maximum delay between them, in seconds. The delay doubles each time.
 """
 
 MAX_CONCURRENT = 64

@@ -38,10 +38,10 @@ class AllAtOnce(nn.Module):
     def forward(self, images: Tensor) -> Tensor:
         """Return the output (N * K, ...) for the images of N configurations.
 
-        All K images of a configuration get the same row of the output. A count of images
-        that is no multiple of K is allowed, since a model is run on one or two images
-        when it is loaded. Then copies of the last image are added, and their rows are
-        cut off.
+        All K images of a configuration get the same row of the output. A count of
+        images that is no multiple of K is allowed, since a model is run on one or two
+        images when it is loaded. Then copies of the last image are added, and their
+        rows are cut off.
 
         Args:
             images: (N * K, 3, H, W); the K images of a configuration follow each other.

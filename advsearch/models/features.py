@@ -124,9 +124,9 @@ class _Call(NamedTuple):
 
 
 Calls = Callable[[Any, Tensor, Any], list[_Call]]
-"""Runs a network (first argument) on a batch (second argument), and returns the calls of
-its layers in their order. The third argument is the only layer of interest; None for all
-layers.
+"""Runs a network (first argument) on a batch (second argument), and returns the calls
+of its layers in their order. The third argument is the only layer of interest; None for
+all layers.
 """
 
 

@@ -252,8 +252,8 @@ def _apply_signature(source: Source, program: torch.export.ExportedProgram) -> S
     """Return the source with input size, layout, batch limits and dtype of a program.
 
     An exported program states the shape and dtype of its inputs. A program may take the
-    K images of a rig (several cameras) at once, (N, K, 3, H, W) or (N, K, H, W, 3): then
-    it is wrapped as a network of single images.
+    K images of a rig (several cameras) at once, (N, K, 3, H, W) or (N, K, H, W, 3):
+    then it is wrapped as a network of single images.
 
     Args:
         source: source of the network.

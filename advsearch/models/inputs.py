@@ -125,10 +125,11 @@ PICTURE = "observation.image"  # the key of the image for a policy's `select_act
 class WithState(nn.Module):
     """Call a policy of images and a constant state with images only.
 
-    A policy with a method `select_action` is called as those of LeRobot: with one mapping
-    of the images (key `PICTURE`) and of the state. Its `reset`, if it has one, is called
-    before, because the policy may have stored an earlier image. Other policies are
-    called with the images and the state, or with the images only if the state is empty.
+    A policy with a method `select_action` is called as those of LeRobot: with one
+    mapping of the images (key `PICTURE`) and of the state. Its `reset`, if it has one,
+    is called before, because the policy may have stored an earlier image. Other
+    policies are called with the images and the state, or with the images only if the
+    state is empty.
 
     Args:
         network: the policy.

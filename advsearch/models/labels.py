@@ -109,8 +109,8 @@ def find_similar_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str
 
     There are two kinds of suggestions. Similar names are spelled like the word
     (`find_similar_names`), the most similar first. Synonyms ("cup" for "mug") come from
-    a table of everyday things, and follow them. But if there are synonyms and no similar
-    name contains the word, only the synonyms are suggested.
+    a table of everyday things, and follow them. But if there are synonyms and no
+    similar name contains the word, only the synonyms are suggested.
 
     Args:
         word: what the user wrote.
@@ -344,7 +344,7 @@ def read_prompts(prompts: str | Sequence[str] | None) -> tuple[str, ...] | None:
 
 
 def get_patterns(prompts: tuple[str, ...] | None) -> tuple[str, ...]:
-    """Return the prompts into which names are inserted for ``{}``; the default for None.
+    """Return the prompts with ``{}`` for a name; the default prompt for None.
 
     Raises:
         InputError: a prompt has no ``{}``.

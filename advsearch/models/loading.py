@@ -95,15 +95,15 @@ def load_model(
             archive (.pt2) or to TorchScript; ``"package.module:callable"``, which
             returns an `nn.Module` or a `Model`; ``"torchvision:NAME"`` and the like,
             with ``"@weights.safetensors"`` behind any of them for other weights; an
-            address, ``"https://..."`` (docs/addresses.md); an `nn.Module` (it is copied,
-            and the copy shares its weights, unless they were created in
+            address, ``"https://..."`` (docs/addresses.md); an `nn.Module` (it is
+            copied, and the copy shares its weights, unless they were created in
             `torch.inference_mode`); or a `Model`.
         labels: the names of classes in index order, or a label file (see
             `read_labels`). A network that compares images with texts needs them.
             Default "class 0", "class 1", ...
-        prompt: text into which a network that compares images with texts puts each name,
-            with ``{}`` in its place. Multiple prompts (a list, or a text with | between
-            them) are averaged. Default `advsearch.models.labels.PROMPT`.
+        prompt: text into which a network that compares images with texts puts each
+            name, with ``{}`` in its place. Multiple prompts (a list, or a text with |
+            between them) are averaged. Default `advsearch.models.labels.PROMPT`.
         name: name of the model in messages and results.
         input_size: (height, width) in pixels, or one number; default 224.
         mean: one number, three, or ``"imagenet"``, ``"half"``, ``"clip"``, in units of
@@ -169,8 +169,8 @@ def load_model(
             source = _add_training_arguments(source)
         _check_max_batch(max_batch)
         model = _probe_source(source, options, read, name, names, origin)
-    # The model can be loaded again from its name alone, such as in a resumed run, only if
-    # the user set nothing else.
+    # The model can be loaded again from its name alone, such as in a resumed run, only
+    # if the user set nothing else.
     is_defined_by_spec = not options and labels is None and name is None
     if isinstance(spec, (str, os.PathLike)) and is_defined_by_spec:
         return replace(model, spec=os.fspath(spec))
@@ -238,8 +238,8 @@ def _check_max_batch(max_batch: object) -> None:
 def _check_reads_text(source: Source | Model, spec: object) -> None:
     """Raise InputError if a model cannot use a prompt.
 
-    A network that reads no text cannot, nor can a `Model` that the user passed, since it
-    is complete.
+    A network that reads no text cannot, nor can a `Model` that the user passed, since
+    it is complete.
 
     Args:
         source: what was found for `spec`.

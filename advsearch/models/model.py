@@ -64,9 +64,9 @@ class _Recomputed(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[None, None, Tensor]:
         """Return the gradient by the images, for the gradients of all returned tensors.
 
-        The function is computed again, this time with a graph. Autograd requires a value
-        for each argument of `forward`: None for `function` and `structures`, which are
-        no tensors, and the gradient for `images`.
+        The function is computed again, this time with a graph. Autograd requires a
+        value for each argument of `forward`: None for `function` and `structures`,
+        which are no tensors, and the gradient for `images`.
         """
         (images,) = ctx.saved_tensors
         # Autograd switches gradients on in here only if the caller wants a gradient of
@@ -203,10 +203,10 @@ class Preprocessing:
         value_range: (low, high), the values of black and white.
         layout: "NCHW" or "NHWC".
         channels: "RGB" or "BGR".
-        processor: replaces steps 2 to 4. It takes images (N, 3, H, W) in [0, 1], RGB, and
-            returns what the network takes, of the same shape.
-        resizes: whether there is step 1. Without it the model gets images of the size at
-            which they are rendered.
+        processor: replaces steps 2 to 4. It takes images (N, 3, H, W) in [0, 1], RGB,
+            and returns what the network takes, of the same shape.
+        resizes: whether there is step 1. Without it the model gets images of the size
+            at which they are rendered.
     """
 
     input_size: tuple[int, int]
@@ -276,8 +276,8 @@ class Model:
     It is created by `load_model`.
 
     Args:
-        module: the network. It takes what `preprocessing` returns. It returns logits in a
-            form that `read_logits` accepts, or what `read` takes.
+        module: the network. It takes what `preprocessing` returns. It returns logits in
+            a form that `read_logits` accepts, or what `read` takes.
         name: name of the model in messages and results.
         labels: one name per class, in index order.
         preprocessing: preprocessing of an image.
@@ -293,11 +293,11 @@ class Model:
         device: device of the network. Images are moved there, and the output back.
         read: finds the output in what the network returns for a number of images: a
             tensor (N, ...), or a list with one element for each image; None for logits.
-        spec: the argument of `load_model`, if the model can be loaded again from it; None
-            if the model exists only in this session.
-        cameras: number of cameras of a rig, whose images are side by side in each image.
-            The network gets them one by one. If there are several cameras, the output
-            for an image is a tuple with the output for each camera.
+        spec: the argument of `load_model`, if the model can be loaded again from it;
+            None if the model exists only in this session.
+        cameras: number of cameras of a rig, whose images are side by side in each
+            image. The network gets them one by one. If there are several cameras, the
+            output for an image is a tuple with the output for each camera.
         make_trainable: returns a new network with the same weights that can be trained
             further. It is needed if `module` is made for inference only; None if a copy
             of `module` can be trained.
@@ -348,8 +348,8 @@ class Model:
         Returns:
             Logits (N, classes), float32, on the device of the images; N is 1 for a
             single image. They are log p if the network returns probabilities p. With
-            `read`, the output is what that returns. With several cameras (`cameras`), it
-            is a list of N tuples: the output for each camera, of batch size 1.
+            `read`, the output is what that returns. With several cameras (`cameras`),
+            it is a list of N tuples: the output for each camera, of batch size 1.
 
         Raises:
             InputError: not an image, or values that are clearly not in [0, 1].
@@ -396,9 +396,9 @@ class Model:
     def _must_recompute(self, images: Tensor) -> bool:
         """Return whether the gradient must compute activations again to save memory.
 
-        It must if the images (N, H, W, 3) come from several cameras, there are more than
-        `MAX_STORED_IMAGES`, and a gradient is required. A network that takes the images
-        of all cameras at once cannot be split into smaller batches.
+        It must if the images (N, H, W, 3) come from several cameras, there are more
+        than `MAX_STORED_IMAGES`, and a gradient is required. A network that takes the
+        images of all cameras at once cannot be split into smaller batches.
         """
         return (
             self.cameras > 1
@@ -412,8 +412,8 @@ class Model:
         """Return the maximum number of images in a batch.
 
         The images of all cameras of a rig stay in one batch, if they fit into it. With
-        `recomputes`, a batch has at most `MAX_STORED_IMAGES`, because the activations of
-        one batch are in memory at a time.
+        `recomputes`, a batch has at most `MAX_STORED_IMAGES`, because the activations
+        of one batch are in memory at a time.
         """
         max_batch = self.batch_limits[1]
         if self.cameras > 1:
@@ -487,7 +487,8 @@ class Model:
                 read from it.
 
         Returns:
-            The output as `Model` returns it; with `raw`, the network's own return value.
+            The output as `Model` returns it; with `raw`, the network's own return
+            value.
         """
         INTERRUPTS.look()  # ends here after Ctrl-C
         # In an `attached` model, gradients also go through what its network detaches.
@@ -510,16 +511,16 @@ class Model:
 def copy_sharing_weights(module: nn.Module) -> nn.Module:
     """Return a copy of a module that shares its weights, but not their gradients.
 
-    Weights that were created in `torch.inference_mode` are copied, since autograd cannot
-    use them.
+    Weights that were created in `torch.inference_mode` are copied, since autograd
+    cannot use them.
     """
 
     def make_differentiable(weights: torch.Tensor) -> torch.Tensor:
         """Return weights through which autograd can differentiate."""
         return weights.clone() if weights.is_inference() else weights
 
-    # `deepcopy` uses the object that is stored here under the id of another one in place
-    # of a copy of that one.
+    # `deepcopy` uses the object that is stored here under the id of another one in
+    # place of a copy of that one.
     memo: dict[int, Any] = {}
     for parameter in module.parameters():
         weights = make_differentiable(parameter.detach())
@@ -537,8 +538,8 @@ class DetachMode(TorchFunctionMode):
 
     RT-DETR and similar networks choose queries by the scores of their encoder, and
     detach the queries from their decoder, in evaluation too. This makes training stable
-    (Zhu et al. 2020, arXiv 2010.04159, appendix A.4). But it hides from a search how the
-    image changes the queries.
+    (Zhu et al. 2020, arXiv 2010.04159, appendix A.4). But it hides from a search how
+    the image changes the queries.
 
     Attributes:
         ignored: whether `detach` does nothing.
@@ -649,8 +650,8 @@ def _advise_on_output(returned: Any, task: str | None) -> str:
     if advice:
         return advice
     likely_task = _guess_task(returned)
-    # The actions that task `command` reads look like rows of scores. So an output that it
-    # cannot read says nothing about the right task.
+    # The actions that task `command` reads look like rows of scores. So an output that
+    # it cannot read says nothing about the right task.
     is_certain = task != "command"
     if likely_task and likely_task != task and is_certain:
         return _advise_other_task(likely_task)
@@ -796,8 +797,8 @@ def mend_batch_norms(output: Any) -> None:
 
         Args:
             strides: strides of the input of the batch norm.
-            gradients: gradients with respect to each output of the batch norm. The first
-                output is the normalized images; the others are statistics.
+            gradients: gradients with respect to each output of the batch norm. The
+                first output is the normalized images; the others are statistics.
         """
         gradient, *rest = gradients
         if gradient is None or gradient.stride() == strides:
@@ -817,7 +818,8 @@ def mend_batch_norms(output: Any) -> None:
         visited.add(node)
         pending.extend(next_node for next_node, _ in node.next_functions)
         if node.name().startswith("NativeBatchNorm"):
-            # `empty_like` keeps the order of axes in memory; a "meta" tensor takes none.
+            # `empty_like` keeps the order of axes in memory; a "meta" tensor takes
+            # none.
             strides = torch.empty_like(node._saved_input, device="meta").stride()
             node.register_prehook(partial(with_strides, strides))
 

@@ -44,8 +44,8 @@ REPEAT_TOLERANCE = 1e-3
 
 ROUNDING_STEPS = 4.0
 """Minimum change of an image, and tolerance of outputs, in units of the machine epsilon
-of the network's dtype. bfloat16, for example, cannot resolve less than the difference of
-0.50 and 0.51.
+of the network's dtype. bfloat16, for example, cannot resolve less than the difference
+of 0.50 and 0.51.
 """
 
 # Change of each pixel value in [0, 1] over which a gradient is checked.
@@ -70,8 +70,8 @@ divided by 255, they had 0.006 to 0.10.
 """
 
 MAX_GROWTH = 2.0
-"""Maximum factor by which outputs may grow from a wrong range of colors to the right one.
-The same five networks had 0.98 to 1.22. Outputs of untrained networks grow more.
+"""Maximum factor by which outputs may grow from a wrong range of colors to the right
+one. The same five networks had 0.98 to 1.22. Outputs of untrained networks grow more.
 """
 
 EIGHT_BIT = (0.0, 255.0)  # the other range of colors that networks are made for
@@ -88,10 +88,10 @@ def probe(
 ) -> Model:
     """Run a model on test images, and set the fields of the model that follow from it.
 
-    These are `labels`, `probabilities`, `differentiable`, `attached` and `batch_limits`.
-    The images are a gray one and one of uniform noise. AutoAttack looks for
-    probabilities, randomness and missing gradients before an attack, too (Croce and Hein
-    2020, the flags of its reference implementation).
+    These are `labels`, `probabilities`, `differentiable`, `attached` and
+    `batch_limits`. The images are a gray one and one of uniform noise. AutoAttack looks
+    for probabilities, randomness and missing gradients before an attack, too (Croce and
+    Hein 2020, the flags of its reference implementation).
 
     Args:
         model: the model, without labels.
@@ -265,8 +265,8 @@ def _run_network(model: Model, images: Tensor) -> tuple[Any, int]:
     the return value (`raw`).
     """
     x = model.prepare(images)
-    # A network that raises may leave gradients switched on or off. The mode is set to its
-    # present value so that it is restored in the end.
+    # A network that raises may leave gradients switched on or off. The mode is set to
+    # its present value so that it is restored in the end.
     with torch.set_grad_enabled(torch.is_grad_enabled()):
         returned = _call_guarded(model, lambda: model.run_network(x, raw=True))
         return returned, len(x)
@@ -378,9 +378,9 @@ def _describe_other_inputs(network: object, error: str) -> str:
 def _list_missing_inputs(network: nn.Module, error: str) -> list[str]:
     """Return the names of the inputs that a network needs in addition to images.
 
-    These are the arguments without a default. Arguments for training, such as `targets`,
-    often have the default None, although the network fails without them: they count if
-    the text of the error names them.
+    These are the arguments without a default. Arguments for training, such as
+    `targets`, often have the default None, although the network fails without them:
+    they count if the text of the error names them.
 
     Args:
         network: the user's network.
@@ -415,9 +415,9 @@ def _are_probabilities(rows: Tensor, tolerance: float = PROBABILITY_TOLERANCE) -
 def _describe_odd_scores(model: Model, rows: Tensor) -> str:
     """Describe scores (N, classes) that are neither logits nor probabilities.
 
-    Scores in [0, 1] are those of a sigmoid if they stay in [0, 1] for colors far outside
-    of it (logits, such as the small ones of an untrained network, do not) and are not
-    all 0 for a black image (means of the image are).
+    Scores in [0, 1] are those of a sigmoid if they stay in [0, 1] for colors far
+    outside of it (logits, such as the small ones of an untrained network, do not) and
+    are not all 0 for a black image (means of the image are).
 
     Args:
         model: model that is probed.
@@ -440,8 +440,8 @@ def _describe_odd_scores(model: Model, rows: Tensor) -> str:
     sum_error = (torch.exp(-all_rows).sum(dim=1) - 1.0).abs()
     if is_non_negative and bool((sum_error < PROBABILITY_TOLERANCE).all()):
         return (
-            "costs (negative logarithms of probabilities), of which the smallest is the "
-            "predicted class"
+            "costs (negative logarithms of probabilities), of which the smallest is "
+            "the predicted class"
         )
     return ""
 
@@ -711,8 +711,8 @@ def _try_attached(
 
     Each gradient predicts how outputs change over a small step: the one that is closer
     to the actual change is better. The step follows the sign of their difference, where
-    they disagree most. A network with a straight-through gradient, which rounds behind a
-    `detach`, keeps its own gradient, because ignoring `detach` makes it zero.
+    they disagree most. A network with a straight-through gradient, which rounds behind
+    a `detach`, keeps its own gradient, because ignoring `detach` makes it zero.
 
     Args:
         model: model that is probed.
@@ -830,9 +830,9 @@ def _check_gradient(
     """Warn if a network's outputs do not change as its gradient predicts.
 
     A defense may mask the gradient, or a rounding may cut it off. The change of outputs
-    over a small step along the sign of the gradient is compared with the change that the
-    gradient predicts. The gradient counts as right if they agree for one of the step
-    sizes.
+    over a small step along the sign of the gradient is compared with the change that
+    the gradient predicts. The gradient counts as right if they agree for one of the
+    step sizes.
 
     Args:
         model: model that is probed.
@@ -879,8 +879,8 @@ def _choose_step_sizes(model: Model) -> tuple[float, ...]:
     """
     min_step = ROUNDING_STEPS * torch.finfo(model.dtype).eps
     if min_step > STEP:
-        # Half precision: a step that is large compared to rounding may be too large for a
-        # linear prediction, and a smaller one may be rounded. Both are tried.
+        # Half precision: a step that is large compared to rounding may be too large for
+        # a linear prediction, and a smaller one may be rounded. Both are tried.
         return (min_step, min_step / STEP_RATIO)
     returns_logits = model.read is None
     if returns_logits:

@@ -41,8 +41,8 @@ REMEDY = "run `make reference` to train it, or install a release, which contains
 class ReferenceNet(nn.Module):
     """A residual network for at least 2 classes.
 
-    It has a stem of stride 2, four stages of strides 4 to 32, average pooling, dropout of
-    pooled features in training, and a linear layer.
+    It has a stem of stride 2, four stages of strides 4 to 32, average pooling, dropout
+    of pooled features in training, and a linear layer.
     """
 
     def __init__(self, classes: int, *, dropout: float = 0.1) -> None:
@@ -201,7 +201,7 @@ def load(folder: Path | None = None, weights: Path | None = None) -> Model:
 def load_network(
     folder: Path | None = None, weights: Path | None = None
 ) -> tuple[ReferenceNet, tuple[str, ...]]:
-    """Return the network with its weights, which can be trained further, and its labels.
+    """Return the network, which can be trained further, and its labels.
 
     Args:
         folder: folder with `WEIGHTS` and `METADATA`; by default that of the package.

@@ -359,14 +359,15 @@ def load_callable(spec: str, libraries: Iterable[str] = ()) -> Source | Model:
 
     Args:
         spec: the text.
-        libraries: names of model sources, such as "timm". If there is no such module, it
-            may be a misspelling of one of them, which the message suggests.
+        libraries: names of model sources, such as "timm". If there is no such module,
+            it may be a misspelling of one of them, which the message suggests.
 
     Raises:
         ModelError: the module cannot be imported; or what it defines raises, returns
             something else, or does not fit the weights.
-        UnknownNameError: the module has no such attribute; the message has similar names.
-        InputError: the module may not be imported (`trust.code.check_import`).
+        UnknownNameError: the module has no such attribute; the message has similar
+            names. InputError: the module may not be imported
+            (`trust.code.check_import`).
     """
     target, weights = split_weights(spec)
     check_import(target)

@@ -30,8 +30,8 @@ from advsearch.models.zoo.library import (
 from advsearch.models.zoo.zero_shot import get_spoken_names
 
 PIXEL_TOLERANCE = 0.05
-"""Maximum difference of pixel values from those that the processor computes for an 8-bit
-image, relative to the largest of these: the processor rounds.
+"""Maximum difference of pixel values from those that the processor computes for an
+8-bit image, relative to the largest of these: the processor rounds.
 """
 
 # Continuation by which a network that answers freely is checked.
@@ -41,9 +41,9 @@ MIN_LARGE_WEIGHTS = 500_000_000
 
 
 def generates_text(architecture: str, network: Any) -> bool:
-    """Return whether an architecture of transformers continues image and text with text.
+    """Return whether an architecture of transformers continues images and texts.
 
-    The network itself is not used.
+    Only its name is used.
     """
     transformers: Any = sys.modules["transformers"]
     names = transformers.models.auto.modeling_auto.MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING_NAMES
@@ -77,8 +77,7 @@ def make_language_source(loaded: LoadedNetwork) -> models.Source:
         reader = _LanguageModel(loaded, processor, question or models.QUESTION)
         # Without names, likelihoods are checked with another text.
         tokens = reader.tokenize_names(names or (CHECK_TEXT,))
-        max_answer_tokens = purpose.tokens if is_free else 0
-        max_new_tokens = max(max_answer_tokens, *map(len, tokens))
+        max_new_tokens = max(purpose.tokens if is_free else 0, *map(len, tokens))
         _check_length(loaded, reader, max_new_tokens)
         classifier = _NameClassifier(reader, tokens)
         module = _FreeAnswerer(reader, purpose.tokens) if is_free else classifier
@@ -475,8 +474,8 @@ class _NameClassifier(nn.Module):
     def forward(self, images: Tensor) -> Tensor:
         """Return the log-likelihoods (N, names) for images (N, 3, H, W)."""
         stems = self._stems.to(images.device)
-        # Row and column of each token of each name in the table below, and whether there
-        # is a token: shorter names are padded.
+        # Row and column of each token of each name in the table below, and whether
+        # there is a token: shorter names are padded.
         rows = self._rows.to(images.device)
         columns = self._columns.to(images.device)
         is_token = self._is_token.to(images.device)
@@ -509,7 +508,7 @@ def _make_prompt_text(processor: Any, question: str) -> str:
 
 
 def _read_image_size(config: Any) -> tuple[int, int]:
-    """Return the image size (height, width) in a network's ``config``, or the default."""
+    """Return the image size (height, width) of a network's ``config``, or a default."""
     vision_config = getattr(config, "vision_config", None)
     size = getattr(vision_config, "image_size", None) or models.DEFAULT_SIZE
     height, width = size if isinstance(size, (list, tuple)) else (size, size)
@@ -572,9 +571,10 @@ def _find_stems(tokens: Sequence[Sequence[int]]) -> list[tuple[int, ...]]:
 
 
 class _FreeAnswerer(nn.Module):
-    """Answer freely about each image, by greedy decoding: the most likely token follows.
+    """Answer freely about each image, by greedy decoding.
 
-    The outputs are `advsearch.tasks.answers.AnswerWithLogits`.
+    Each next token is the most likely one. The outputs are
+    `advsearch.tasks.answers.AnswerWithLogits`.
     """
 
     def __init__(self, reader: _LanguageModel, max_tokens: int) -> None:
@@ -665,8 +665,8 @@ def _append_tokens(prompt: Mapping[str, Tensor], tokens: Tensor) -> dict[str, Te
 def _check_likelihood(loaded: LoadedNetwork, module: _NameClassifier) -> None:
     """Compare the likelihood of the longest name with that of the network itself.
 
-    The network itself reads image, prompt and name at once. `_NameClassifier` reads them
-    in two steps, with a cache.
+    The network itself reads image, prompt and name at once. `_NameClassifier` reads
+    them in two steps, with a cache.
 
     Raises:
         ModelError: they differ.

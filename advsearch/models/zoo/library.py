@@ -32,7 +32,8 @@ def report_library_errors(spec: str, advice: str) -> Iterator[None]:
     unpickled, and nothing is fetched for a model that only a file names.
     """
     disabled_before = logging.root.manager.disable
-    # Libraries log failed connections. This is not needed: an error is raised in the end.
+    # Libraries log failed connections. This is not needed: an error is raised in the
+    # end.
     logging.disable(logging.WARNING)
     # connections that were not allowed, and therefore not made
     rejected_connections: list[object] = []
@@ -73,8 +74,8 @@ PROBE_SIZES = (96, 160)
 # Maximum difference of a processor's output from that of an affine map, relative to its
 # range.
 TOLERANCE = 1e-3
-# Maximum relative difference between a network's scores and those that are computed from
-# its parts.
+# Maximum relative difference between a network's scores and those that are computed
+# from its parts.
 SCORE_TOLERANCE = 1e-4
 # Likewise, in units of the machine epsilon of the network's dtype. It is the larger one
 # in half precision.
@@ -402,7 +403,8 @@ class LoadedNetwork:
     def preprocessing(self) -> Processing:
         """The preprocessing of images.
 
-        Raises ModelError like `measure_processor`; warns if there is no image processor.
+        Raises ModelError like `measure_processor`; warns if there is no image
+        processor.
         """
         if self.processor is None:
             models.warn(

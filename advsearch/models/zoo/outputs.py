@@ -268,8 +268,8 @@ def _tokenize_sentence(loaded: LoadedNetwork) -> Tensor:
 def load_timm(spec: str, purpose: models.Purpose) -> models.Source:
     """Load ``timm:NAME[@weights.safetensors]``.
 
-    By default it has timm's pretrained weights. Size, normalization and labels are those
-    of the pretrained weights in any case.
+    By default it has timm's pretrained weights. Size, normalization and labels are
+    those of the pretrained weights in any case.
 
     Raises:
         ModelError: timm is missing, its weights cannot be loaded, or the user's weights
@@ -458,8 +458,8 @@ def _make_detector_source(
 ) -> models.Source:
     """Return the source of a detector of torchvision.
 
-    Such a detector normalizes and resizes images by itself. The input size is the one to
-    which it would resize a square image.
+    Such a detector normalizes and resizes images by itself. The input size is the one
+    to which it would resize a square image.
 
     Args:
         module: the detector.

@@ -51,8 +51,8 @@ class Family(NamedTuple):
 
 
 HUB_TIMEOUT = 5.0
-"""Timeout in seconds of the hub's first response. Without it, the hub's client would try
-to fetch each file for half a minute.
+"""Timeout in seconds of the hub's first response. Without it, the hub's client would
+try to fetch each file for half a minute.
 """
 
 ADVICE = (
@@ -168,9 +168,9 @@ def find_transformers_source(
 ) -> models.Source | None:
     """Return the source of an existing network of transformers.
 
-    None for any other network. Names of classes are in its ``config``. The preprocessing
-    comes from the repository or directory from which it was loaded; there is a
-    ModelWarning if that has no image processor, or cannot be read any more.
+    None for any other network. Names of classes are in its ``config``. The
+    preprocessing comes from the repository or directory from which it was loaded; there
+    is a ModelWarning if that has no image processor, or cannot be read any more.
     """
     transformers: Any = sys.modules.get("transformers")
     if transformers is None or not isinstance(network, transformers.PreTrainedModel):
@@ -373,8 +373,8 @@ def _run_detector(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
     """Return boxes and scores of a detector, without suppression of boxes.
 
     Returns:
-        Boxes (N, queries, 4) in pixels, x0, y0, x1, y1; and scores (N, queries, classes)
-        in [0, 1].
+        Boxes (N, queries, 4) in pixels, x0, y0, x1, y1; and scores (N, queries,
+        classes) in [0, 1].
     """
     returned = network(pixel_values=images)
     boxes = to_pixel_corners(returned.pred_boxes, images)

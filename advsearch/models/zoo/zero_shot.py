@@ -52,8 +52,8 @@ def make_zero_shot_source(loaded: LoadedNetwork) -> models.Source:
     prompts = models.get_patterns(loaded.purpose.prompts)
     tokenizer = loaded.load_part("AutoTokenizer")
     words = get_spoken_names(names)
-    # One text per name, by which scores are checked and equal names are found. The first
-    # prompt is enough for both.
+    # One text per name, by which scores are checked and equal names are found. The
+    # first prompt is enough for both.
     texts = [prompts[0].replace("{}", word) for word in words]
     with (
         models.translate_errors(f"model {name}: cannot embed the names of `labels`"),
@@ -213,7 +213,8 @@ def _get_features(returned: Any) -> Tensor:
 class _CosineClassifier(nn.Module):
     """Compute logits (N, names): the scaled cosine of an image and each name.
 
-    The text encoder is removed, since the embeddings of names are the weights of `head`.
+    The text encoder is removed, since the embeddings of names are the weights of
+    `head`.
     """
 
     def __init__(self, network: nn.Module, head: nn.Linear) -> None:
@@ -262,7 +263,8 @@ def _check_scores(
     noise = noise.to(network.device, network.dtype)
     inputs = _tokenize(network, tokenizer, [text])
     expected = network(**inputs, pixel_values=noise).logits_per_image.float()
-    # The rows of the head are embeddings of length 1, multiplied by the scale of cosines.
+    # The rows of the head are embeddings of length 1, multiplied by the scale of
+    # cosines.
     scale = classifier.head.weight.norm(dim=-1).max()
     # With the prompt "{}" the text is used as it is.
     embedding = scale * embed_words(network, tokenizer, [text], ["{}"])
