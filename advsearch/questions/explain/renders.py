@@ -548,7 +548,10 @@ def select_inside(
     conditions: rules.RuleConditions,
     earlier_conditions: Sequence[rules.RuleConditions],
 ) -> pd.DataFrame:
-    """Return the rows of a rule that no earlier rule covers, with the object in view."""
+    """Return the rows of a rule that no earlier rule covers.
+
+    Rows in which the object is out of view are left out.
+    """
     is_inside = rules.find_covered(conditions, rows) & is_outside(
         earlier_conditions, rows
     )

@@ -226,9 +226,9 @@ class ExplainResult(RunResult, RightCounts):
 
 RULES_NOTE = (
     "Rules are chosen on one half of the rows and counted on the other half. Rows "
-    "under an earlier rule are left out. Intervals are 95 % intervals. If there were no "
-    "rules, chance would produce one in at most one of a hundred cases. The text of a "
-    "rule, entered in the search field of the sweep's page, shows the images under it."
+    "under an earlier rule are left out. Intervals are 95 % intervals. If there were "
+    "no rules, chance would produce one in at most one of a hundred cases. The text of "
+    "a rule, entered in the search field of the sweep's page, shows the images under it."
 )
 IMPORTANCE_NOTE = (
     "The fraction of the variance of the predictions, right or wrong, that is between "
