@@ -228,7 +228,7 @@ RULES_NOTE = (
     "Rules are chosen on one half of the rows and counted on the other half. Rows "
     "under an earlier rule are left out. Intervals are 95 % intervals. If there were "
     "no rules, chance would produce one in at most one of a hundred cases. The text of "
-    "a rule, entered in the search field of the sweep's page, shows the images under it."
+    "a rule, entered in the search field of the sweep's page, shows its images."
 )
 IMPORTANCE_NOTE = (
     "The fraction of the variance of the predictions, right or wrong, that is between "
@@ -290,7 +290,7 @@ def _make_headline(result: ExplainResult) -> str:
     """Return the sentence that a reader sees first: how many rules there are."""
     if not result.rules:
         return (
-            f"No rule is told from chance in {result.total:,} rows, of which one half "
+            f"No rule is significant in {result.total:,} rows, of which one half "
             f"chooses and the other counts: the model is right in {result.text}."
         )
     return (
