@@ -163,7 +163,7 @@ def _check_chat(spec: str, name: str, *, is_free: bool, is_named: bool) -> None:
     if not is_free:
         raise InputError(
             f"task: a chat such as {name} answers in words; use "
-            "`task=answer`, and say the right `label`"
+            "`task=answer`, and set the right `label`"
         )
     if not is_named:
         raise InputError(
@@ -414,13 +414,13 @@ class AddressModel(models.RemoteNetwork):
             if "scores" not in answer:
                 raise errors.ModelError(
                     f"model {self.name}: answers in words ({answer['text'][:60]!r}), "
-                    "which are no scores; use "
-                    "`task=answer`, and say the right `label`"
+                    "and not with scores; use "
+                    "`task=answer`, and set the right `label`"
                 )
             if self.names and (other := answer["scores"].keys() - set(self.names)):
                 raise errors.ModelError(
-                    f"model {self.name}: says {min(other)!r}, "
-                    "which is none of the `labels`"
+                    f"model {self.name}: has a score for {min(other)!r}, "
+                    "which is not among the `labels`"
                 )
             rows.append(answer["scores"])
         return rows
@@ -593,7 +593,7 @@ class AddressModel(models.RemoteNetwork):
     def spending_sentence(self) -> str:
         """What a run has spent, as a sentence."""
         calls, tokens, money = self._spent_by_limit.values()
-        text = f"The model {self.name} was asked {calls:,} times"
+        text = f"The model {self.name} was called {calls:,} times"
         if tokens:
             text += f", {tokens:,} tokens"
         if money:
@@ -736,7 +736,7 @@ class AddressModel(models.RemoteNetwork):
         return errors.ModelError(
             f"model {self.name}: {spent:,.10g} {name} are spent, and `ask` allows "
             f"{limit:,.10g}; `advsearch resume RUN ask.{name}={advised_limit:.10g}` "
-            "goes on with more, and asks nothing twice"
+            "continues with a higher limit, and repeats no request"
         )
 
     def _send_together(
@@ -835,8 +835,8 @@ class AddressModel(models.RemoteNetwork):
         if 300 <= status < 400:
             location = self._clean(error.headers.get("Location", "elsewhere"))
             return (
-                f"sends on to {location}, and pictures and keys are not sent there; "
-                "give that address if you trust it"
+                f"redirects to {location}, and images and keys are not sent there; "
+                "use that address if you trust it"
             )
         if status in (401, 403):
             problem = "is not accepted" if models.read_key() else "is missing"

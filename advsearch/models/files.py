@@ -168,7 +168,7 @@ def _load_torchscript(archive: Archive) -> Source:
 def _find_archive_kind(archive: Archive) -> str:
     """Return the kind of an archive, "exported" or "torchscript".
 
-    The names of its members tell the kind.
+    It follows from the names of its members.
 
     Raises:
         FileFormatError: it is of another kind, such as a pickle that `torch.save` made.
@@ -218,7 +218,7 @@ def _describe_file(path: Path, head: bytes) -> str:
     """Describe what a file that is no zip archive may be, and what to do about it.
 
     Args:
-        path: path of the file, whose suffix is looked at.
+        path: path of the file, whose suffix matters.
         head: its first 16 bytes.
     """
     suffix = path.suffix.lower()
@@ -423,7 +423,7 @@ def _report_corrupt(path: Path, kind: str) -> AbstractContextManager[None]:
         f"model file {path}: cannot be read as {kind} with torch {torch.__version__}"
     )
     causes = (
-        "damaged, made by another version, or in need of unpickling, which is "
+        "corrupt, made by another version, or would have to be unpickled, which is "
         "never done"
     )
     return translate_errors(f"{problem}; {causes}", kind=FileFormatError)

@@ -252,7 +252,7 @@ def _check_reads_text(source: Source | Model, spec: object) -> None:
         reads_text = isinstance(source.module, RemoteNetwork)
     if source is spec or not reads_text:
         raise InputError(
-            f"prompt: model {source.name} has classes of its own and "
+            f"prompt: model {source.name} has its own classes and "
             "reads no text; leave `prompt` out"
         )
 
@@ -291,8 +291,8 @@ def _adapt_model(
     """
     if options:
         raise InputError(
-            f"model {model.name} brings its own preprocessing: leave out "
-            f"{', '.join(options)}, or load its network anew"
+            f"model {model.name} has its own preprocessing: leave out "
+            f"{', '.join(options)}, or load its network again"
         )
     # `spec` can load the model again only without another name or other labels. `read`
     # is not compared, since it usually follows from the task.

@@ -210,9 +210,9 @@ def _warn_of_odd_scores(model: Model, rows: Tensor) -> None:
     kind = _describe_odd_scores(model, rows)
     if kind:
         warn(
-            f"model {model.name} returns {kind}. They are taken for logits: the "
-            "probabilities that are shown are none, and margins are differences of "
-            "such scores. Return what stands before the last function"
+            f"model {model.name} returns {kind}. They are used as logits: displayed "
+            "probabilities are not meaningful, and margins are differences of such "
+            "scores. Return the values before the last function"
         )
 
 
@@ -363,14 +363,14 @@ def _describe_other_inputs(network: object, error: str) -> str:
     missing = _list_missing_inputs(network, error)
     if missing:
         return (
-            f"wants {' and '.join(missing)} beside pictures; wrap it in an nn.Module "
-            "that is called with pictures alone, as it is used outside of training"
+            f"needs {' and '.join(missing)} in addition to images; wrap it in an "
+            "nn.Module that is called with images only, as outside of training"
         )
     if any(isinstance(layer, nn.Conv3d) for layer in network.modules()):
         return (
-            "is made for videos or volumes (it has an nn.Conv3d), and pictures (N, 3, "
-            "H, W) are what is given; wrap it "
-            "in an nn.Module that makes one of each picture"
+            "is made for videos or volumes (it has an nn.Conv3d), but gets images (N, "
+            "3, H, W); wrap it in an nn.Module that makes a video or volume of each "
+            "image"
         )
     return ""
 
@@ -866,9 +866,9 @@ def _check_gradient(
         )
     warn(
         f"the gradient of model {model.name} does not say how its outputs change: "
-        f"{predicted:.3g} expected, {change.actual:.3g} seen for a small step along "
-        f"it. {reason} A search that follows them may find nothing: try a policy "
-        "without gradients beside it"
+        f"{predicted:.3g} expected, {change.actual:.3g} observed for a small step "
+        f"along it. {reason} A search by this gradient may find nothing: try a policy "
+        "without gradients, too"
     )
 
 

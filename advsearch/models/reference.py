@@ -219,7 +219,7 @@ def load_network(
         state = safetensors.load((folder / WEIGHTS).read_bytes())
     except FileNotFoundError as error:
         raise ModelError(
-            f"the reference model is not there ({error.filename}); {REMEDY}"
+            f"the reference model is missing ({error.filename}); {REMEDY}"
         ) from None
     except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
         raise ModelError(

@@ -117,7 +117,7 @@ class Purpose:
         if free and self.names is not None:
             raise InputError(
                 "labels: task answer has no classes; leave them out, and "
-                "say the right words with `label`"
+                "set the right words with `label`"
             )
         if len(prompts) > 1:
             raise InputError(
@@ -140,8 +140,8 @@ class Purpose:
         self.check(model, what, task)
         if self.names is None:
             raise InputError(
-                f"model {model} {what} and has no classes of its own: name them, two "
-                "at least, such as `labels=mug,cup,bowl` or `labels=imagenet`"
+                f"model {model} {what} and has no classes itself: set at least two, "
+                "such as `labels=mug,cup,bowl` or `labels=imagenet`"
             )
         return self.names
 
@@ -200,9 +200,9 @@ def _check_not_lazy(module: nn.Module, name: str) -> None:
     layer = lazy_keys[0].rpartition(".")[0]
     raise ModelError(
         f"model {name}: its layer {layer} "
-        f"({type(module.get_submodule(layer)).__name__}) has no weights before it "
-        "has seen a picture; call the network once with one, load its weights, and "
-        "give it then"
+        f"({type(module.get_submodule(layer)).__name__}) has no weights before its "
+        "first call; call the network once with an image, load its weights, and pass "
+        "it then"
     )
 
 
@@ -353,7 +353,7 @@ def split_weights(spec: str) -> tuple[str, Path | None]:
 def load_callable(spec: str, libraries: Iterable[str] = ()) -> Source | Model:
     """Return the model behind ``package.module:callable[@weights.safetensors]``.
 
-    The module is looked for on `sys.path` and in the current directory. The attribute
+    The module is searched on `sys.path` and in the current directory. The attribute
     is an `nn.Module`, a `Model`, or something that returns one when called without
     arguments (a function, or a class of modules).
 

@@ -146,7 +146,7 @@ def allow_code_of_call(function: Function) -> Function:
 
 
 def _to_list(value: Any) -> list[Any]:
-    """Return the items of a list, the names of a mapping, or any other value alone."""
+    """Return the items of a list, the keys of a mapping, or a list of another value."""
     return list(value) if isinstance(value, (list, tuple, Mapping)) else [value]
 
 

@@ -337,7 +337,7 @@ def rewrite_program(archive: Archive) -> io.BytesIO:
 
     Raises:
         FileFormatError: the archive has something that a plain network does not have;
-            the message says what.
+            the message names it.
     """
     # This import takes a second, and only this kind of model needs it.
     from torch.export.pt2_archive import PT2ArchiveWriter

@@ -98,7 +98,7 @@ def check_request(
         )
     is_same_origin = headers.get("Sec-Fetch-Site", "none") in ("none", "same-origin")
     # Another site may link to a page here, which the user then sees. It cannot read
-    # that page, and a POST from it is refused, since that could change something.
+    # that page, and a POST from it is rejected, since that could change something.
     follows_link = headers.get("Sec-Fetch-Mode") == "navigate" and command != "POST"
     if not is_same_origin and not follows_link:
         raise RequestRejected(

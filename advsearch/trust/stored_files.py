@@ -84,7 +84,7 @@ def scale_limit(limit: int) -> int:
     try:
         factor = float(text)
     except ValueError:
-        factor = math.nan  # refused below
+        factor = math.nan  # rejected below
     if not 0 < factor < math.inf:
         raise InputError(
             f"{FACTOR}: expected a number greater than 0, by which limits "

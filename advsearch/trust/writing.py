@@ -121,7 +121,7 @@ def replace_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
 def check_free_folder(out: Path, setting: str) -> None:
     """Check that a folder to be written does not exist yet or is empty.
 
-    A link is refused: the finished folder could not replace it, and it may lead to
+    A link is rejected: the finished folder could not replace it, and it may lead to
     files of somebody else.
 
     Args:

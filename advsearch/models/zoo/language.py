@@ -71,8 +71,8 @@ def make_language_source(loaded: LoadedNetwork) -> models.Source:
         _check_has_choice(names, name)
     kind = type(loaded.network).__name__
     with models.translate_errors(
-        f"model {loaded.spec}: is a {kind}, which can't be asked about "
-        "a picture as LLaVA can"
+        f"model {loaded.spec}: is a {kind}, which cannot be questioned about "
+        "an image as LLaVA can"
     ):
         reader = _LanguageModel(loaded, processor, question or models.QUESTION)
         # Without names, likelihoods are checked with another text.
@@ -175,7 +175,7 @@ def _warn_of_prefixes(
             models.warn(
                 f"model {model_name} reads {names[first]!r} (#{first}) as the "
                 f"beginning of {names[second]!r} "
-                f"(#{second}): whoever says the second has said the first"
+                f"(#{second}): an answer with the second begins with the first"
             )
             return
 
@@ -256,9 +256,9 @@ class _LanguageModel(nn.Module):
         is_accurate = max_error <= PIXEL_TOLERANCE * float(expected.abs().max())
         if not is_accurate:  # also if the error is NaN
             raise errors.ModelError(
-                f"model {spec}: its processor {type(self.processor).__name__} does "
-                "something else to numbers than to 8-bit pictures. Wrap network and "
-                "processing in an nn.Module of yours, and give that from Python"
+                f"model {spec}: its processor {type(self.processor).__name__} treats "
+                "floating-point images differently from 8-bit images. Wrap network and "
+                "processor in an nn.Module, and pass that from Python"
             )
 
     def _process(self, image: Any, text: str = "", **options: Any) -> dict[str, Tensor]:
@@ -400,7 +400,7 @@ class _LanguageModel(nn.Module):
         returned = self.network(**self.make_inputs(image), use_cache=True)
         past = returned.get(self.cache_name)
         if past is None:
-            raise ValueError("it keeps no keys and values of what it has read")
+            raise ValueError("it returns no cache of keys and values")
         return returned.logits[0, -1].float(), past
 
     def continue_with(self, tokens: Tensor, past: Any) -> Tensor:
@@ -706,6 +706,6 @@ def _make_unsupported_error(loaded: LoadedNetwork, what: str) -> errors.ModelErr
     """
     return errors.ModelError(
         f"model {loaded.spec}: is a {type(loaded.network).__name__}, which {what}; "
-        "expected one that goes on with the text it is given, such as "
+        "expected one that continues its input text, such as "
         "LlavaForConditionalGeneration or Qwen2_5_VLForConditionalGeneration"
     )

@@ -508,15 +508,14 @@ def _check_reads_images(zoo: Any, name: str, spec: str) -> None:
 
 
 NOT_FOR_PICTURES = {
-    "video": "is made for videos, and pictures are what is given here; name a network "
-    "for pictures, or wrap it in an "
-    "nn.Module that makes a video of each picture and give that from Python",
-    "optical_flow": "compares two pictures of a video, and one at a time is given "
-    "here; name a network for one picture",
-    "quantization": "is quantised: it rounds as it runs, and no gradient goes through "
-    "it; name {plain}, which it was "
-    "made of, or give it from Python and search with a policy without gradients, such "
-    "as nes",
+    "video": "is made for videos, but gets images here; name a network for images, or "
+    "wrap it in an nn.Module that makes a video of each image, and pass that from "
+    "Python",
+    "optical_flow": "compares two images of a video, but gets one at a time here; "
+    "name a network for single images",
+    "quantization": "is quantized: it rounds, and no gradient goes through it; name "
+    "{plain}, of which it was made, or pass it from Python and search with a policy "
+    "without gradients, such as nes",
 }
 """Descriptions of torchvision's other networks by module, with advice, for messages."""
 

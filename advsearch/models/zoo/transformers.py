@@ -212,7 +212,7 @@ def _load_part(
         loader: class of the package that loads it, such as "AutoTokenizer".
     """
     with report_library_errors(
-        spec, "Give a repository, or a folder, in which it is beside the network"
+        spec, "Give a repository, or a folder, that also has this part"
     ):
         return getattr(transformers, loader).from_pretrained(
             name, trust_remote_code=False, **hub_options
@@ -241,10 +241,10 @@ def _find_family(architecture: str, network: Any, spec: str) -> Family:
         f"model {spec}: is a {architecture}; expected one whose name has "
         "ForImageClassification, ForVideoClassification, ForSemanticSegmentation, "
         "ForUniversalSegmentation, ForObjectDetection or ForDepthEstimation in it, "
-        "one that compares pictures with texts, as CLIPModel, one that goes on in "
-        "words, as LlavaForConditionalGeneration, or one that has features, as "
-        "Dinov2Model. Wrap another in an nn.Module whose output a task can judge, "
-        "your own too, and give that from Python"
+        "one that compares images with texts, such as CLIPModel, one that continues "
+        "a text, such as LlavaForConditionalGeneration, or one that has features, such "
+        "as Dinov2Model. Wrap any other in an nn.Module whose output a task can read, "
+        "and pass that from Python"
     )
 
 
@@ -286,8 +286,8 @@ def _load_config(
             f"model {spec}: {name} is no folder here{_suggest_folders(name)}, and no "
             "repository of that name is in the "
             f"cache{_format_suggestions(models.find_similar_names(name, cached))} or "
-            f"can be had ({models.get_first_line(error)}). Check the name and the "
-            "network, or give a folder"
+            f"can be downloaded ({models.get_first_line(error)}). Check the name and "
+            "the connection, or give a folder"
         ) from error
 
 
@@ -352,7 +352,7 @@ def _check_weights(network: Any, report: Any, spec: str) -> None:
     raise errors.ModelError(
         f"model {spec}: its files lack {len(missing)} of the network's weights "
         f"({examples}), which would be random. "
-        "Give a repository that was trained for this, not one of its beginnings"
+        "Give a repository that was trained for this task, not only pretrained"
     )
 
 

@@ -70,9 +70,9 @@ def make_zero_shot_source(loaded: LoadedNetwork) -> models.Source:
     is_trained_with_sigmoid = hasattr(loaded.network, "logit_bias")
     if is_trained_with_sigmoid:
         models.warn(
-            f"model {name} judges each name by itself, with a sigmoid of its logit: "
-            f"the scores that are shown are a softmax over the {len(names)} names, and "
-            "margins are differences of logits"
+            f"model {name} scores each name independently, by a sigmoid of its logit: "
+            f"displayed scores are a softmax over the {len(names)} names, and margins "
+            "are differences of logits"
         )
     return source
 
@@ -302,7 +302,7 @@ def warn_of_equal_texts(
         if first != index:
             models.warn(
                 f"model {name} reads {names[first]!r} (#{first}) and {names[index]!r} "
-                f"(#{index}) as the same text: it cannot tell one from the other"
+                f"(#{index}) as the same text: it cannot distinguish them"
             )
             return
 
@@ -322,7 +322,7 @@ def make_detector_source(loaded: LoadedNetwork) -> models.Source:
     Its network is one of `DETECTORS`.
     """
     names = loaded.purpose.require_names(
-        loaded.name, "finds what it is told to", "detection"
+        loaded.name, "finds objects by their names", "detection"
     )
     tokenizer = loaded.load_part("AutoTokenizer")
     words = get_spoken_names(names)

@@ -422,8 +422,8 @@ def replay(
     if isinstance(attack, AttackResult):
         if attack.run is None:
             raise InputError(
-                "attack: expected an attack that was kept, got one that "
-                "was not; give it a `run`"
+                "attack: expected an attack whose run is stored, got one that "
+                "is not; set its `run`"
             )
         run = attack.run
         # Parts that exist only in Python, such as a model object, cannot be loaded from

@@ -730,8 +730,8 @@ class ClaimTester:
         """Load scene, model and task, and add remarks on them to the warnings."""
         parts = workbench.load_parts(AttackConfig.from_config(config))
         _, model_warnings = parts.model_and_warnings
-        # `make_problem` appends remarks of the task to this list. They are not wanted
-        # here, since the reason of each claim has them: the list is copied before.
+        # `make_problem` appends remarks of the task to this list. The list is copied
+        # before, because the reason of each claim has these remarks already.
         remarks = list(model_warnings)
         problem = workbench.make_problem(parts, differentiated=False)
         self.model_names[config.model] = problem.model.name
