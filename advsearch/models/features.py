@@ -43,8 +43,9 @@ Read = Callable[[Tensor], Tensor]
 @final
 @dataclass(frozen=True, eq=False)
 class Features:
-    """A model as a differentiable function from images to features; created by
-    `features_of`.
+    """A model as a differentiable function from images to features.
+
+    `features_of` creates it.
     """
 
     model: Model
@@ -57,13 +58,13 @@ class Features:
     penultimate: bool = True
 
     def __call__(self, images: Tensor) -> Tensor:
-        """Compute the features (N, F), float32, of images as `Model` takes them;
-        differentiable.
+        """Compute the features (N, F), float32, of images, differentiably.
 
-        The network runs once more: the logits are not computed with them.
+        The images are as `Model` takes them. The network is run for the features only:
+        logits need another run.
 
         Raises:
-            InputError: not an image, or values that are clearly not in [0, 1].
+            InputError: they are no images, or values are clearly not in [0, 1].
         """
         images = check_images(images)
         batches = images.split(self.model.batch_limits[1])

@@ -296,8 +296,7 @@ such a text: nothing in it is nested.
 
 
 def _is_name_list(source: str | os.PathLike[str]) -> bool:
-    """Return whether a text is names with commas between them, and not the path of a
-    file.
+    """Return whether a text has names with commas between them, and is no path.
 
     A text that ends with ".json" or ".txt" is a path even if there is no such file.
     """

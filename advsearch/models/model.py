@@ -167,8 +167,10 @@ class RemoteNetwork:
         raise NotImplementedError
 
     def store_answers_in(self, store: Any) -> None:
-        """Store answers and what is spent in an `advsearch.runs.store.Store` from now
-        on.
+        """Store answers and what is spent in a run from now on.
+
+        Args:
+            store: an `advsearch.runs.store.Store`.
         """
         raise NotImplementedError
 
@@ -352,7 +354,7 @@ class Model:
             it is a list of N tuples: the output for each camera, of batch size 1.
 
         Raises:
-            InputError: not an image, or values that are clearly not in [0, 1].
+            InputError: they are no images, or values are clearly not in [0, 1].
             ModelError: the network's output is not (N, classes), or `read` finds no
                 output in it.
         """
@@ -451,8 +453,10 @@ class Model:
         return replace(self, module=shared, make_trainable=None)
 
     def label_set(self, text: str | int | Sequence[str | int]) -> LabelSet:
-        """Return the classes that `text` names, e.g. ``"coffee mug,cup"`` or
-        ``"#504"``; see `find_label_set`.
+        """Return the classes that a text names; see `find_label_set`.
+
+        Args:
+            text: such as ``"coffee mug,cup"`` or ``"#504"``.
         """
         return find_label_set(text, self.labels, named=self.named)
 

@@ -132,6 +132,7 @@ class _Residual(nn.Module):
         self.activation = nn.SiLU()
 
     def forward(self, x: Tensor) -> Tensor:
+        """Return the output of the block for an input (N, channels, H, W)."""
         branch = self.second(self.activation(self.first(x)))
         result: Tensor = self.activation(branch + self.shortcut(x))
         return result

@@ -136,6 +136,7 @@ def allow_code_of_call(function: Function) -> Function:
 
     @wraps(function)
     def wrapper(*args: Any, **keywords: Any) -> Any:
+        """Allow the code in the arguments, and call the function."""
         # Arguments that do not fit the signature raise TypeError here; the call below
         # raises a better one.
         with suppress(TypeError):
@@ -152,8 +153,9 @@ def _to_list(value: Any) -> list[Any]:
 
 @contextmanager
 def restrict_allowed_code() -> Iterator[None]:
-    """Allow no code at the beginning of the block, and restore what is allowed after
-    it.
+    """Allow no code at the beginning of the block.
+
+    After it, exactly the code is allowed that was allowed before.
     """
     before = allowed_code()
     _ALLOWED.clear()

@@ -34,8 +34,10 @@ _SUPER_JOURNAL_END = bytes.fromhex("d9d505f920a163d7")
 
 @contextmanager
 def translate_database_errors(path: Path) -> Iterator[None]:
-    """Turn errors of SQLite inside the block into a FileFormatError that names the
-    file.
+    """Turn errors of SQLite inside the block into errors that name the file.
+
+    Raises:
+        FileFormatError: in place of an error of SQLite.
     """
     try:
         yield

@@ -458,6 +458,7 @@ class QuantityMeasurer:
         )
 
         def advance(**info: float | str) -> None:
+            """Move the bar to the seconds that have passed."""
             nonlocal done
             passed = min(total, total - math.ceil(budget.seconds_left))
             self._progress.advance(passed - done, **info)

@@ -99,6 +99,7 @@ class ReplayConfig(Config):
     @field_validator("ways")
     @classmethod
     def _check_names(cls, value: str | None) -> str | None:
+        """Reject a name that is not in `RENDER_METHODS`."""
         if value is not None and set(settings.split_names(value)) - set(RENDER_METHODS):
             raise ValueError("an unknown way")
         return value

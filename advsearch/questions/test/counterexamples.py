@@ -394,8 +394,9 @@ def compute_scene_digest(description: SceneDescription) -> str:
 
 
 def select_deciding_settings(config: AttackConfig) -> dict[str, Any]:
-    """Return the settings that decide a verdict, without those of the network, for
-    JSON.
+    """Return the settings that decide a verdict, without those of the network.
+
+    They are JSON values.
     """
     left_out = NOT_DECIDING | {*MODEL_SETTINGS}
     return {
