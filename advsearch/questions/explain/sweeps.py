@@ -142,10 +142,7 @@ def cut_controls(
         instance, _, parameter = condition.factor.partition(".")
         declared = config.declared_parameters(instance) or {}
         low, high = _find_range(condition, table, arc)
-        is_allowed = (
-            high <= declared[parameter].high
-        )  # False for an arc past 360 degrees
-        if not is_allowed:
+        if high > declared[parameter].high:  # an arc that passes 360 degrees
             continue
         # the settings of the sweep, without ranges that were added for other conditions
         has_ranges = bool(declared.keys() & config.controls[instance].keys())

@@ -18,7 +18,9 @@ from advsearch.questions.precision.result import (
     view=make_view,
 )
 def precision(context: RunContext[PrecisionConfig]) -> PrecisionResult:
-    """Measure error against run time of a scene and its gradients (docs/precision.md)."""
+    """Measure error against run time of a scene and its gradients
+    (docs/precision.md).
+    """
     # This import takes long, because it imports torch.
     from advsearch.questions.precision.carry_out import measure_precision
 

@@ -234,8 +234,8 @@ HEADS = (
 
 TRIALS_NOTE = (
     "Trials have fresh seeds, the same under every condition, and images are rounded "
-    "to 8 bits. Intervals are 95 % Clopper-Pearson intervals. A trial is a success if the "
-    "adversarial scene has the prediction that the search was for, and the model is "
+    "to 8 bits. Intervals are 95 % Clopper-Pearson intervals. A trial is a success if "
+    "the adversarial scene has the prediction that the search was for, and the model is "
     "right for the clean scene with the same seed under the same condition."
 )
 VERDICTS = {HOLDS: "holds", CLEAN_IS_WRONG: "clean is wrong too"}
