@@ -131,24 +131,9 @@ def _check(node: ast.expr, depth: int, max_power: int) -> None:
             is_numbered_symbol = is_symbol(name) and name[-1].isdecimal()
             if name not in NAMES and not is_numbered_symbol:
                 raise ValueError(f"the name {name[:40]!r}")
-        case ast.Call(func=ast.Name(id="Symbol")):
-            _check_symbol(node)
-        case ast.Call(func=ast.Name(id="Float")):
-            _check_decimal(node)
-        # Only the two calls above may have keywords: Symbol("s0", integer=True).
-        case ast.Call(keywords=[_, *_]):
-            raise ValueError("a call with keywords")
-        # A power. `_divide_max_power` checks the exponent, so that only the base is an
-        # operand.
-        case ast.Call(func=ast.Name(id=name), args=[base, exponent]) if name in POWERS:
-            operands = [base]
-            max_power = _divide_max_power(exponent, max_power)
-        case ast.Call(func=ast.Name(id=name), args=arguments) if (
-            name in FUNCTIONS and len(arguments) <= MAX_ARGUMENTS
-        ):
-            operands = arguments
-        case ast.Call(func=function):
-            raise ValueError(f"a call of {ast.unparse(function)[:40]!r}")
+        case ast.Call():
+            operands, max_power = _check_call(node, max_power)
+        # `_divide_max_power` checks the exponent of a power: only the base is left.
         case ast.BinOp(left=base, op=ast.Pow(), right=exponent):
             operands = [base]
             max_power = _divide_max_power(exponent, max_power)
@@ -169,6 +154,39 @@ def _check(node: ast.expr, depth: int, max_power: int) -> None:
             raise ValueError(f"{type(node).__name__} is no arithmetic")
     for operand in operands:
         _check(operand, depth - 1, max_power)
+
+
+def _check_call(call: ast.Call, max_power: int) -> tuple[list[ast.expr], int]:
+    """Check that an expression may call a function.
+
+    Args:
+        call: node of the call.
+        max_power: maximum product of the exponents in the call.
+
+    Returns:
+        The arguments that are still to be checked, and the maximum product of the
+        exponents in them.
+
+    Raises:
+        ValueError: it may not; the message is a clause about what was got instead.
+    """
+    match call:
+        case ast.Call(func=ast.Name(id="Symbol")):
+            _check_symbol(call)
+            return [], max_power
+        case ast.Call(func=ast.Name(id="Float")):
+            _check_decimal(call)
+            return [], max_power
+        # Only the two calls above may have keywords: Symbol("s0", integer=True).
+        case ast.Call(keywords=[_, *_]):
+            raise ValueError("a call with keywords")
+        case ast.Call(func=ast.Name(id=name), args=[base, exponent]) if name in POWERS:
+            return [base], _divide_max_power(exponent, max_power)
+        case ast.Call(func=ast.Name(id=name), args=arguments) if (
+            name in FUNCTIONS and len(arguments) <= MAX_ARGUMENTS
+        ):
+            return arguments, max_power
+    raise ValueError(f"a call of {ast.unparse(call.func)[:40]!r}")
 
 
 def _check_number(value: object) -> None:
