@@ -861,8 +861,8 @@ def _advise_on_missing_scores(returned: Any) -> str:
     are_losses = all(isinstance(value, Tensor) and value.ndim == 0 for value in values)
     if values and are_losses:
         return (
-            "one number for all pictures is what a loss is: give the network as it "
-            "is outside of training"
+            "one number for all images is a loss: give the network as it is outside "
+            "of training"
         )
     # The first element of a list may be the labels of boxes: no advice is given.
     if isinstance(returned, (list, tuple)):

@@ -173,7 +173,7 @@ def _check_finite(model: Model, rows: Tensor) -> None:
     raise ModelError(
         f"model {model.name}: expected finite {expected}, got NaN or infinity for a "
         f"{image} image; "
-        "check its weights and the value range and normalisation that it expects"
+        "check its weights and the value range and normalization that it expects"
     )
 
 
@@ -344,8 +344,7 @@ LABEL_ARGUMENTS = {
     "annotations",
     "ground_truth",
 }
-"""Names of arguments that take the right labels, in networks as they are for training.
-"""
+"""Names of arguments that take the right labels, for networks that compute a loss."""
 
 
 def _describe_other_inputs(network: object, error: str) -> str:
@@ -733,7 +732,8 @@ def _try_attached(
             change = _measure_change(model, images, step, attached_gradient, gradient)
             attached_change, detached_change = change.predicted
             detached_error = abs(change.actual - detached_change)
-            # better than the network's own gradient, and good by itself
+            # The error has to be smaller than that of the network's own gradient, and
+            # small compared to the change.
             max_error = min(detached_error, MAX_ATTACHED_ERROR * abs(attached_change))
             if abs(change.actual - attached_change) < max_error:
                 return attached, attached_gradient

@@ -61,7 +61,7 @@ def make_language_source(loaded: LoadedNetwork) -> models.Source:
         InputError: there are fewer than two names, or prompt and name are too long.
     """
     if getattr(loaded.network.config, "is_encoder_decoder", False):
-        raise _make_unsupported_error(loaded, "reads from an encoder of its own")
+        raise _make_unsupported_error(loaded, "has a separate encoder")
     processor = _load_processor(loaded)
     purpose = loaded.purpose
     name = loaded.name
@@ -702,7 +702,7 @@ def _make_unsupported_error(loaded: LoadedNetwork, what: str) -> errors.ModelErr
 
     Args:
         loaded: the network.
-        what: what it does, such as "reads from an encoder of its own".
+        what: what it does, such as "has a separate encoder".
     """
     return errors.ModelError(
         f"model {loaded.spec}: is a {type(loaded.network).__name__}, which {what}; "

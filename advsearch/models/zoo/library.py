@@ -282,7 +282,7 @@ def _wrap_processor(
     image = torch.from_numpy(levels).float() / 255.0
     try:
         output, has_gradient = _call_with_gradient(call, image.movedim(2, 0)[None])
-    except Exception as error:  # a processor with numpy raises nearly anything
+    except Exception as error:  # a processor with numpy raises errors of many types
         advice = ""
         if getattr(processor, "backend", None) == "pil":
             advice = "; with torchvision installed, transformers takes one that may"
@@ -408,9 +408,9 @@ class LoadedNetwork:
         """
         if self.processor is None:
             models.warn(
-                f"model {self.spec} comes without an image processor: pictures are "
-                "given as they are, RGB in [0, 1]. Say `mean`, `std` and `input_size` "
-                "of load_model if it wants them otherwise"
+                f"model {self.spec} comes without an image processor: images are not "
+                "changed, RGB in [0, 1]. Set `mean`, `std` and `input_size` of "
+                "load_model if it needs others"
             )
             return Processing()
         return measure_processor(self.processor, self.spec)

@@ -223,7 +223,7 @@ class Sitting(results.Fields):
     points: list[PrecisionPoint] = Field(default=[])
     references: list[PrecisionReference] = Field(default=[])
     confirmations: list[PrecisionPoint] = Field(
-        default=[], description="recommended settings, measured anew"
+        default=[], description="new measurements of recommended settings"
     )
     warnings: list[str] = Field(default=[])
     left_out: list[str] = Field(default=[])

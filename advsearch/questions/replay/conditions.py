@@ -584,7 +584,7 @@ def batch_by_renders(
     """Divide conditions into batches that share their renders.
 
     The first batch has all conditions that share the renders of the run; it is empty if
-    there are none. Every other condition is a batch by itself.
+    there are none. Every other condition is a separate batch.
 
     Args:
         conditions: the conditions.
@@ -638,7 +638,7 @@ class _Table:
             if condition.unavailable_reason
         ]
         if reasons:
-            # It is a batch by itself: conditions that share renders are available.
+            # Then it is the only condition: those that share renders are available.
             self._add_not_done(conditions, reasons[0])
             return
         try:
