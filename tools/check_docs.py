@@ -463,7 +463,7 @@ MADE_BY_HAND = [
     (
         "testing.md",
         "in all {} trials ({} for one".format(
-            *(tested.count_trials(over=over) for over in (False, True))
+            *(tested.count_trials(has_conditions=over) for over in (False, True))
         ),
     ),
     (

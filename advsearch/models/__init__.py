@@ -1,5 +1,6 @@
-"""The network under test: loading it, asking it, naming its classes; and what a source
-of models needs. Torch only.
+"""Load and run the network under test, name its classes, and define sources of models.
+
+Only torch is needed.
 """
 
 from __future__ import annotations

@@ -1,10 +1,11 @@
-"""Ask models behind addresses, ``http://...`` and ``https://...``, that only answer.
+"""Send images to models behind addresses (``http://...``, ``https://...``).
 
-A model of the plain protocol gets ``{"image": PNG in base64, "prompt": text}`` and
-returns ``{"scores": {name: fraction}}`` or ``{"text": answer}``. One whose path ends in
-``/chat/completions`` gets requests of OpenAI's chat. A key from the environment is sent
-along, to this address alone: redirects are not followed, and no message, row or file
-has the key.
+Such a model returns answers, but no gradients. In the plain protocol it gets
+``{"image": PNG in base64, "prompt": text}`` and returns ``{"scores": {name:
+fraction}}`` or ``{"text": answer}``. If the path of the address ends in
+``/chat/completions``, requests follow the protocol of OpenAI's chat. A key from the
+environment is sent to this address only: redirects are not followed, and the key is
+written to no message, row or file.
 """
 
 from __future__ import annotations
@@ -44,16 +45,19 @@ LIMITS: dict[str, float] = {
     "calls": 2000, "at_once": 4, "tokens": float("inf"), "money": float("inf"),
     "per_call": 0.0, "per_million_in": 0.0, "per_million_out": 0.0, "seconds": 120.0,
 }  # fmt: skip
-"""Limits that `ask` may set, with their defaults: maximum number of calls of a run, and
-of concurrent ones; maximum of tokens and money; price of a call and of a million tokens
-in and out, in the unit of `money`; maximum duration of an answer in seconds.
+"""Limits and prices that `ask` may set, with their defaults.
+
+`calls` is the maximum number of calls of a run, and `at_once` that of concurrent calls.
+`tokens` and `money` limit what a run spends; infinity means no limit. `per_call`,
+`per_million_in` and `per_million_out` are the prices of a call and of a million tokens
+in and out, in the unit of `money`. `seconds` is the maximum duration of an answer.
 """
 
 MAX_TRIES = 5
 FIRST_DELAY = 1.0
 MAX_DELAY = 60.0
-"""How often an image is sent to a server that is busy or fails, and the first and
-maximum delay in seconds, which doubles each time.
+"""Maximum number of times that a request is sent if the server is busy or fails; and
+the first and the maximum delay between them, in seconds. The delay doubles each time.
 """
 
 MAX_CONCURRENT = 64
@@ -100,7 +104,8 @@ def load(spec: str, purpose: models.Purpose) -> Model:
     Raises:
         CodeNotAllowedError: the address comes from a file, and the user has not allowed
             it.
-        InputError: it is no valid address, or a chat is asked for scores.
+        InputError: it is no valid address, or the task needs scores, which a chat does
+            not return.
         ModelError: it cannot do the task, or there is no answer.
     """
     address = models.check_address(spec)
@@ -153,12 +158,12 @@ def _check_chat(spec: str, name: str, *, is_free: bool, is_named: bool) -> None:
         is_named: whether the address names the chat's model behind a #.
 
     Raises:
-        InputError: one of the two is not the case.
+        InputError: the task needs scores, or the address names no model.
     """
     if not is_free:
         raise InputError(
             f"task: a chat such as {name} answers in words; use "
-            "`task=answer`, and say the right `label`"
+            "`task=answer`, and set the right `label`"
         )
     if not is_named:
         raise InputError(
@@ -181,7 +186,8 @@ def resolve_limits(ask: Mapping[str, float]) -> dict[str, float]:
     """Return all limits of a run: those that the setting `ask` sets, else the defaults.
 
     Raises:
-        InputError: a name is unknown, or a number is out of range.
+        InputError: a name is unknown, a number is out of range, or `money` is limited
+            without a price.
     """
     for name, value in ask.items():
         if name not in LIMITS:
@@ -201,10 +207,10 @@ def resolve_limits(ask: Mapping[str, float]) -> dict[str, float]:
     has_price = any(
         limits[name] for name in ("per_call", "per_million_in", "per_million_out")
     )
-    # Without a price nothing is spent, and a limit of money would never be reached.
+    # Without a price no money is spent, and a limit of money would never be reached.
     if "money" in ask and not has_price:
         raise InputError(
-            "`ask` money: expected a price beside it; give `ask` per_call, or "
+            "`ask` money: expected a price too; give `ask` per_call, or "
             "per_million_in and per_million_out"
         )
     return limits
@@ -215,7 +221,7 @@ class _Request:
     """A request that is to be sent.
 
     Attributes:
-        index: index of its body.
+        index: index of its body in the list of bodies to send.
         tries_left: how often it may be sent, this time included.
         delay: seconds to wait if this try fails.
     """
@@ -261,7 +267,8 @@ class _Connection(http.client.HTTPConnection):
         """End whatever is being sent or read; a connection that has ended stays so."""
         for opened in (self.sock, self.connected):
             if opened is not None:
-                # not the method of an SSL socket, which would wait for the other side
+                # Not `opened.shutdown`: that of an SSL socket would wait for the
+                # server.
                 with suppress(OSError):
                     socket.socket.shutdown(opened, socket.SHUT_RDWR)
 
@@ -323,25 +330,25 @@ class _SecureHandler(_TrackingHandler, urllib.request.HTTPSHandler):
 class AddressModel(models.RemoteNetwork):
     """A model behind an address, as a network.
 
-    It answers images (N, 3, H, W) in [0, 1], rounded to 8 bits: logits (N, names), or
-    without names the texts about each image
+    Its input are images (N, 3, H, W) in [0, 1], which are rounded to 8 bits. Its output
+    are logits (N, names), or without names the texts about each image
     (`advsearch.tasks.answers.AnswersWithoutLogits`). The same image is not sent twice
-    in a run, also if the run is resumed.
+    in a run, even if the run is resumed.
 
     Attributes:
         url: URL of requests.
         name: name in messages.
         spec: what the user wrote.
-        limits: limits of a run, see `LIMITS`.
+        limits: limits and prices of a run, with all names of `LIMITS`.
         chat: the name of a chat's model; empty for the plain protocol.
         question: question about the image; may be empty.
         tokens: maximum length of an answer in words.
         times: number of requests per image.
         names: names with scores in answers.
-        spent: calls, and tokens in and out, of a run including what it was resumed
-            from.
-        store: the run that stores answers and what is spent.
-        answer_cache: answers, if no run stores them.
+        spent: number of "calls", "tokens_in" and "tokens_out" of a run. If the run was
+            resumed, those before the interruption are included.
+        store: the run that stores answers and what is spent; None if there is no run.
+        answer_cache: answers by key, if no run stores them.
     """
 
     url: str
@@ -358,18 +365,18 @@ class AddressModel(models.RemoteNetwork):
     answer_cache: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def __call__(self, pictures: Tensor) -> Any:
-        """Return what the model answers about images (N, 3, H, W) in [0, 1].
+        """Return the model's output for images (N, 3, H, W) in [0, 1].
 
-        They are logits (N, names). If the model has no names, they are the texts about
-        each image, ``{"texts": [...]}``.
+        The output are logits (N, names). If the model has no names, it is a list with
+        the texts about each image, ``{"texts": [...]}``.
         """
         # what an image file holds: integers from 0 to 255, channels last
         levels = (pictures.clamp(0.0, 1.0).nan_to_num() * 255.0).round().to(torch.uint8)
         images = list(levels.permute(0, 2, 3, 1).cpu().contiguous().numpy())
         if not self.names:
             return [{"texts": texts} for texts in self._request_texts(images)]
-        # A score of 0, or of a name that is missing in the answer, has no logarithm:
-        # `MIN_SCORE` takes its place.
+        # A score of 0 has no logarithm, so that `MIN_SCORE` replaces it. A name that is
+        # missing in the answer has a score of 0.
         rows = [
             [max(scores.get(name, 0.0), MIN_SCORE) for name in self.names]
             for scores in self.request_scores(images)
@@ -388,6 +395,7 @@ class AddressModel(models.RemoteNetwork):
         for answer in self._get_answers(requests):
             scores: dict[str, float] = answer.get("scores") or {answer["text"]: 1.0}
             texts.append(max(scores, key=scores.__getitem__))
+        # The texts about one image follow each other.
         return [
             texts[start : start + self.times]
             for start in range(0, len(texts), self.times)
@@ -399,18 +407,20 @@ class AddressModel(models.RemoteNetwork):
         Raises:
             ModelError: an answer is in words, or has other names than the labels.
         """
+        # One request is enough for scores, so that each image has turn 0 only.
+        turn = 0
         rows = []
-        for answer in self._get_answers([(image, 0) for image in images]):
+        for answer in self._get_answers([(image, turn) for image in images]):
             if "scores" not in answer:
                 raise errors.ModelError(
                     f"model {self.name}: answers in words ({answer['text'][:60]!r}), "
-                    "which are no scores; use "
-                    "`task=answer`, and say the right `label`"
+                    "and not with scores; use "
+                    "`task=answer`, and set the right `label`"
                 )
             if self.names and (other := answer["scores"].keys() - set(self.names)):
                 raise errors.ModelError(
-                    f"model {self.name}: says {min(other)!r}, "
-                    "which is none of the `labels`"
+                    f"model {self.name}: has a score for {min(other)!r}, "
+                    "which is not among the `labels`"
                 )
             rows.append(answer["scores"])
         return rows
@@ -418,7 +428,8 @@ class AddressModel(models.RemoteNetwork):
     def store_answers_in(self, store: AnswerStore) -> None:
         """Store answers and what is spent in a run from now on.
 
-        Its stored answers are not requested again, and counts continue.
+        Answers that the run has already stored are not requested again, and its counts
+        are continued.
         """
         self.spent += Counter(store.read_json_note(f"asked {self.spec}") or {})
         self.store = store
@@ -433,8 +444,9 @@ class AddressModel(models.RemoteNetwork):
         are all sent, since their noise differs.
 
         Args:
-            requests: images, each with its turn: the number of the request about that
-                image, from 0. A model that answers by chance is asked in several turns.
+            requests: images, each with its turn. The turn is the index of the request
+                about that image, from 0: a model with random answers gets the same
+                image in several turns.
         """
         keys = list[str]()
         answers = dict[str, Any]()
@@ -446,7 +458,7 @@ class AddressModel(models.RemoteNetwork):
             key = f"answer {hashlib.blake2b(request, digest_size=16).hexdigest()}"
             keys.append(key)
             answers[key] = self._read_stored_answer(key)
-            if not isinstance(answers[key], dict):  # it is not stored, or damaged
+            if not isinstance(answers[key], dict):  # it is not stored, or corrupt
                 new_bodies[key] = body
         new_keys = list(new_bodies)
         read_answer = self._read_chat if self.chat else self._read_plain
@@ -518,7 +530,9 @@ class AddressModel(models.RemoteNetwork):
             return {"scores": scores}
         if isinstance(text, str):
             return {"text": text[:MAX_ANSWER_CHARACTERS]}
-        raise self._make_error('{"scores": {NAME: SHARE}} or {"text": WORDS}', response)
+        raise self._make_error(
+            '{"scores": {NAME: FRACTION}} or {"text": WORDS}', response
+        )
 
     def _read_chat(self, response: Mapping[str, Any]) -> dict[str, Any]:
         """Return the answer in a response of a chat, as ``{"text": answer}``.
@@ -556,16 +570,19 @@ class AddressModel(models.RemoteNetwork):
 
     @property
     def _spent_by_limit(self) -> dict[str, float]:
-        """What has been spent, by the name of its limit; money in the unit of the
-        prices.
+        """The calls, tokens and money that have been spent so far.
+
+        The keys are the names of their limits: "calls", "tokens" and "money". Money is
+        in the currency in which the user stated the prices.
         """
-        limits = self.limits
+        prices = self.limits  # it has the prices, too
         spent = self.spent
-        by_token = (
-            limits["per_million_in"] * spent["tokens_in"]
-            + limits["per_million_out"] * spent["tokens_out"]
+        # the cost of all tokens, times a million
+        token_cost = (
+            prices["per_million_in"] * spent["tokens_in"]
+            + prices["per_million_out"] * spent["tokens_out"]
         )
-        money = limits["per_call"] * spent["calls"] + by_token / 1e6
+        money = prices["per_call"] * spent["calls"] + token_cost / 1e6
         return {
             "calls": spent["calls"],
             "tokens": spent["tokens_in"] + spent["tokens_out"],
@@ -576,7 +593,7 @@ class AddressModel(models.RemoteNetwork):
     def spending_sentence(self) -> str:
         """What a run has spent, as a sentence."""
         calls, tokens, money = self._spent_by_limit.values()
-        text = f"The model {self.name} was asked {calls:,} times"
+        text = f"The model {self.name} was called {calls:,} times"
         if tokens:
             text += f", {tokens:,} tokens"
         if money:
@@ -585,13 +602,18 @@ class AddressModel(models.RemoteNetwork):
 
     @property
     def _priced_by_token(self) -> bool:
-        """Whether tokens cost money."""
+        """Whether tokens have a price."""
         return bool(self.limits["per_million_in"] or self.limits["per_million_out"])
+
+    @property
+    def _has_token_limit(self) -> bool:
+        """Whether the user limits tokens: by default the limit is infinite."""
+        return self.limits["tokens"] < LIMITS["tokens"]
 
     def _send(
         self, bodies: Sequence[Mapping[str, Any]]
     ) -> Iterator[tuple[int, dict[str, Any]]]:
-        """Send bodies, several at once, and again while the server is busy.
+        """Send bodies, a few at a time, and again while the server is busy.
 
         Yields:
             The index of each body, and the JSON object in the response to it.
@@ -615,8 +637,8 @@ class AddressModel(models.RemoteNetwork):
             )
             failures = list[str]()
             retries = list[_Request]()
-            # Whether this is the first batch of the run: its own calls are counted
-            # already. If the server refuses the connection now, there is no server, and
+            # Whether this is the first batch of the run; `_reserve` has already counted
+            # its calls. If the connection is refused now, there is no server, and
             # another try is pointless.
             is_first = self.spent["calls"] <= len(batch)
             for request, response in zip(batch, responses, strict=True):
@@ -646,12 +668,14 @@ class AddressModel(models.RemoteNetwork):
     def _max_concurrent(self) -> int:
         """Return how many requests may be sent at once.
 
-        It is one if tokens or their price are limited: how many tokens a request takes
+        It is one if tokens or their cost are limited: how many tokens a request takes
         is known only from its response.
         """
-        by_token = self._priced_by_token and self.limits["money"] < LIMITS["money"]
-        is_sequential = self.limits["tokens"] < LIMITS["tokens"] or by_token
-        return 1 if is_sequential else int(self.limits["at_once"])
+        has_money_limit = self.limits["money"] < LIMITS["money"]  # default: infinity
+        limits_token_cost = self._priced_by_token and has_money_limit
+        if self._has_token_limit or limits_token_cost:
+            return 1
+        return int(self.limits["at_once"])
 
     def _plan_retry(
         self, request: _Request, error: Exception, *, first: bool
@@ -680,8 +704,8 @@ class AddressModel(models.RemoteNetwork):
     def _reserve(self, max_count: int) -> int:
         """Count calls as spent before they are made, as many as the limits allow.
 
-        They are counted first so that a crash cannot lead to calls that nobody counted.
-        Tokens are known only after a call, so that their limit stops later calls.
+        They are counted first, so that a crash leaves no call uncounted. Tokens are
+        known only after a call, so that their limit stops later calls.
 
         Args:
             max_count: number of calls that the caller wants to make.
@@ -697,7 +721,7 @@ class AddressModel(models.RemoteNetwork):
             spent = self._spent_by_limit
             reached = [name for name in spent if spent[name] >= self.limits[name]]
             if reached and count:
-                break  # those counted so far may be made
+                break  # the calls that are counted so far may be made
             if reached:
                 raise self._make_limit_error(reached[0], spent[reached[0]])
             self.spent["calls"] += 1
@@ -712,7 +736,7 @@ class AddressModel(models.RemoteNetwork):
         return errors.ModelError(
             f"model {self.name}: {spent:,.10g} {name} are spent, and `ask` allows "
             f"{limit:,.10g}; `advsearch resume RUN ask.{name}={advised_limit:.10g}` "
-            "goes on with more, and asks nothing twice"
+            "continues with a higher limit, and repeats no request"
         )
 
     def _send_together(
@@ -721,7 +745,7 @@ class AddressModel(models.RemoteNetwork):
         """Send bodies at the same time, and return the response to each, or its error.
 
         It takes at most the limit of `seconds`, whatever a server does: connections
-        that are still open are broken off.
+        that are still open after that are closed.
         """
         seconds = self.limits["seconds"]
         deadline = time.monotonic() + seconds
@@ -744,7 +768,9 @@ class AddressModel(models.RemoteNetwork):
     def _try_to_send(
         self, body: bytes, deadline: float, connections: list[_Connection]
     ) -> dict[str, Any] | Exception:
-        """Return the response to a body, or the error, as a later try may succeed.
+        """Return the response to a body, or the error that was raised.
+
+        The error is returned because a later try may succeed.
 
         Args:
             body: JSON.
@@ -756,6 +782,7 @@ class AddressModel(models.RemoteNetwork):
         except urllib.error.HTTPError as error:
             # The message of the error needs its body, which cannot be read once the
             # connection is closed. So it is copied, or left out if reading it fails.
+            # In the latter case the original error is returned.
             with error, suppress(OSError, http.client.HTTPException):
                 text = error.read(MAX_ERROR_BYTES)
                 error = urllib.error.HTTPError(
@@ -808,8 +835,8 @@ class AddressModel(models.RemoteNetwork):
         if 300 <= status < 400:
             location = self._clean(error.headers.get("Location", "elsewhere"))
             return (
-                f"sends on to {location}, and pictures and keys are not sent there; "
-                "give that address if you trust it"
+                f"redirects to {location}, and images and keys are not sent there; "
+                "use that address if you trust it"
             )
         if status in (401, 403):
             problem = "is not accepted" if models.read_key() else "is missing"
@@ -831,22 +858,25 @@ class AddressModel(models.RemoteNetwork):
             connections: list that the connection is added to.
 
         Raises:
-            ModelError: the response is too long, or something else. OSError,
-                http.client.HTTPException: it cannot be sent, or there is no response.
+            ModelError: the response is too long, or not a JSON object.
+            OSError: the body cannot be sent, or there is no response.
+            http.client.HTTPException: the response is no valid HTTP.
         """
         headers = {"Content-Type": "application/json", "User-Agent": "advsearch"}
         request = urllib.request.Request(self.url, body, headers)
         key = models.read_key()
-        if key:  # never sent on to another address
+        if key:
+            # urllib does not send this header to the target of a redirect.
             request.add_unredirected_header("Authorization", f"Bearer {key}")
         handlers: list[Any] = [
             models.NoRedirect,
             _PlainHandler(deadline, connections),
             _SecureHandler(deadline, connections),
         ]
-        # without the port, and the brackets of an IPv6 address
+        # the host without the port, and without the brackets of an IPv6 address
         host = request.host.rpartition(":")[0].strip("[]") or request.host
-        if models.is_local(host):  # no proxy leads to this machine
+        if models.is_local(host):
+            # A proxy in the environment cannot reach a server on this machine.
             handlers.append(urllib.request.ProxyHandler({}))
         opener = urllib.request.build_opener(*handlers)
         with opener.open(request, timeout=self.limits["seconds"]) as response:
@@ -907,7 +937,7 @@ class AddressModel(models.RemoteNetwork):
         They are in its field `usage`, as in OpenAI's protocol.
 
         Raises:
-            ModelError: it states none, and a limit or a price needs them.
+            ModelError: it states none, and a limit or a price depends on them.
         """
         usage = response.get("usage")
         if not isinstance(usage, Mapping):
@@ -918,9 +948,10 @@ class AddressModel(models.RemoteNetwork):
             for count in counts
         )
         # Tokens may be unknown if neither a limit nor a price depends on them.
-        needs_tokens = self.limits["tokens"] < LIMITS["tokens"] or self._priced_by_token
+        needs_tokens = self._has_token_limit or self._priced_by_token
         if is_stated:
             tokens_in, tokens_out = counts
+            # `spent` is a Counter: `update` adds.
             self.spent.update({"tokens_in": tokens_in, "tokens_out": tokens_out})
             self._store_spent()
         elif needs_tokens:

@@ -1,4 +1,4 @@
-"""A network that takes the pictures of several cameras in one call."""
+"""A network that takes the images of several cameras in one call."""
 
 from __future__ import annotations
 
@@ -12,20 +12,19 @@ from advsearch.errors import InputError
 
 @final
 class AllAtOnce(nn.Module):
-    """A network that takes all pictures of a rig in one call, as a model of single
-    pictures.
+    """Call a network of all images of a rig at once as a network of single images.
 
-    Its output counts for each of them, so that any rule of the task `rig` gives the
-    same.
+    A rig is a set of K cameras. Each of its images gets the same output, so that all
+    rules of the task `rig` give the same result.
 
     Args:
         network: network from (N, K, 3, H, W), or (N, K, H, W, 3), to an output with N
             rows.
-        cameras: K.
+        cameras: number of cameras K.
         layout: "NKCHW" or "NKHWC".
 
     Raises:
-        InputError: another layout.
+        InputError: the layout is another one.
     """
 
     def __init__(self, network: nn.Module, cameras: int, layout: str = "NKCHW") -> None:
@@ -37,14 +36,15 @@ class AllAtOnce(nn.Module):
         self.layout = layout
 
     def forward(self, images: Tensor) -> Tensor:
-        """Return the output (N * K, ...) for the pictures of N configurations.
+        """Return the output (N * K, ...) for the images of N configurations.
 
-        All K pictures of a configuration get the same row of the output. A count that
-        is no multiple of K is allowed, since a model is run on one or two images when
-        it is loaded. Then copies of the last picture fill it up, and get no row.
+        All K images of a configuration get the same row of the output. A count of
+        images that is no multiple of K is allowed, since a model is run on one or two
+        images when it is loaded. Then copies of the last image are added, and their
+        rows are cut off.
 
         Args:
-            images: (N * K, 3, H, W), the K pictures of each configuration together.
+            images: (N * K, 3, H, W); the K images of a configuration follow each other.
         """
         count = len(images)
         n_missing = -count % self.cameras

@@ -1,10 +1,10 @@
-"""What a network sees before it decides: the numbers that its last layer turns into
-logits.
+"""Features of a network: the numbers that its last layer turns into logits.
 
-It is found by running the network once: a hook on the last `nn.Linear` or convolution
-of an `nn.Module`, or the last such operator of a graph (`torch.export`), reads its
-input where it returns one value per class, else its output. For any other network it is
-the logits less their mean. Maps and sequences are averaged over their positions.
+The last layer is found by running the network once: by hooks on the `nn.Linear` layers
+and convolutions of an `nn.Module`, or from such operators in a graph (`torch.export`).
+If that layer returns one value per class, its input are the features, else its output.
+For any other network, features are the logits minus their mean. Maps and sequences are
+averaged over their positions.
 """
 
 from __future__ import annotations
@@ -32,38 +32,39 @@ CHANNELS_SECOND = {
     for name in ("conv1d", "conv2d", "conv3d", "convolution")
 }
 OPERATORS: dict[Any, int] = {**CHANNELS_LAST, **CHANNELS_SECOND}
-"""Operators that may be a last layer, and which of their arguments is the
-activation.
+"""Operators that may be a last layer, and the index of the activation among their
+arguments: 1 for ``addmm(bias, activation, weights)``, else 0.
 """
 
-# from a batch as `Model.prepare` returns it, N images, to features (N, F)
 Read = Callable[[Tensor], Tensor]
+"""Computes features (N, F) of a batch of N images as `Model.prepare` returns it."""
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Features:
-    """A model as a differentiable function from images to features; created by
-    `features_of`.
+    """A model as a differentiable function from images to features.
+
+    `features_of` creates it.
     """
 
     model: Model
     read: Read = field(repr=False)
     size: int  # F, numbers per image
-    # Source for messages and reports, such as "the input of head (Linear), 192
-    # numbers".
+    # Where the features come from, for messages and reports: "the input of head
+    # (Linear), 192 numbers".
     source: str
-    # False where they are the logits, for want of anything else
+    # False if the features are the logits, since no last layer was found.
     penultimate: bool = True
 
     def __call__(self, images: Tensor) -> Tensor:
-        """Compute the features (N, F), float32, of images as `Model` takes them;
-        differentiable.
+        """Compute the features (N, F), float32, of images, differentiably.
 
-        The network runs once more: the logits are not computed with them.
+        The images are as `Model` takes them. The network is run for the features only:
+        logits need another run.
 
         Raises:
-            InputError: not an image, or values that are clearly not in [0, 1].
+            InputError: they are no images, or values are clearly not in [0, 1].
         """
         images = check_images(images)
         batches = images.split(self.model.batch_limits[1])
@@ -80,15 +81,15 @@ def features_of(model: Model) -> Features:
     running an exported graph node by node. If neither finds one, features are the
     logits minus their mean.
     """
-    # two images, as one alone may hide which axis is the batch
+    # two images, because with one it is not clear which axis is the batch
     batch_size = min(2, model.batch_limits[1])
     gray = torch.full((batch_size, *model.input_size, 3), 0.5)
     with torch.no_grad():
         x = model.prepare(gray)
         for trace_calls in (_trace_modules, _trace_graph):
-            last = _find_last_layer(trace_calls, model, x)
-            if last is not None:
-                read, source = last
+            reader_and_source = _find_last_layer(trace_calls, model, x)
+            if reader_and_source is not None:
+                read, source = reader_and_source
                 size = read(x).shape[1]
                 return Features(model, read, size, f"the {source}, {size} numbers")
     source = (
@@ -110,9 +111,10 @@ class _Call(NamedTuple):
     Attributes:
         layer: a module, or a node of a graph.
         name: name for messages.
-        input: input of the call; None if it is no activation but weights.
+        input: input of the call; None if it is a weight and no activation, as where an
+            operator multiplies two weights.
         output: output of the call.
-        axis: axis of the channels in both.
+        axis: axis of the channels in input and output.
     """
 
     layer: Any
@@ -123,8 +125,9 @@ class _Call(NamedTuple):
 
 
 Calls = Callable[[Any, Tensor, Any], list[_Call]]
-"""Runs a network on a batch and returns the calls of its layers, or of one of them, in
-their order.
+"""Runs a network (first argument) on a batch (second argument), and returns the calls
+of its layers in their order. The third argument is the only layer of interest; None for
+all layers.
 """
 
 
@@ -138,7 +141,8 @@ def _find_last_layer(
     over all axes but the batch and the channels.
 
     Args:
-        trace_calls: runs a network, and returns the calls of its layers.
+        trace_calls: runs a network, and returns the calls of all of its layers, or of
+            one of them (`Calls`).
         model: model with the network.
         x: a batch for it.
 
@@ -146,23 +150,25 @@ def _find_last_layer(
         The function that computes them, and a description of the layer; None if there
         is no such layer.
     """
-    # layers whose output has a row for each image
+    only_layer = None  # all layers are traced
+    # calls whose output has a row for each image
     usable = [
         call
-        for call in trace_calls(model.module, x, None)
+        for call in trace_calls(model.module, x, only_layer)
         if len(call.output) == len(x)
     ]
     if not usable:
         return None
     heads = [call for call in usable if call.output.shape[call.axis] == model.classes]
     last = (heads or usable)[-1]
-    attribute = "input" if heads else "output"  # of the call, which has the features
-    if getattr(last, attribute) is None:  # a head whose input is a weight
+    # the attribute of the call that holds the features
+    attribute = "input" if heads else "output"
+    if getattr(last, attribute) is None:  # the input is no activation, see `_Call`
         return None
 
     def read(batch: Tensor) -> Tensor:
         """Return the features (N, F) of a batch, by running the network on it."""
-        # the last call, if the network calls the layer several times
+        # The last call counts if the network calls the layer several times.
         call = trace_calls(model.module, batch, last.layer)[-1]
         value: Tensor = getattr(call, attribute)
         channels_last = value.movedim(last.axis, -1)
@@ -177,7 +183,8 @@ def _trace_modules(network: Any, x: Tensor, only: nn.Module | None) -> list[_Cal
     """Return the calls of the layers (`LAYERS`) of a module in their order, by hooks.
 
     Args:
-        network: any network; a program, or what is no module, has no such calls.
+        network: any network; a scripted program, or what is no `nn.Module`, has no such
+            calls.
         x: a batch to run it on.
         only: the only layer of interest; None for all.
     """
@@ -199,8 +206,8 @@ def _trace_modules(network: Any, x: Tensor, only: nn.Module | None) -> list[_Cal
     ) -> None:
         """Record a call of a layer; PyTorch calls this after each of them.
 
-        Calls are left out whose output has another number of rows than the input, as
-        they do not work on the images of the batch.
+        A call is left out if its output has another number of rows than its input: it
+        does not work on the images of the batch.
         """
         input = args[0] if args else kwargs["input"]
         keeps_batch = len(input) == len(output) and input.dim() > 1
@@ -236,14 +243,22 @@ def _trace_graph(network: Any, x: Tensor, only: fx.Node | None) -> list[_Call]:
             """Run a node, and record its call if it is a layer."""
             value = super().run_node(n)
             is_layer = n.op == "call_function" and n.target in OPERATORS
-            if is_layer and only in (None, n) and isinstance(value, Tensor):
-                source = n.args[OPERATORS[n.target]]
-                # weights come from `get_attr`, activations from other nodes
-                input = None
+            is_traced = only is None or n is only
+            if is_layer and is_traced and isinstance(value, Tensor):
+                activation_index = OPERATORS[n.target]
+                source = n.args[activation_index]
+                # Weights come from `get_attr` nodes, activations from other nodes.
+                activation = None
                 if isinstance(source, fx.Node) and source.op != "get_attr":
-                    input = self.env[source]
-                axis = -1 if n.target in CHANNELS_LAST else 1
-                calls.append(_Call(n, f"the operator {n.name}", input, value, axis))
+                    activation = self.env[source]
+                call = _Call(
+                    layer=n,
+                    name=f"the operator {n.name}",
+                    input=activation,
+                    output=value,
+                    axis=-1 if n.target in CHANNELS_LAST else 1,
+                )
+                calls.append(call)
             return value
 
     if isinstance(network, fx.GraphModule):
@@ -251,7 +266,7 @@ def _trace_graph(network: Any, x: Tensor, only: fx.Node | None) -> list[_Call]:
     return calls
 
 
-# of outputs that hold the features, the best first
+# names of the features in an output of transformers, the most suitable first
 PARTS = ("image_embeds", "pooler_output", "last_hidden_state")
 
 
@@ -261,8 +276,8 @@ def pooled(returned: Any, *, token: bool) -> Tensor | None:
     Args:
         returned: a tensor, or an object or mapping with one of `PARTS`. Maps (N, D, H,
             W) are averaged over their positions.
-        token: whether the first of several tokens (N, T, D) is taken, as of networks
-            with a class token; otherwise their mean is.
+        token: whether the features of tokens (N, T, D) are those of the first token, as
+            in networks with a class token; otherwise they are the mean over tokens.
     """
     for part in PARTS:
         value = (

@@ -1,9 +1,9 @@
 """Load models from files: `torch.export` archives (.pt2), TorchScript and ONNX.
 
-Archives are recognized by content, ONNX by its suffix. No Python object is ever
-unpickled: archives that need it are rejected. A model file is a program all the same;
-open only files whose makers you trust. ONNX files are run by onnxruntime, which gives
-predictions and no gradients.
+Archives are recognized by their content, ONNX by its suffix. No Python object is ever
+unpickled: archives that need it are rejected. Still, a model file is a program: open
+only files whose authors you trust. ONNX files are run by onnxruntime, which returns
+predictions but no gradients.
 """
 
 from __future__ import annotations
@@ -70,12 +70,12 @@ MAX_BATCH = 64  # maximum batch size of a program whose batch dimension is free
 def load_file(path: Path) -> Source:
     """Load the model in a file: a torch.export archive, TorchScript, or ONNX.
 
-    Archives are told apart by their content, ONNX by its suffix.
+    The kind of an archive is recognized by its content, ONNX by its suffix.
 
     Raises:
-        FileFormatError: missing, empty, truncated, corrupt, a pickle, or of another
-            kind; the message names the file.
-        ModelError: a program that does not take one floating-point image.
+        FileFormatError: the file is missing, empty, truncated, corrupt, a pickle, or of
+            another kind; the message names it.
+        ModelError: the program does not take one floating-point image.
     """
     try:
         opened = open_regular(path, "a model file", LARGEST)
@@ -88,7 +88,7 @@ def load_file(path: Path) -> Source:
             f"model file {path}: cannot be read ({error.strerror or error})"
         ) from None
     with opened as file:
-        head = file.read(16)  # enough to tell the kind of a file
+        head = file.read(16)  # enough to recognize the kind of a file
         if not head:
             raise FileFormatError(
                 f"model file {path}: expected a model, got an empty file"
@@ -117,8 +117,8 @@ def _load_exported(archive: Archive) -> Source:
         without_unpickling(),
         ExitStack() as stack,
     ):
-        # torch logs a traceback of an error. The user gets a message instead, so that
-        # its logger is silent in this block.
+        # torch logs the traceback of an error. The user gets a message instead, so that
+        # its logger is silent in this block, and gets its level back after it.
         stack.callback(logger.setLevel, logger.level)
         logger.setLevel(logging.CRITICAL)
         program = torch.export.load(checked)
@@ -168,7 +168,7 @@ def _load_torchscript(archive: Archive) -> Source:
 def _find_archive_kind(archive: Archive) -> str:
     """Return the kind of an archive, "exported" or "torchscript".
 
-    The names of its members tell the kind.
+    It follows from the names of its members.
 
     Raises:
         FileFormatError: it is of another kind, such as a pickle that `torch.save` made.
@@ -218,11 +218,12 @@ def _describe_file(path: Path, head: bytes) -> str:
     """Describe what a file that is no zip archive may be, and what to do about it.
 
     Args:
-        path: path of the file, whose suffix is looked at.
+        path: path of the file, whose suffix matters.
         head: its first 16 bytes.
     """
     suffix = path.suffix.lower()
-    # safetensors begin with the length of a header in eight bytes, and the header, JSON
+    # A safetensors file begins with the length of its header in eight bytes, then the
+    # header, a JSON object.
     header_length = int.from_bytes(head[:8], "little")
     is_safetensors = head[8:9] == b"{" and header_length < 1 << 30
     if is_safetensors:
@@ -250,9 +251,9 @@ def _describe_file(path: Path, head: bytes) -> str:
 def _apply_signature(source: Source, program: torch.export.ExportedProgram) -> Source:
     """Return the source with input size, layout, batch limits and dtype of a program.
 
-    The signature of an exported program states the shape and dtype of its inputs. If it
-    takes all K images of a rig at once, (N, K, 3, H, W) or (N, K, H, W, 3), it is
-    wrapped as a network of single images.
+    An exported program states the shape and dtype of its inputs. A program may take the
+    K images of a rig (several cameras) at once, (N, K, 3, H, W) or (N, K, H, W, 3):
+    then it is wrapped as a network of single images.
 
     Args:
         source: source of the network.
@@ -265,17 +266,20 @@ def _apply_signature(source: Source, program: torch.export.ExportedProgram) -> S
         node.name: node for node in program.graph.nodes if node.op == "placeholder"
     }
     names = [name for name in program.graph_signature.user_inputs if name in nodes]
-    inputs = [nodes[name].meta.get("val") for name in names]
-    is_rig = _check_inputs(source, names, inputs)
-    images = inputs[0]
+    # Example values with shape and dtype, as torch.export records them ("val").
+    examples = [nodes[name].meta.get("val") for name in names]
+    is_rig = _check_inputs(source, names, examples)
+    images = examples[0]
     takes_sizes = (
-        len(names) == 2 and names[1] in SIZE_INPUTS and inputs[1].shape[1] == 2
+        len(names) == 2 and names[1] in SIZE_INPUTS and examples[1].shape[1] == 2
     )
-    if takes_sizes:  # the size of each image, which is known and passed as well
-        size_type = inputs[1].dtype
-        source = replace(source, size_type=size_type)
+    if takes_sizes:
+        # The size of each image is known, so that it can be passed too.
+        source = replace(source, size_type=examples[1].dtype)
     else:
-        source = replace(source, takes_more=len(inputs) > 1, size_type=None)
+        # Any other second input must come from the user as a `state` (`takes_more`).
+        # `size_type` is reset, as `make_source` guesses it from names of inputs alone.
+        source = replace(source, takes_more=len(examples) > 1, size_type=None)
     source = _apply_image_input(source, images, is_rig=is_rig)
     min_batch, max_batch = _find_batch_limits(program, images.shape[0])
     if not is_rig:
@@ -297,7 +301,7 @@ def _apply_image_input(source: Source, images: Any, *, is_rig: bool) -> Source:
         source: source of the network.
         images: example value of the input, (N, 3, H, W) or (N, H, W, 3), or the same
             with an axis of K cameras after N.
-        is_rig: whether there is that axis.
+        is_rig: whether there is an axis of cameras.
 
     Raises:
         ModelError: its dtype is neither a floating-point one nor uint8.
@@ -309,7 +313,7 @@ def _apply_image_input(source: Source, images: Any, *, is_rig: bool) -> Source:
             expected = "floating-point images as input, got"
         raise ModelError(f"model {source.name}: expected {expected} {images.dtype}")
     image_shape = images.shape[-3:]
-    # Only a size of 3 in the last place alone means that channels come last.
+    # Channels come last if the last size is 3 and the first one is not.
     is_channels_last = image_shape[2] == 3 and image_shape[0] != 3
     height, width = image_shape[:2] if is_channels_last else image_shape[1:]
     is_fixed_size = isinstance(height, int) and isinstance(width, int)
@@ -419,7 +423,7 @@ def _report_corrupt(path: Path, kind: str) -> AbstractContextManager[None]:
         f"model file {path}: cannot be read as {kind} with torch {torch.__version__}"
     )
     causes = (
-        "damaged, made by another version, or in need of unpickling, which is "
+        "corrupt, made by another version, or would have to be unpickled, which is "
         "never done"
     )
     return translate_errors(f"{problem}; {causes}", kind=FileFormatError)
@@ -433,15 +437,18 @@ FLOATS = {
 
 MIN_VERSION = (1, 24)
 """The first onnxruntime that reads no weights from outside the directory of a file;
-older ones follow `../` and links.
+older versions follow `../` and links.
 """
 
 
 class OnnxNetwork(nn.Module):
     """A session of onnxruntime as a function from a batch of images to its outputs.
 
-    No gradient goes through it. `new_options` creates options of a run, by which it can
-    be ended.
+    No gradient goes through it.
+
+    Args:
+        session: the session.
+        new_options: creates the options of a run; a run can be ended through them.
     """
 
     def __init__(self, session: Any, new_options: Callable[[], Any]) -> None:
@@ -456,7 +463,7 @@ class OnnxNetwork(nn.Module):
         Args:
             *tensors: its inputs, in the order of the file.
         """
-        # New options each time: those by which `stop` ended a run would end the next.
+        # Each run has new options: the ones that `stop` used would end this run, too.
         self.options = self.new_options()
         names = [tensor.name for tensor in self.session.get_inputs()]
         named = {
@@ -494,9 +501,10 @@ def load_onnx(path: Path) -> Source:
     has_fixed_batch = isinstance(batch_size, int)
     is_channels_last = images.shape[3] == 3 and images.shape[1] != 3
     input_size = images.shape[1:3] if is_channels_last else images.shape[2:4]
-    # `imgsz` and `names` are what YOLO's exports state.
+    # Files that YOLO exports state the image size (`imgsz`) and the class names.
     metadata = session.get_modelmeta().custom_metadata_map
-    if not all(isinstance(size, int) for size in input_size):
+    has_fixed_size = all(isinstance(size, int) for size in input_size)
+    if not has_fixed_size:
         input_size = _parse_image_size(metadata.get("imgsz", ""))
     source = Source(
         OnnxNetwork(session, runtime.RunOptions),
@@ -561,6 +569,7 @@ def _check_onnx_inputs(path: Path, inputs: list[Any]) -> None:
     Raises:
         ModelError: it takes something else.
     """
+    # A size is an integer if it is fixed. If it is free, it is a name, or None.
     image_shape = inputs[0].shape if inputs else []
     fixed_sizes = [size for size in image_shape if isinstance(size, int)]
     takes_images = (
@@ -589,8 +598,8 @@ def _check_onnx_inputs(path: Path, inputs: list[Any]) -> None:
 def _parse_image_size(text: str) -> list[int]:
     """Parse (height, width) in pixels from a text such as "[640, 640]".
 
-    YOLO's exporters write it so. The result is empty if the text has another form, or
-    if a size is 0.
+    YOLO's exporters write this form. The result is empty if the text has another form,
+    or if a size is 0.
     """
     match = re.fullmatch(r"\[(\d{1,5}), ?(\d{1,5})\]", text)
     size = [int(number) for number in match.groups()] if match else []

@@ -1,5 +1,6 @@
-"""Adapt networks with further inputs, or with integer images, to networks of images
-alone.
+"""Adapt networks so that they can be called with floating-point images only.
+
+Such networks take integer images, or further inputs: the image size or a state.
 """
 
 from __future__ import annotations
@@ -29,7 +30,9 @@ SIZE_TYPES = {
 
 @final
 class WithImageSize(nn.Module):
-    """A network that also takes the size of its images; its boxes are then in pixels.
+    """Call a network that takes images and their sizes with images only.
+
+    The boxes of such a network are in pixels.
 
     Args:
         network: network from images and their sizes (N, 2), (width, height) in pixels,
@@ -49,7 +52,7 @@ class WithImageSize(nn.Module):
         self.training = False
 
     def forward(self, images: Tensor) -> Any:
-        """Return the network's output for pictures (N, 3, H, W) or (N, H, W, 3)."""
+        """Return the network's output for images (N, 3, H, W) or (N, H, W, 3)."""
         height, width = (
             images.shape[1:3] if self.layout == "NHWC" else images.shape[2:4]
         )
@@ -61,8 +64,9 @@ class WithImageSize(nn.Module):
 
 @final
 class EightBitInput(nn.Module):
-    """A network that takes integers from 0 to 255 (uint8); the rounding has no
-    gradient.
+    """Call a network of uint8 images with floating-point images from 0 to 255.
+
+    Images are rounded, which has no gradient.
 
     Args:
         network: network from images in uint8, and further inputs, to an output.
@@ -74,8 +78,11 @@ class EightBitInput(nn.Module):
         self.training = False
 
     def forward(self, images: Tensor, *more: Tensor) -> Any:
-        """Return the network's output for floating-point images with values from 0 to
-        255.
+        """Return the network's output for floating-point images.
+
+        Args:
+            images: images with values from 0 to 255.
+            *more: further inputs, which are passed on.
         """
         return self.network(
             images.detach().round().clamp(0.0, 255.0).to(torch.uint8), *more
@@ -106,7 +113,7 @@ def list_required_inputs(network: nn.Module) -> list[str]:
 
 
 def takes_image_size(network: nn.Module) -> bool:
-    """Whether a network takes images and their sizes, by the names of its inputs."""
+    """Return whether the names of a network's inputs are those of images and sizes."""
     names = list_required_inputs(network)
     return len(names) == 2 and names[1] in SIZE_INPUTS
 
@@ -116,12 +123,17 @@ PICTURE = "observation.image"  # the key of the image for a policy's `select_act
 
 @final
 class WithState(nn.Module):
-    """A policy of images and a constant state.
+    """Call a policy of images and a constant state with images only.
 
-    A policy with a method `select_action` is called as LeRobot's are: with one mapping
-    of the images, as `PICTURE`, and of the state (numbers by name), after `reset` if it
-    has one, because it may still hold an earlier image. Others are called with the
-    images and the mapping, or with the images alone if the state is empty.
+    A policy with a method `select_action` is called as those of LeRobot: with one
+    mapping of the images (key `PICTURE`) and of the state. Its `reset`, if it has one,
+    is called before, because the policy may have stored an earlier image. Other
+    policies are called with the images and the state, or with the images only if the
+    state is empty.
+
+    Args:
+        network: the policy.
+        state: numbers of the state by name, such as {"speed": [3.0]}.
     """
 
     def __init__(
@@ -149,6 +161,7 @@ class WithState(nn.Module):
         reset = getattr(self.network, "reset", None)
         if reset is not None:
             reset()
-        # A policy may switch gradients off or on as it runs: this restores the mode.
+        # A policy may switch gradients on or off as it runs. The mode is set to its
+        # present value so that it is restored in the end.
         with torch.set_grad_enabled(torch.is_grad_enabled()):
             return select({PICTURE: images, **state})

@@ -14,49 +14,50 @@ from typing import Any, NamedTuple
 from advsearch.errors import FileFormatError, InputError, find_similar_names
 from advsearch.trust.stored_files import parse_json, read_text
 
-# the text that a name is put into where nothing else is said
+# the default text into which the name of a class is inserted
 PROMPT = "a photo of a {}"
-MAX_FILE_BYTES = 16 << 20  # bytes of a label file
-MAX_NAME_CHARACTERS = (
-    1000  # characters of a label name; those of ImageNet have up to 130
-)
-MAX_METADATA_CHARACTERS = (
-    1 << 20
-)  # characters of all names that a network's metadata say
+MAX_FILE_BYTES = 16 << 20  # maximum size of a label file in bytes
+# Maximum number of characters of a label name; the names of ImageNet have up to 130.
+MAX_NAME_CHARACTERS = 1000
+# Maximum number of characters of all names in the metadata of a network.
+MAX_METADATA_CHARACTERS = 1 << 20
 MAX_SUGGESTIONS = 4  # labels that a message suggests for an unknown one
 DATA = Path(__file__).parent / "data"
 SETS = ("imagenet", "cifar10", "cifar100", "coco", "coco90", "coco91", "voc")
-"""Names of the classes of data sets that many networks are trained on, in the order of
-their outputs. `coco91` has the background first and the numbers that its authors gave,
-of which 11 have no class; `coco90` is that without background; `voc` has the background
-first.
+"""Data sets that many networks are trained on; the names of their classes are known.
+
+`coco91` has the background first, and the numbering of its authors, in which 11 numbers
+have no class. `coco90` is the same without background. `voc` has the background first.
 """
 
 NOTHING_NAMES = frozenset(
     "background bg noobject noobj noclass nothing none null void n/a n.a. unlabeled "
     "unlabelled unused ??? ∅".split()
 )
-"""Names of classes that stand for no thing, without blanks, hyphens and underscores;
-"none of the above" is a thing.
+"""Names of classes that stand for no object, without blanks, hyphens and underscores.
+"none of the above" is not among them.
 """
 
 
 def is_nothing_name(name: str) -> bool:
-    """Whether the name of a class stands for no thing: background, "no object", an
-    index without a class.
+    """Return whether the name of a class stands for no object.
+
+    Such a name is that of the background, "no object", or an index without a class.
     """
     return re.sub(r"[\s_<>()\[\]-]+", "", name.casefold()) in NOTHING_NAMES
 
 
 @dataclass(frozen=True)
 class LabelSet:
-    """The classes that count as right for an object; both "coffee mug" and "cup" may
-    be.
+    """The classes that count as right for an object, such as "coffee mug" and "cup".
+
+    Attributes:
+        names: the model's full label names, in the order in which the user named them.
+        indices: distinct indices of these classes, in the same order.
     """
 
-    # the model's full label names, in the order in which they were asked for
     names: tuple[str, ...]
-    indices: tuple[int, ...]  # distinct, in the same order
+    indices: tuple[int, ...]
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -84,8 +85,9 @@ def find_label_set(
         named: whether the labels are names; else they are placeholders ("class 0").
 
     Raises:
-        InputError: no term, an unknown name (with near matches), a name of several
-            classes (with their indices), an index that the model does not have.
+        InputError: there is no term; a name is unknown (the message has similar names)
+            or belongs to several classes (the message has their indices); or the model
+            does not have an index.
     """
     texts: Sequence[str | int] = [text] if isinstance(text, (str, int)) else text
     # Each text may have several terms itself.
@@ -103,12 +105,12 @@ def find_label_set(
 
 
 def find_similar_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str]]:
-    """Find the classes whose names resemble a word, best first, then its synonyms.
+    """Find the classes to suggest for an unknown word.
 
-    Names resemble a word if they are spelled alike (`find_similar_names`). Synonyms
-    ("cup" for "mug") come from a table of everyday things. A synonym is a better
-    suggestion than a name that is only spelled alike: if there are synonyms, names
-    count only if one of them contains the word.
+    There are two kinds of suggestions. Similar names are spelled like the word
+    (`find_similar_names`), the most similar first. Synonyms ("cup" for "mug") come from
+    a table of everyday things, and follow them. But if there are synonyms and no
+    similar name contains the word, only the synonyms are suggested.
 
     Args:
         word: what the user wrote.
@@ -132,7 +134,9 @@ def find_similar_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str
         if key in names:
             synonyms += [name for name in names if name in indices_of_name]
     similar = find_similar_names(word, indices_of_name)
-    if synonyms and not any(key in name for name in similar):
+    contains_word = any(key in name for name in similar)
+    if synonyms and not contains_word:
+        # A synonym is a better suggestion than a name that is only spelled alike.
         similar = []
     name_of_index: dict[int, str] = {}
     for name in (*similar, *synonyms):
@@ -204,7 +208,7 @@ def _hint_of_labels(term: str, labels: Sequence[str], named: bool) -> str:
     return f"Its {len(labels)} labels: {', '.join(labels[:20])}{suffix}"
 
 
-def _normalize_name(name: str) -> str:  # what is compared
+def _normalize_name(name: str) -> str:
     """Return a name in the form in which names are compared."""
     return " ".join(name.casefold().split())
 
@@ -216,9 +220,8 @@ def _make_name_table(labels: Sequence[str]) -> dict[str, list[int]]:
     """
     table: dict[str, list[int]] = {}
     for index, label in enumerate(labels):
-        for name in dict.fromkeys(
-            _normalize_name(part) for part in (label, *label.split(","))
-        ):
+        names = [_normalize_name(part) for part in (label, *label.split(","))]
+        for name in dict.fromkeys(names):  # each name once
             if name:
                 table.setdefault(name, []).append(index)
     return table
@@ -234,11 +237,11 @@ def read_labels(source: str | os.PathLike[str] | Sequence[str]) -> tuple[str, ..
         source: the names themselves, in a sequence or a text with commas between them;
             one of `SETS`; or a path to a JSON list of names, a JSON object from index
             to name (every index from 0 on, once), or a text file with one name per line
-            (UTF-8). A text with commas that is the path of a file stands for that.
+            (UTF-8). A text with commas that is the path of a file is read as a path.
 
     Raises:
-        FileFormatError: the file is missing, empty or something else; the message names
-            it.
+        FileFormatError: the file is missing, empty or has another content; the message
+            names it.
         InputError: `source` holds something other than non-empty names.
     """
     if isinstance(source, (str, os.PathLike)):
@@ -275,12 +278,11 @@ def parse_names(names: Any) -> tuple[str, ...] | None:
         except (ValueError, SyntaxError, MemoryError):
             return None
     if isinstance(names, Mapping):
-        names = list(names.values()) if list(names) == list(range(len(names))) else None
-    return (
-        read_labels(names)
-        if isinstance(names, (list, tuple)) and not _find_problem(names)
-        else None
-    )
+        has_index_keys = list(names) == list(range(len(names)))
+        names = list(names.values()) if has_index_keys else None
+    if isinstance(names, (list, tuple)) and not _find_problem(names):
+        return read_labels(names)
+    return None
 
 
 _TEXT = r"""(?:'(?:[^'\\\n]|\\.)*'|"(?:[^"\\\n]|\\.)*")"""
@@ -288,14 +290,15 @@ _FLAT = re.compile(
     rf"\{{(?:\d{{1,6}}: {_TEXT}(?:, |(?=\}})))*\}}|\[(?:{_TEXT}(?:, "
     r"|(?=\])))*\]"
 )
-"""A mapping or a list as Python writes it: nothing in it is deep or runs."""
+"""Pattern of a flat mapping or list as Python writes it. `ast.literal_eval` is safe for
+such a text: nothing in it is nested.
+"""
 
 
 def _is_name_list(source: str | os.PathLike[str]) -> bool:
-    """Return whether a text is names with commas between them, and not the path of a
-    file.
+    """Return whether a text has names with commas between them, and is no path.
 
-    A text that ends like a label file is a path even if there is no such file.
+    A text that ends with ".json" or ".txt" is a path even if there is no such file.
     """
     text = str(source)
     is_path = os.path.isfile(text) or text.endswith((".json", ".txt"))
@@ -323,7 +326,7 @@ def read_prompts(prompts: str | Sequence[str] | None) -> tuple[str, ...] | None:
     """Return the prompts of a model from a list, or a text with | between them.
 
     Raises:
-        InputError: one is no text, or empty.
+        InputError: a prompt is no text, or empty.
     """
     if prompts is None:
         return None
@@ -340,10 +343,10 @@ def read_prompts(prompts: str | Sequence[str] | None) -> tuple[str, ...] | None:
 
 
 def get_patterns(prompts: tuple[str, ...] | None) -> tuple[str, ...]:
-    """Return the prompts that names are inserted into for ``{}``; the default for None.
+    """Return the prompts with ``{}`` for a name; the default prompt for None.
 
     Raises:
-        InputError: one has no ``{}``.
+        InputError: a prompt has no ``{}``.
     """
     for text in prompts or ():
         if "{}" not in text:
@@ -362,7 +365,7 @@ def list_sets_of_size(classes: int) -> list[str]:
 def _load_label_sets() -> dict[str, tuple[str, ...]]:
     """Load the names of classes of all `SETS`."""
     stored = json.loads((DATA / "labels.json").read_text("utf-8"))
-    # without its first name, which stands for the background
+    # `coco91` without its first name, which stands for the background
     stored["coco90"] = stored["coco91"][1:]
     return {name: tuple(stored[name]) for name in SETS}
 
@@ -379,18 +382,19 @@ def fit_labels(
         model: name of the model, for the message.
 
     Raises:
-        InputError: their number is not that of the model's classes; FileFormatError if
-            they are from a file.
+        InputError: there are more or fewer labels than classes.
+        FileFormatError: likewise, if the labels are from a file.
     """
     if labels is None:
         return tuple(f"class {index}" for index in range(classes))
     if len(labels) == classes:
         return labels
+    fitting_sets = "".join(
+        f" (`labels={name}` has {classes})" for name in list_sets_of_size(classes)
+    )
     message = (
         f"{origin.text}: {len(labels)} labels, but model {model} has {classes} "
-        "classes; give one per class, in index "
-        "order"
-        f"{''.join(f' (`labels={name}` has {classes})' for name in list_sets_of_size(classes))}"
+        f"classes; give one per class, in index order{fitting_sets}"
     )
     raise FileFormatError(message) if origin.is_file else InputError(message)
 
@@ -400,10 +404,10 @@ def _order_by_index(name_by_index: dict[str, Any], where: str) -> list[Any]:
 
     Args:
         name_by_index: the object; its keys may be in any order.
-        where: what is read, with which the message begins.
+        where: what is read, for the beginning of the message.
 
     Raises:
-        FileFormatError: the keys are others.
+        FileFormatError: the keys are not these indices.
     """
     indices = list(map(str, range(len(name_by_index))))
     last_index = len(name_by_index) - 1
@@ -425,7 +429,7 @@ def _read_file(path: Path) -> tuple[str, ...]:
     try:
         text = read_text(path, "a label file", MAX_FILE_BYTES)
     except OSError as error:
-        # Without a suffix, the path may have been meant for a name.
+        # A text without a suffix may have been meant as a single name.
         advice = ""
         if not path.suffix:
             advice = ", and several names have commas between them, such as 'mug,cup'"
@@ -447,7 +451,7 @@ def _parse_json_names(text: str, where: str) -> list[Any]:
 
     Args:
         text: content of a label file.
-        where: what is read, with which the message begins.
+        where: what is read, for the beginning of the message.
 
     Raises:
         FileFormatError: it is anything else.

@@ -59,6 +59,7 @@ SOURCES: Registry[Callable[..., Source | Model]] = Registry(
 # Sources whose loader takes a `Purpose`.
 SOURCES_WITH_PURPOSE = ("timm", "hf", "http", "https")
 
+# The forms of a model's name, for messages.
 FORMS = (
     "A model is 'reference', a file (.pt2, TorchScript or .onnx), 'torchvision:NAME', "
     "'timm:NAME', 'hf:REPOSITORY', "
@@ -86,23 +87,24 @@ def load_model(
 ) -> Model:
     """Load a model and probe its outputs once.
 
-    The result is a function from images to logits. Options that are None take what the
-    model states of itself, else the defaults given here.
+    The result is a function from images to logits. For an option that is None, the
+    value that the model itself states is used, or else the default that is listed here.
 
     Args:
         spec: ``"reference"`` (the bundled classifier); a path to a `torch.export`
             archive (.pt2) or to TorchScript; ``"package.module:callable"``, which
             returns an `nn.Module` or a `Model`; ``"torchvision:NAME"`` and the like,
-            all with ``"@weights.safetensors"`` if wanted; an address, ``"https://..."``
-            (docs/addresses.md); an `nn.Module` (copied, its weights shared, unless made
-            in `torch.inference_mode`); a `Model`.
-        labels: the names in index order, or a label file (see `read_labels`), which a
-            network that compares pictures with texts needs. Default "class 0", "class
-            1", ...
-        prompt: prompt of such a network: the text that each name is put into, with
-            ``{}`` in its place; several (a list, or with | between them) are averaged.
-            Default `advsearch.models.labels.PROMPT`.
-        name: its name in messages and results.
+            with ``"@weights.safetensors"`` behind any of them for other weights; an
+            address, ``"https://..."`` (docs/addresses.md); an `nn.Module` (it is
+            copied, and the copy shares its weights, unless they were created in
+            `torch.inference_mode`); or a `Model`.
+        labels: the names of classes in index order, or a label file (see
+            `read_labels`). A network that compares images with texts needs them.
+            Default "class 0", "class 1", ...
+        prompt: text into which a network that compares images with texts puts each
+            name, with ``{}`` in its place. Multiple prompts (a list, or a text with |
+            between them) are averaged. Default `advsearch.models.labels.PROMPT`.
+        name: name of the model in messages and results.
         input_size: (height, width) in pixels, or one number; default 224.
         mean: one number, three, or ``"imagenet"``, ``"half"``, ``"clip"``, in units of
             `value_range`; default 0.
@@ -120,7 +122,7 @@ def load_model(
             {"calls": 500}.
 
     Raises:
-        UnknownNameError: `spec` is a name that means nothing; near matches are given.
+        UnknownNameError: `spec` is an unknown name; the message has similar names.
         FileFormatError: a model or label file is missing, empty, truncated, a pickle,
             or of another kind.
         InputError: an option is out of range, or the number of labels is not the number
@@ -167,10 +169,10 @@ def load_model(
             source = _add_training_arguments(source)
         _check_max_batch(max_batch)
         model = _probe_source(source, options, read, name, names, origin)
-    # A text stands for the model, in a file of a run for example, only if nothing but
-    # the text was given.
-    is_named_alone = not options and labels is None and name is None
-    if isinstance(spec, (str, os.PathLike)) and is_named_alone:
+    # The model can be loaded again from its name alone, such as in a resumed run, only
+    # if the user set nothing else.
+    is_defined_by_spec = not options and labels is None and name is None
+    if isinstance(spec, (str, os.PathLike)) and is_defined_by_spec:
         return replace(model, spec=os.fspath(spec))
     return model
 
@@ -194,7 +196,7 @@ def _state_purpose(
         names=names,
         prompts=prompts,
         # Only tasks that read answers in words have these two: the maximum length of an
-        # answer in tokens, and how many answers are asked for about each image.
+        # answer in tokens, and the number of answers per image.
         tokens=getattr(task, "tokens", 16),
         times=getattr(task, "times", 1),
         ask=ask or {},
@@ -210,7 +212,7 @@ def _add_training_arguments(source: Source) -> Source:
     """Return a source completed by what YOLO networks store of their training.
 
     They have the names of classes in `names` and the image size in `args["imgsz"]`.
-    What the source itself states stays.
+    Labels and size that the source itself states take precedence.
     """
     arguments = getattr(source.module, "args", None)
     size = arguments.get("imgsz") if isinstance(arguments, Mapping) else None
@@ -234,10 +236,10 @@ def _check_max_batch(max_batch: object) -> None:
 
 
 def _check_reads_text(source: Source | Model, spec: object) -> None:
-    """Raise InputError if a prompt means nothing to a model.
+    """Raise InputError if a model cannot use a prompt.
 
-    It means nothing to a network that reads no text, nor to a `Model` that the user
-    passed, which is complete.
+    A network that reads no text cannot, nor can a `Model` that the user passed, since
+    it is complete.
 
     Args:
         source: what was found for `spec`.
@@ -250,7 +252,7 @@ def _check_reads_text(source: Source | Model, spec: object) -> None:
         reads_text = isinstance(source.module, RemoteNetwork)
     if source is spec or not reads_text:
         raise InputError(
-            f"prompt: model {source.name} has classes of its own and "
+            f"prompt: model {source.name} has its own classes and "
             "reads no text; leave `prompt` out"
         )
 
@@ -289,19 +291,23 @@ def _adapt_model(
     """
     if options:
         raise InputError(
-            f"model {model.name} brings its own preprocessing: leave out "
-            f"{', '.join(options)}, or load its network anew"
+            f"model {model.name} has its own preprocessing: leave out "
+            f"{', '.join(options)}, or load its network again"
         )
-    is_unchanged = names is None and name is None
+    # `spec` can load the model again only without another name or other labels. `read`
+    # is not compared, since it usually follows from the task.
+    has_same_names = names is None and name is None
     adapted_model = replace(
         model,
         name=name or model.name,
         read=read or model.read,
-        spec=model.spec if is_unchanged else None,
+        spec=model.spec if has_same_names else None,
     )
     if names is None:
         return adapted_model
-    if adapted_model.read is None:  # other tasks count the classes by themselves
+    returns_logits = adapted_model.read is None
+    if returns_logits:
+        # Only logits have a known number of classes, which the names must fit.
         names = fit_labels(adapted_model.classes, names, origin, adapted_model.name)
     return replace(adapted_model, labels=names, named=True)
 
@@ -334,7 +340,7 @@ def _probe_source(
         name=name or source.name,
         labels=(),
         preprocessing=preprocessing,
-        # a network that needs larger batches gets them whatever the option is
+        # The option `max_batch` cannot go below what the network needs.
         batch_limits=(min_batch, max(min_batch, max_batch)),
         dtype=source.dtype,
         device=source.device,
@@ -349,8 +355,8 @@ def _adapt_to_images_alone(
 ) -> Callable[[Tensor], Any]:
     """Return the network of a source as one that is called with images alone.
 
-    Some networks also take the size of the images, which is then passed along. A
-    network with a state, such as a speed, is called with that already (`WithState`).
+    Some networks also take the size of the images: the result passes it to them. A
+    network with a state, such as a speed, is already wrapped (`WithState`).
 
     Args:
         source: source of the network.
@@ -367,11 +373,11 @@ def parse_code_reference(spec: str) -> str | None:
     None if it imports nothing: a source such as "timm:resnet18", a path, or
     "reference". A file of weights behind an @ is left out.
     """
-    # two names of Python with dots and a colon between them, perhaps with weights
     text = spec.strip()
-    if text.partition(":")[0].lower() in SOURCES or not re.fullmatch(
-        r"[^\W\d][\w.]*:[^\W\d][\w.]*(@.+)?", text
-    ):
+    is_source = text.partition(":")[0].lower() in SOURCES
+    # two dotted names of Python with a colon between them, perhaps with weights
+    is_reference = re.fullmatch(r"[^\W\d][\w.]*:[^\W\d][\w.]*(@.+)?", text) is not None
+    if is_source or not is_reference:
         return None
     return split_weights(text)[0]
 
@@ -385,7 +391,7 @@ def _find_source(spec: object, purpose: Purpose) -> Source | Model:
         purpose: what the model is loaded for.
 
     Raises:
-        InputError: `spec` is something else, or a name that means nothing.
+        InputError: `spec` is something else, or an unknown name.
     """
     if isinstance(spec, Model):
         return spec
@@ -431,7 +437,7 @@ def _find_named_source(text: str, purpose: Purpose) -> Source | Model:
             f"model {text!r}: write {text.replace('.py:', ':')!r}, without the '.py'"
         )
     if parse_code_reference(text) is not None:
-        # the sources are only for a message, about a misspelt source in the text
+        # `SOURCES` is only for a message: the package may be a misspelt source.
         return load_callable(text, SOURCES)
     is_path = (
         Path(text).suffix.lower() in files.SUFFIXES
@@ -445,12 +451,12 @@ def _find_named_source(text: str, purpose: Purpose) -> Source | Model:
 
 
 def _make_unknown_error(text: str) -> UnknownNameError:
-    """Return the error for a model's name that means nothing, with similar names.
+    """Return the error for an unknown name of a model, with similar names.
 
     A name without a colon, such as "resnet18", may be that of a library's network. Then
     the message states how it is written with its library.
     """
-    # what stands after the colon; NAME for other sources
+    # how a model of some sources is written; other sources have "SOURCE:NAME"
     forms = {
         "hf": "hf:REPOSITORY",
         "http": "http://ADDRESS",
@@ -479,7 +485,8 @@ def _find_library_source(network: nn.Module, purpose: Purpose) -> Source | None:
         purpose: what the model is loaded for, such as the task.
     """
     for library, recognizer in list_built_ins("recognizer").items():
-        if library in sys.modules:  # else no network of it can exist
+        # A network of a library that is not imported cannot exist.
+        if library in sys.modules:
             recognize: Callable[[nn.Module, Purpose], Source | None] = load_attribute(
                 recognizer.target
             )
@@ -522,8 +529,8 @@ def _parse_choice(key: str, value: object, choices: tuple[str, ...]) -> str:
 def _make_preprocessing(source: Source, options: Mapping[str, Any]) -> Preprocessing:
     """Create the preprocessing of a network.
 
-    An option of the user takes precedence over what the source states, and that over
-    the defaults.
+    An option of the user takes precedence over what the source states, which takes
+    precedence over the defaults.
 
     Args:
         source: source of the network.
@@ -558,7 +565,7 @@ def _make_preprocessing(source: Source, options: Mapping[str, Any]) -> Preproces
     for key, choices in (("layout", ("NCHW", "NHWC")), ("channels", ("RGB", "BGR"))):
         if key in options:
             fields[key] = _parse_choice(key, options[key], choices)
-    # What neither states is left to the defaults of `Preprocessing`.
+    # `Preprocessing` has defaults for what neither the source nor the user states.
     stated_fields = {key: value for key, value in fields.items() if value}
     return Preprocessing(**stated_fields)
 
@@ -619,16 +626,18 @@ def _check_eight_bit(
 
     Args:
         name: name of the model, for the message.
-        fields: fields of the preprocessing, `value_range` among them.
+        fields: fields of the preprocessing, including `value_range`.
         options: options that the user set.
     """
-    wrong = [key for key in ("mean", "std") if key in options]
+    wrong_keys = [key for key in ("mean", "std") if key in options]
+    # The source itself states (0, 255), so that only the option can have changed it.
     if fields["value_range"] != (0.0, 255.0):
-        wrong.append("value_range")
-    if wrong:
+        wrong_keys.append("value_range")
+    if wrong_keys:
+        key = wrong_keys[0]
         raise InputError(
-            f"{wrong[0]}: model {name} takes whole numbers from 0 to 255 (uint8), got "
-            f"{options[wrong[0]]!r}; leave it out"
+            f"{key}: model {name} takes whole numbers from 0 to 255 (uint8), got "
+            f"{options[key]!r}; leave it out"
         )
 
 
@@ -639,7 +648,7 @@ def _parse_numbers(
 
     Args:
         key: name of the option, for messages.
-        value: to parse.
+        value: value to parse.
         counts: allowed counts of numbers, such as (1, 3).
         expected: description of what is expected, for messages.
 

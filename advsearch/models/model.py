@@ -29,11 +29,10 @@ from advsearch.models.labels import LabelSet, find_label_set
 
 
 class _Recomputed(torch.autograd.Function):
-    """Compute a function of images without storing activations; its gradient computes
-    again.
+    """Compute a function of images without storing activations.
 
-    `torch.utils.checkpoint` does the same, but not under `autograd.grad`, and not with
-    `mend_batch_norms`.
+    For the gradient, the function is computed again. `torch.utils.checkpoint` does the
+    same, but not under `autograd.grad`, and not with `mend_batch_norms`.
     """
 
     @staticmethod
@@ -48,8 +47,8 @@ class _Recomputed(torch.autograd.Function):
         Args:
             ctx: stores what `backward` needs.
             function: the function; it is called again for the gradient.
-            structures: list to which it is appended how the tensors are nested, as only
-                tensors may be returned.
+            structures: list to which the nesting of the returned tensors is appended:
+                autograd allows only a flat tuple of tensors as the result.
             images: (N, H, W, 3).
         """
         tensors, structure = tree_flatten(function(images))  # autograd is off in here
@@ -65,16 +64,17 @@ class _Recomputed(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[None, None, Tensor]:
         """Return the gradient by the images, for the gradients of all returned tensors.
 
-        The function is computed again, this time with a graph. As autograd requires,
-        there is a value for each argument of `forward`: None for `function` and
-        `structures`, which are no tensors, and the gradient for `images`.
+        The function is computed again, this time with a graph. Autograd requires a
+        value for each argument of `forward`: None for `function` and `structures`,
+        which are no tensors, and the gradient for `images`.
         """
         (images,) = ctx.saved_tensors
         # Autograd switches gradients on in here only if the caller wants a gradient of
         # this gradient (`create_graph=True`).
         create_graph = torch.is_grad_enabled()
         with torch.enable_grad():
-            images = images if create_graph else images.detach().requires_grad_()
+            if not create_graph:
+                images = images.detach().requires_grad_()
             tensors, _ = tree_flatten(ctx.function(images))
         outputs = []
         output_gradients = []
@@ -99,15 +99,15 @@ class _Recomputed(torch.autograd.Function):
 def compute_checkpointed(function: Callable[[Tensor], Any], images: Tensor) -> Any:
     """Return `function(images)` without storing activations.
 
-    The gradient computes the function a second time. So the activations of one batch
-    are in memory at a time, and not those of all (Chen et al. 2016, *Training Deep Nets
-    with Sublinear Memory Cost*, section 3).
+    For the gradient, the function is computed a second time. So the activations of only
+    one batch are in memory at a time (Chen et al. 2016, *Training Deep Nets with
+    Sublinear Memory Cost*, section 3).
 
     Args:
         function: function that returns a tensor, or lists and mappings of tensors.
         images: (N, H, W, 3).
     """
-    # `apply` returns tensors only, and appends the structure that they belong to
+    # `apply` returns a flat tuple of tensors, and appends their nesting to this list.
     structures: list[Any] = []
     tensors = _Recomputed.apply(function, structures, images)  # type: ignore[no-untyped-call]
     return tree_unflatten(list(tensors), structures[0])
@@ -127,14 +127,14 @@ PRESETS: dict[str, tuple[Triple, Triple]] = {
 }
 
 Read = Callable[[Any, int], Any]
-"""Reads the output from what a network returned for a number of images. Raises
-ValueError with what was expected.
+"""Finds the output in what a network returned (first argument) for a number of images
+(second argument). Raises ValueError, with what was expected, if it is not there.
 """
 
 # Smaller probabilities are clamped to this before the logarithm: its derivative is
 # finite in float32.
 MIN_PROBABILITY = 1e-30
-# How far outside [0, 1] a pixel may lie: finite differences overshoot a little.
+# Maximum distance of a pixel from [0, 1]: finite differences overshoot a little.
 RANGE_TOLERANCE = 0.01
 # Maximum number of images of a rig whose activations are stored; for more, the network
 # recomputes them.
@@ -144,7 +144,7 @@ OUTPUTS_BY_TASK = {
     "classification": "a row of scores is what a classifier gives",
     "detection": "boxes are what a detector gives",
     "segmentation": "a score for each pixel is what a segmenter gives",
-    "depth": "a number for each pixel is what a model of depth gives",
+    "depth": "a number for each pixel is what a depth model gives",
     "similarity": "features are what a network without a head gives",
     "command": "actions are what a policy gives",
 }
@@ -152,8 +152,9 @@ OUTPUTS_BY_TASK = {
 
 
 class RemoteNetwork:
-    """A network elsewhere that only answers; a run stores its answers and states their
-    cost.
+    """A network on another machine, which returns answers but no gradients.
+
+    A run stores its answers and reports their cost.
     """
 
     def __call__(self, pictures: Tensor) -> Any:
@@ -166,20 +167,23 @@ class RemoteNetwork:
         raise NotImplementedError
 
     def store_answers_in(self, store: Any) -> None:
-        """Store answers and what is spent in an `advsearch.runs.store.Store` from now
-        on.
+        """Store answers and what is spent in a run from now on.
+
+        Args:
+            store: an `advsearch.runs.store.Store`.
         """
         raise NotImplementedError
 
 
 class ModelWarning(UserWarning):
-    """A model that works, but not as an attack would like it to (probabilities,
-    randomness, no gradient).
+    """Warn that a model works, but is hard to attack.
+
+    For example, it returns probabilities, is random, or has no gradient.
     """
 
 
 def warn(message: str) -> None:
-    """Warn of a model (ModelWarning)."""
+    """Issue a ModelWarning."""
     warnings.warn(message, ModelWarning, stacklevel=4)
 
 
@@ -194,18 +198,25 @@ class Preprocessing:
     `channels`.
     5. Layout: NCHW (contiguous), or NHWC.
 
-    A `processor` stands for steps 2 to 4: from pictures (N, 3, H, W) in [0, 1], RGB, to
-    what the network takes, of the same shape. Without `resizes` there is no first step:
-    such a model is given pictures as they are rendered.
+    Attributes:
+        input_size: (height, width) in pixels.
+        mean: one number per channel, in the order of `channels`.
+        std: likewise; greater than 0.
+        value_range: (low, high), the values of black and white.
+        layout: "NCHW" or "NHWC".
+        channels: "RGB" or "BGR".
+        processor: replaces steps 2 to 4. It takes images (N, 3, H, W) in [0, 1], RGB,
+            and returns what the network takes, of the same shape.
+        resizes: whether there is step 1. Without it the model gets images of the size
+            at which they are rendered.
     """
 
-    input_size: tuple[int, int]  # (height, width) in pixels
-    mean: Triple = (0.0, 0.0, 0.0)  # one number per channel
-    std: Triple = (1.0, 1.0, 1.0)  # likewise, over 0
-    # (low, high) that black and white are sent to
+    input_size: tuple[int, int]
+    mean: Triple = (0.0, 0.0, 0.0)
+    std: Triple = (1.0, 1.0, 1.0)
     value_range: tuple[float, float] = (0.0, 1.0)
-    layout: str = "NCHW"  # or "NHWC"
-    channels: str = "RGB"  # or "BGR"
+    layout: str = "NCHW"
+    channels: str = "RGB"
     processor: Callable[[Tensor], Tensor] | None = None
     resizes: bool = True
 
@@ -237,10 +248,11 @@ class Preprocessing:
         return x.permute(0, 2, 3, 1).contiguous()
 
     def _normalize(self, x: Tensor) -> Tensor:
-        """Apply steps 2 to 4 of the preprocessing to images (N, 3, H, W).
+        """Apply value range, channel order and normalization to images (N, 3, H, W).
 
-        Range and normalization are linear, so that one gain and one offset for each
-        channel do both.
+        Value range and normalization are linear, so that one gain and one offset per
+        channel do both. `mean` and `std` are in the order of the channels that the
+        network takes, BGR or RGB.
         """
         # (low + (high - low) x - mean) / std = gain x + offset
         low, high = self.value_range
@@ -250,7 +262,8 @@ class Preprocessing:
         ]
         if self.channels == "BGR":
             x = x.flip(1)
-        if gain == [1.0] * 3 and offset == [0.0] * 3:  # nothing to do
+        is_identity = gain == [1.0] * 3 and offset == [0.0] * 3
+        if is_identity:
             return x
         return torch.addcmul(
             x.new_tensor(offset).view(3, 1, 1), x, x.new_tensor(gain).view(3, 1, 1)
@@ -261,34 +274,35 @@ class Preprocessing:
 @dataclass(frozen=True, eq=False, repr=False)
 class Model:
     """A network with all that is needed to run it on an image and to read its output.
-    Created by `load_model`.
+
+    It is created by `load_model`.
 
     Args:
-        module: the network. It takes what `preprocessing` returns and returns what
-            `read_logits` describes.
-        name: its name in messages and results.
+        module: the network. It takes what `preprocessing` returns. It returns logits in
+            a form that `read_logits` accepts, or what `read` takes.
+        name: name of the model in messages and results.
         labels: one name per class, in index order.
         preprocessing: preprocessing of an image.
         batch_limits: (minimum, maximum) batch size of the network. Larger batches are
             split, smaller ones padded.
-        probabilities: the network returns probabilities; their logarithm is returned:
-            differences are log-odds.
-        differentiable: a gradient of the logits reaches the image.
-        attached: its gradient is that of its outputs only if `detach` is ignored, see
-            `DetachMode`.
-        named: False if `labels` are placeholders.
+        probabilities: whether the network returns probabilities. Then the model returns
+            their logarithms, whose differences are log-odds.
+        differentiable: whether a gradient of the logits reaches the image.
+        attached: whether the network's calls of `detach` are ignored: without that its
+            gradient does not predict its outputs, see `DetachMode`.
+        named: whether `labels` are names; False for placeholders ("class 0").
         dtype: dtype of the network's floating-point input.
-        device: device of the network. Images go there, the output comes back.
-        read: reads the output from what the network returns for a number of images: a
-            tensor (N, ...), or a list with one element for each; None for logits.
-        spec: the argument of `load_model`, if that is all that defines the model; None
-            for what exists in this session only.
-        cameras: how many images of a rig are side by side in each image. The network
-            sees them one by one; the output is then a list with a tuple of theirs for
-            each image.
+        device: device of the network. Images are moved there, and the output back.
+        read: finds the output in what the network returns for a number of images: a
+            tensor (N, ...), or a list with one element for each image; None for logits.
+        spec: the argument of `load_model`, if the model can be loaded again from it;
+            None if the model exists only in this session.
+        cameras: number of cameras of a rig, whose images are side by side in each
+            image. The network gets them one by one. If there are several cameras, the
+            output for an image is a tuple with the output for each camera.
         make_trainable: returns a new network with the same weights that can be trained
-            further, if `module` is one made for inference alone; None for a copy of
-            `module`.
+            further. It is needed if `module` is made for inference only; None if a copy
+            of `module` can be trained.
     """
 
     module: Callable[[Tensor], Any] = field(repr=False)
@@ -314,8 +328,9 @@ class Model:
 
     @property
     def input_size(self) -> tuple[int, int]:
-        """(height, width) in pixels of the images that the network takes; others are
-        resized.
+        """(height, width) in pixels of the images that the network takes.
+
+        Images of other sizes are resized.
         """
         return self.preprocessing.input_size
 
@@ -325,20 +340,21 @@ class Model:
         return len(self.labels)
 
     def __call__(self, images: Tensor) -> Any:
-        """Return the output for one image or a batch; differentiable with respect to
-        the images.
+        """Return the output for one image or a batch, differentiably.
 
         Args:
             images: (H, W, 3) or (N, H, W, 3), floating, display-referred sRGB in [0,
-                1]. Non-finite values pass through: they are the search's to handle.
+                1]. The images of several cameras are side by side in each of them.
+                Non-finite values pass through: the search handles them.
 
         Returns:
             Logits (N, classes), float32, on the device of the images; N is 1 for a
-            single image. If the network returns probabilities p, log p. With `read`,
-            what that returns.
+            single image. They are log p if the network returns probabilities p. With
+            `read`, the output is what that returns. With several cameras (`cameras`),
+            it is a list of N tuples: the output for each camera, of batch size 1.
 
         Raises:
-            InputError: not an image, or values that are clearly not in [0, 1].
+            InputError: they are no images, or values are clearly not in [0, 1].
             ModelError: the network's output is not (N, classes), or `read` finds no
                 output in it.
         """
@@ -346,6 +362,7 @@ class Model:
         if self.cameras > 1:
             # (N, H, cameras * W, 3) to (N * cameras, H, W, 3)
             images = images.unflatten(2, (self.cameras, -1)).movedim(2, 1).flatten(0, 1)
+        # whether activations are computed again for the gradient, and not stored
         recomputes = self._must_recompute(images)
 
         def return_to_device(output: Tensor) -> Tensor:
@@ -358,6 +375,9 @@ class Model:
             return returned.clone() if is_same_memory else returned
 
         def run_batch(batch: Tensor) -> Any:
+            """Return the output for a batch of images (N, H, W, 3)."""
+            # `prepare` fills up a batch that is too small with copies of an image: the
+            # outputs for these are cut off.
             output = self.run_network(self.prepare(batch))[: len(batch)]
             return map_tensors(output, return_to_device)
 
@@ -368,7 +388,7 @@ class Model:
         output = outputs[0] if len(outputs) == 1 else join_outputs(outputs)
         if self.cameras == 1:
             return output
-        # one tuple for each rig, with the output for each of its cameras
+        # one tuple for each original image, with the output for each of its cameras
         image_outputs = [output[index : index + 1] for index in range(len(output))]
         return [
             tuple(image_outputs[start : start + self.cameras])
@@ -378,9 +398,9 @@ class Model:
     def _must_recompute(self, images: Tensor) -> bool:
         """Return whether the gradient must compute activations again to save memory.
 
-        It must if the images (N, H, W, 3) come from rigs, there are more than
-        `MAX_STORED_IMAGES`, and a gradient is wanted. A network that takes all images
-        of a rig at once cannot be split so.
+        It must if the images (N, H, W, 3) come from several cameras, there are more
+        than `MAX_STORED_IMAGES`, and a gradient is required. A network that takes the
+        images of all cameras at once cannot be split into smaller batches.
         """
         return (
             self.cameras > 1
@@ -393,16 +413,16 @@ class Model:
     def _find_max_batch(self, *, recomputes: bool) -> int:
         """Return the maximum number of images in a batch.
 
-        The images of a rig stay in one batch, if they fit into it. With `recomputes`,
-        batches are at most `MAX_STORED_IMAGES`, as the activations of one batch are in
-        memory at a time.
+        The images of all cameras of a rig stay in one batch, if they fit into it. With
+        `recomputes`, a batch has at most `MAX_STORED_IMAGES`, because the activations
+        of one batch are in memory at a time.
         """
         max_batch = self.batch_limits[1]
         if self.cameras > 1:
-            # The largest multiple of the number of cameras; 0 if one rig is too large.
-            # Then the batch has as many images as are allowed.
-            full_rigs = max_batch - max_batch % self.cameras
-            max_batch = max(full_rigs, min(max_batch, self.cameras))
+            # The largest multiple of the number of cameras. It is 0 if a single rig has
+            # more images than are allowed: then the batch is as large as is allowed.
+            n_images_of_full_rigs = max_batch - max_batch % self.cameras
+            max_batch = max(n_images_of_full_rigs, min(max_batch, self.cameras))
         return min(max_batch, MAX_STORED_IMAGES) if recomputes else max_batch
 
     def copy_network(self) -> nn.Module:
@@ -423,18 +443,20 @@ class Model:
         return copy.deepcopy(self.module)
 
     def with_network(self, network: nn.Module) -> Model:
-        """Return the same model with a network of the same kind in evaluation mode,
-        whose weights it shares.
+        """Return the same model with another network of the same kind.
 
-        It sees the weights as they are trained in place, and collects no gradients for
+        The model has a copy of the network in evaluation mode that shares its weights:
+        it follows them when they are trained in place, and collects no gradients for
         them.
         """
         shared = copy_sharing_weights(network).eval().requires_grad_(False)
         return replace(self, module=shared, make_trainable=None)
 
     def label_set(self, text: str | int | Sequence[str | int]) -> LabelSet:
-        """Return the classes that `text` names, e.g. ``"coffee mug,cup"`` or
-        ``"#504"``; see `find_label_set`.
+        """Return the classes that a text names; see `find_label_set`.
+
+        Args:
+            text: such as ``"coffee mug,cup"`` or ``"#504"``.
         """
         return find_label_set(text, self.labels, named=self.named)
 
@@ -451,11 +473,10 @@ class Model:
             What the network takes, with at least the minimum batch size. It shares no
             memory with the images, as the network may write into it.
         """
-        # how many images the batch is too small by
-        missing = self.batch_limits[0] - len(images)
+        n_missing = self.batch_limits[0] - len(images)
         batch = images
-        if missing > 0:
-            batch = torch.cat([images, images[-1:].expand(missing, -1, -1, -1)])
+        if n_missing > 0:
+            batch = torch.cat([images, images[-1:].expand(n_missing, -1, -1, -1)])
         batch = batch.to(device=self.device, dtype=torch.float32)
         x = self.preprocessing(batch).to(self.dtype)
         is_view = x.untyped_storage().data_ptr() == images.untyped_storage().data_ptr()
@@ -466,16 +487,19 @@ class Model:
 
         Args:
             x: the batch.
-            raw: whether to return what the network itself returns.
+            raw: whether to return the network's own return value, before the output is
+                read from it.
 
         Returns:
-            The output; with `raw`, what the network itself returns.
+            The output as `Model` returns it; with `raw`, the network's own return
+            value.
         """
         INTERRUPTS.look()  # ends here after Ctrl-C
-        # A model that is `attached` has a gradient through what its network detaches.
+        # In an `attached` model, gradients also go through what its network detaches.
         ignores_detach = self.attached and torch.is_grad_enabled()
         mode = DetachMode(ignored=True) if ignores_detach else nullcontext()
-        # The network may switch gradients off as it runs: this restores the mode.
+        # The network may switch gradients on or off as it runs. The mode is set to its
+        # present value so that it is restored in the end.
         with mode, torch.set_grad_enabled(torch.is_grad_enabled()):
             returned = self.module(x)
         if raw:
@@ -489,17 +513,18 @@ class Model:
 
 
 def copy_sharing_weights(module: nn.Module) -> nn.Module:
-    """Return a copy of a module that shares its weights, but has gradients of its own.
+    """Return a copy of a module that shares its weights, but not their gradients.
 
-    Weights that were created in `torch.inference_mode` are copied: nothing can be
-    differentiated through them.
+    Weights that were created in `torch.inference_mode` are copied, since autograd
+    cannot use them.
     """
 
     def make_differentiable(weights: torch.Tensor) -> torch.Tensor:
         """Return weights through which autograd can differentiate."""
         return weights.clone() if weights.is_inference() else weights
 
-    # `deepcopy` takes the objects in here, by id, in place of copies of them.
+    # `deepcopy` uses the object that is stored here under the id of another one in
+    # place of a copy of that one.
     memo: dict[int, Any] = {}
     for parameter in module.parameters():
         weights = make_differentiable(parameter.detach())
@@ -516,12 +541,14 @@ class DetachMode(TorchFunctionMode):
     """Observe whether a network detaches tensors, or ignore that it does.
 
     RT-DETR and similar networks choose queries by the scores of their encoder, and
-    detach these from their decoder, in evaluation too: that makes training stable (Zhu
-    et al. 2020, arXiv 2010.04159, appendix A.4), and hides from a search how the image
-    moves them.
+    detach the queries from their decoder, in evaluation too. This makes training stable
+    (Zhu et al. 2020, arXiv 2010.04159, appendix A.4). But it hides from a search how
+    the image changes the queries.
 
-    `detach` does nothing if it is `ignored`; `has_detached` states whether something
-    with a gradient was to be detached.
+    Attributes:
+        ignored: whether `detach` does nothing.
+        has_detached: whether the network has called `detach` for a tensor with a
+            gradient.
     """
 
     def __init__(self, *, ignored: bool = False) -> None:
@@ -532,13 +559,14 @@ class DetachMode(TorchFunctionMode):
     def __torch_function__(
         self, function: Any, types: Any, args: Any = (), kwargs: Any = None
     ) -> Any:
-        """Call a function of torch, or leave out a `detach` that is to be ignored.
+        """Call a function of torch, unless it is a `detach` that is ignored.
 
-        torch calls this in place of each of its functions while the mode is on.
+        torch calls this method in place of each of its functions while the mode is
+        active.
 
         Args:
             function: function of torch that the network calls.
-            types: types of its arguments, which are not needed.
+            types: types of its arguments; not used.
             args: its positional arguments; the first of `detach` is the tensor.
             kwargs: its keyword arguments.
         """
@@ -556,8 +584,8 @@ def check_images(images: Tensor) -> Tensor:
         images: (H, W, 3) or (N, H, W, 3), floating.
 
     Raises:
-        InputError: another type, shape or dtype, or values that are not in [0, 1] up to
-            `RANGE_TOLERANCE`.
+        InputError: type, shape or dtype are others, or a value is outside of [0, 1] by
+            more than `RANGE_TOLERANCE`.
     """
     expected = (
         "images: expected a floating-point tensor (H, W, 3) or (N, H, W, 3) in [0, 1]"
@@ -573,7 +601,7 @@ def check_images(images: Tensor) -> Tensor:
     if not images.is_floating_point():
         raise InputError(f"{expected}, got {images.dtype}; divide 8-bit values by 255")
     low, high = (float(limit) for limit in images.detach().aminmax())
-    # NaN and infinity pass: these are the search's to handle.
+    # NaN and infinity pass: the search handles them.
     is_too_low = -math.inf < low < -RANGE_TOLERANCE
     is_too_high = 1 + RANGE_TOLERANCE < high < math.inf
     if is_too_low or is_too_high:
@@ -599,7 +627,7 @@ def read_output(read: Read, returned: Any, count: int, name: str) -> Any:
     try:
         output = read(returned, count)
     except ValueError as error:
-        # `read` is usually a method of a task, whose name is then known for advice.
+        # `read` is usually a method of a task. The name of that task is for the advice.
         task = getattr(getattr(read, "__self__", None), "name", None)
         raise ModelError(
             f"model {name}: {error}, got {describe_output(returned)}; "
@@ -610,6 +638,7 @@ def read_output(read: Read, returned: Any, count: int, name: str) -> Any:
             f"model {name}: expected an output for each of {count} "
             f"images, got {len(output)}"
         )
+    # torch computes some gradients of batch norms wrongly; hooks correct them.
     mend_batch_norms(output)
     return output
 
@@ -625,8 +654,10 @@ def _advise_on_output(returned: Any, task: str | None) -> str:
     if advice:
         return advice
     likely_task = _guess_task(returned)
-    # Actions, of task command, look like rows of scores.
-    if likely_task and task not in (likely_task, "command"):
+    # The actions that task `command` reads look like rows of scores. So an output that
+    # it cannot read says nothing about the right task.
+    is_certain = task != "command"
+    if likely_task and likely_task != task and is_certain:
         return _advise_other_task(likely_task)
     return "wrap the network, or ask for another task"
 
@@ -648,8 +679,9 @@ def join_outputs(outputs: Sequence[Any]) -> Any:
 def map_tensors(output: Any, function: Callable[[Tensor], Tensor]) -> Any:
     """Apply a function to every tensor in an output.
 
-    The result has plain dicts and lists. `torch.utils._pytree` would not do: it takes a
-    subclass of dict that is not registered, such as a library's output, for a leaf.
+    The result has plain dicts and lists. `torch.utils._pytree` cannot be used, because
+    for it a subclass of dict that is not registered, such as a library's output, is a
+    leaf.
 
     Args:
         output: a tensor, or mappings and sequences of tensors and other values.
@@ -669,6 +701,7 @@ def list_tensors(output: Any) -> list[Tensor]:
     tensors: list[Tensor] = []
 
     def collect(tensor: Tensor) -> Tensor:
+        """Append a tensor to the list, and return it unchanged."""
         tensors.append(tensor)
         return tensor
 
@@ -677,7 +710,7 @@ def list_tensors(output: Any) -> list[Tensor]:
 
 
 def read_logits(output: Any, count: int, classes: int | None, name: str) -> Tensor:
-    """Return the logits (count, classes) float32 in what a network returned.
+    """Return the logits (count, classes), float32, in a network's return value.
 
     Accepted are a tensor, an object with a tensor `logits`, a mapping with a tensor
     ``"logits"``, and a tuple or list whose first element is a tensor.
@@ -691,7 +724,7 @@ def read_logits(output: Any, count: int, classes: int | None, name: str) -> Tens
     Raises:
         ModelError: there is no such tensor, or its shape or type is not that of logits.
     """
-    # The usual case is a tensor of the right shape. It comes first to be quick.
+    # The usual case, a tensor of the right shape, comes first because it is fast.
     if (
         isinstance(output, Tensor)
         and output.is_floating_point()
@@ -726,8 +759,8 @@ def read_logits(output: Any, count: int, classes: int | None, name: str) -> Tens
 def _check_is_classifier(output: Any, tensor: Tensor | None, expected: str) -> None:
     """Raise ModelError for an output that is clearly not that of a classifier.
 
-    It has losses (the network is in training mode), class indices instead of scores
-    (an argmax was taken), or what networks of another task return.
+    Such an output has losses (the network is in training mode), class indices instead
+    of scores (an argmax was taken), or the form of another task's output.
 
     Args:
         output: output of the network.
@@ -750,11 +783,12 @@ def _check_is_classifier(output: Any, tensor: Tensor | None, expected: str) -> N
 
 
 def mend_batch_norms(output: Any) -> None:
-    """Give gradients that reach batch norms the memory layout of the norms' inputs.
+    """Add hooks to the graph of an output that prevent wrong gradients of batch norms.
 
-    torch 2.13 reads some gradients of a single image in a wrong order on the CPU,
-    without a warning: those from ``flatten(2).transpose(1, 2)``, as in networks whose
-    convolutions end in a transformer. Batches are right.
+    On the CPU, batch norms of torch 2.13 read the gradient of a single image in a wrong
+    order, without a warning, if it comes from ``flatten(2).transpose(1, 2)``. Networks
+    whose convolutions are followed by a transformer are examples. Gradients of batches
+    are right. The hooks copy such a gradient to the memory layout of the input.
 
     Args:
         output: output of a network, whose graph gets hooks.
@@ -763,11 +797,12 @@ def mend_batch_norms(output: Any) -> None:
     def with_strides(
         strides: tuple[int, ...], gradients: tuple[Tensor | None, ...]
     ) -> tuple[Tensor | None, ...]:
-        """Return the gradients of a batch norm, the first with these strides.
+        """Return the gradients that reach a batch norm, the first with these strides.
 
         Args:
             strides: strides of the input of the batch norm.
-            gradients: gradients by its outputs; the first is that of the image.
+            gradients: gradients with respect to each output of the batch norm. The
+                first output is the normalized images; the others are statistics.
         """
         gradient, *rest = gradients
         if gradient is None or gradient.stride() == strides:
@@ -787,7 +822,8 @@ def mend_batch_norms(output: Any) -> None:
         visited.add(node)
         pending.extend(next_node for next_node, _ in node.next_functions)
         if node.name().startswith("NativeBatchNorm"):
-            # `empty_like` keeps the order of axes; "meta" tensors take no memory.
+            # `empty_like` keeps the order of axes in memory; a "meta" tensor takes
+            # none.
             strides = torch.empty_like(node._saved_input, device="meta").stride()
             node.register_prehook(partial(with_strides, strides))
 
@@ -804,8 +840,9 @@ def _find_logits(output: Any) -> Tensor | None:
 
 
 def _find_scores(returned: Any) -> Any:
-    """Return the scores in an output, of images or of pixels; None if there are
-    none.
+    """Return the scores of images or of pixels in an output; None if it has none.
+
+    Segmenters of torchvision return scores under "out".
     """
     if isinstance(returned, Mapping) and "out" in returned:
         return returned["out"]
@@ -824,10 +861,10 @@ def _advise_on_missing_scores(returned: Any) -> str:
     are_losses = all(isinstance(value, Tensor) and value.ndim == 0 for value in values)
     if values and are_losses:
         return (
-            "one number for all pictures is what a loss is: give the network as it "
-            "is outside of training"
+            "one number for all images is a loss: give the network as it is outside "
+            "of training"
         )
-    # The first element of a list may be the labels of boxes.
+    # The first element of a list may be the labels of boxes: no advice is given.
     if isinstance(returned, (list, tuple)):
         return ""
     tensor = _find_scores(returned)
@@ -871,7 +908,7 @@ def _guess_task(returned: Any) -> str | None:
 
 
 def _looks_like_boxes(returned: Any) -> bool:
-    """Return whether an output of a network looks like boxes of a detector.
+    """Return whether an output of a network looks like that of a detector.
 
     Detectors return one of these: a tuple that begins with boxes (N, K, 4), followed by
     scores; a mapping or an object with a field "boxes" or "pred_boxes"; or a list of
@@ -881,8 +918,9 @@ def _looks_like_boxes(returned: Any) -> bool:
     first = returned[0] if is_sequence and returned else returned
     if isinstance(first, Tensor):
         is_boxes = first.dim() == 3 and first.shape[2] == 4
-        has_more = is_sequence and len(returned) > 1  # boxes alone have no scores
-        return has_more and is_boxes
+        # Boxes are followed by their scores.
+        has_scores = is_sequence and len(returned) > 1
+        return has_scores and is_boxes
     # keys of a mapping, or attributes of an object
     field_names = first if isinstance(first, Mapping) else dir(first)
     return "boxes" in field_names or "pred_boxes" in field_names

@@ -1,5 +1,7 @@
-"""Probe a network before its outputs are trusted: two images, a repetition, a batch, a
-gradient.
+"""Probe a network before its outputs are trusted.
+
+It is run on two images, once more on one of them, and on a batch; and its gradient is
+checked.
 """
 
 from __future__ import annotations
@@ -42,38 +44,39 @@ REPEAT_TOLERANCE = 1e-3
 
 ROUNDING_STEPS = 4.0
 """Minimum change of an image, and tolerance of outputs, in units of the machine epsilon
-of the network's dtype: bfloat16 distinguishes 0.50 from 0.51 and no less.
+of the network's dtype. bfloat16, for example, cannot resolve less than the difference
+of 0.50 and 0.51.
 """
 
-# Change of each value of an image, in [0, 1], along the gradient that is checked.
+# Change of each pixel value in [0, 1] over which a gradient is checked.
 STEP = 1e-3
-# Likewise, for outputs that jump over the longer step only.
-SMALL_STEP = STEP / 8.0
+# A second, smaller change, over which fewer outputs jump.
+STEP_RATIO = 8.0
+SMALL_STEP = STEP / STEP_RATIO
 
 MAX_GRADIENT_ERROR = 0.9
-"""Maximum relative error of what the gradient predicts: a wrong sign is an error of 2,
-a step function one of 1; kinks of ordinary networks stay below a half.
+"""Maximum relative error of the change of outputs that the gradient predicts. A wrong
+sign has an error of 2, a step function one of 1; kinks of ordinary networks stay below
+0.5.
 """
 
 MAX_ATTACHED_ERROR = 0.5
-"""Maximum relative error of what a gradient predicts that replaces the network's
-own.
-"""
+"""Likewise, for a gradient that ignores `detach` and replaces the network's own one."""
 
 MIN_RELATIVE_CHANGE = 0.15
-"""Median relative change of an output between unlike images below which it hardly
-follows them. Measured: 0.50 to 1.04 for five trained networks, and 0.006 to 0.10 for
-the same with a 255th of their range.
+"""Minimum of the median relative change of outputs between unlike images. Below it the
+outputs hardly depend on the image. Five trained networks had 0.50 to 1.04; with colors
+divided by 255, they had 0.006 to 0.10.
 """
 
 MAX_GROWTH = 2.0
-"""Maximum factor by which outputs may grow with the right range of colors: 0.98 to 1.22
-for the same five networks. Outputs of untrained networks grow with their input.
+"""Maximum factor by which outputs may grow from a wrong range of colors to the right
+one. The same five networks had 0.98 to 1.22. Outputs of untrained networks grow more.
 """
 
 EIGHT_BIT = (0.0, 255.0)  # the other range of colors that networks are made for
 
-# Minimum relative change of outputs that is evaluated: less may be rounding.
+# Minimum relative change of outputs that is evaluated: a smaller one may be rounding.
 MIN_CHANGE = 1e-5
 
 # Maximum number of pixels in the smallest batch that a network takes: 800 MB.
@@ -83,12 +86,12 @@ MAX_PIXELS = 1 << 26
 def probe(
     model: Model, labels: tuple[str, ...] | None, labels_origin: LabelsOrigin
 ) -> Model:
-    """Run a model on test images, and return it with what its outputs show.
+    """Run a model on test images, and set the fields of the model that follow from it.
 
-    The fields `labels`, `probabilities`, `differentiable` and `batch_limits` are set.
-    The images are a gray one and one of uniform noise. The idea of looking for
-    probabilities, randomness and missing gradients before an attack is AutoAttack's
-    (Croce and Hein 2020, the flags of its reference implementation).
+    These are `labels`, `probabilities`, `differentiable`, `attached` and
+    `batch_limits`. The images are a gray one and one of uniform noise. AutoAttack looks
+    for probabilities, randomness and missing gradients before an attack, too (Croce and
+    Hein 2020, the flags of its reference implementation).
 
     Args:
         model: the model, without labels.
@@ -96,13 +99,13 @@ def probe(
         labels_origin: where the labels come from, for messages.
 
     Raises:
-        ModelError: it takes more than `MAX_PIXELS`, cannot be run on such an image,
-            returns something other than logits, or with NaN or infinity.
+        ModelError: its smallest batch has more than `MAX_PIXELS`, it cannot be run on
+            these images, or its output is of another form, NaN or infinity.
         InputError: the number of labels is not the number of classes.
 
     Warns:
-        ModelWarning: it returns probabilities (a segmenter's too), differently every
-            time, differently in a batch, or no gradient reaches the image.
+        ModelWarning: it returns probabilities; its output differs each time, or in a
+            batch; or no gradient reaches the image.
     """
     _check_batch_size(model)
     height, width = model.input_size
@@ -120,14 +123,14 @@ def probe(
         names = labels or ()
         probabilities = False
         _warn_of_pixel_probabilities(model, noise)
-    # Both are the output for the gray image: a network with dropout differs.
+    # Two outputs for the same gray image; those of a network with dropout differ.
     repeatable = _are_equal(model, rows[:1], repeated_rows)
     if repeatable and returns_logits and not probabilities:
         _warn_of_odd_scores(model, rows)
     if repeatable:
-        _check_range(
-            model, torch.cat([torch.zeros_like(gray), torch.ones_like(gray), noise])
-        )
+        black = torch.zeros_like(gray)
+        white = torch.ones_like(gray)
+        _check_range(model, torch.cat([black, white, noise]))
     else:
         warn(
             f"model {model.name} differs each time on the same image: results hold "
@@ -170,7 +173,7 @@ def _check_finite(model: Model, rows: Tensor) -> None:
     raise ModelError(
         f"model {model.name}: expected finite {expected}, got NaN or infinity for a "
         f"{image} image; "
-        "check its weights and the value range and normalisation that it expects"
+        "check its weights and the value range and normalization that it expects"
     )
 
 
@@ -203,32 +206,31 @@ def _warn_of_pixel_probabilities(model: Model, images: Tensor) -> None:
 
 
 def _warn_of_odd_scores(model: Model, rows: Tensor) -> None:
-    """Warn if rows (N, classes) are scores that are neither logits nor
-    probabilities.
-    """
+    """Warn if scores (N, classes) are neither logits nor probabilities."""
     kind = _describe_odd_scores(model, rows)
     if kind:
         warn(
-            f"model {model.name} returns {kind}. They are taken for logits: the "
-            "probabilities that are shown are none, and margins are differences of "
-            "such scores. Return what stands before the last function"
+            f"model {model.name} returns {kind}. They are used as logits: displayed "
+            "probabilities are not meaningful, and margins are differences of such "
+            "scores. Return the values before the last function"
         )
 
 
 def _run(model: Model, images: Tensor) -> Tensor:
-    """Run a network on images (N, H, W, 3), and return numbers for each to compare.
+    """Run a network on images (N, H, W, 3), and return a row of numbers for each image.
 
-    For a classifier these are its raw scores (N, classes), float32 on the CPU. Any
-    other output, such as boxes, may differ in size from image to image. So it is
-    summarized by three numbers, (N, 3): how many numbers it has, their sum, and the sum
-    of their absolute values.
+    The rows are for comparisons. For a classifier they are its raw scores (N, classes),
+    float32 on the CPU. Any other output, such as boxes, may have a different size for
+    each image. So it is summarized by three numbers, (N, 3): the count of its numbers,
+    their sum, and the sum of their absolute values.
     """
     if model.read is None:
         returned, count = _run_network(model, images)
         return read_logits(returned, count, None, model.name)[: len(images)].cpu()
     rows = []
     for output in _run_and_read(model, images):
-        # an empty tensor first, as `cat` needs one and an output may have none
+        # `cat` needs at least one tensor, but an output may have none: an empty one is
+        # added.
         tensors = [torch.zeros(0, device="cpu")]
         tensors += [tensor.float().flatten().cpu() for tensor in list_tensors(output)]
         values = torch.cat(tensors)
@@ -252,17 +254,22 @@ def _run_and_read(model: Model, images: Tensor) -> Any:
     assert model.read is not None
     returned, batch_size = _run_network(model, images)
     output = read_output(model.read, returned, batch_size, model.name)
-    return output[: len(images)]  # without images that fill a batch up
+    # without the outputs for copies of an image that fill up a batch
+    return output[: len(images)]
 
 
 def _run_network(model: Model, images: Tensor) -> tuple[Any, int]:
-    """Return what a network returns for images (N, H, W, 3), and its batch size.
+    """Return a network's own return value for images (N, H, W, 3), and the batch size.
 
-    The batch is larger than N if the network needs a larger one.
+    The batch is larger than N if the network needs a larger one. No output is read from
+    the return value (`raw`).
     """
     x = model.prepare(images)
+    # A network that raises may leave gradients switched on or off. The mode is set to
+    # its present value so that it is restored in the end.
     with torch.set_grad_enabled(torch.is_grad_enabled()):
-        return _call_guarded(model, lambda: model.run_network(x, raw=True)), len(x)
+        returned = _call_guarded(model, lambda: model.run_network(x, raw=True))
+        return returned, len(x)
 
 
 def _call_guarded(model: Model, call: Callable[[], Any]) -> Any:
@@ -277,7 +284,8 @@ def _call_guarded(model: Model, call: Callable[[], Any]) -> Any:
     """
     network = _unwrap(model.module)
     try:
-        stop = getattr(network, "stop", None)  # ends a program, such as `OnnxNetwork`
+        # `OnnxNetwork` has a method `stop`, which ends its program.
+        stop = getattr(network, "stop", None)
         if stop or isinstance(network, PROGRAMS):
             return run_within_limits(call, stop)
         return call()
@@ -322,7 +330,7 @@ def _explain_failed_call(
 
 
 def _unwrap(network: Any) -> Any:
-    """Return the network inside the adapters that make it one of images alone."""
+    """Return the user's network inside the adapters of this package."""
     while isinstance(network, (AllAtOnce, WithState, WithImageSize, EightBitInput)):
         network = network.network
     return network
@@ -336,14 +344,14 @@ LABEL_ARGUMENTS = {
     "annotations",
     "ground_truth",
 }
-"""Names of the right labels among the arguments of a network in training form."""
+"""Names of arguments that take the right labels, for networks that compute a loss."""
 
 
 def _describe_other_inputs(network: object, error: str) -> str:
-    """Describe what a network that raised an error needs other than images.
+    """Describe which inputs other than images a network needs.
 
     Args:
-        network: the user's network.
+        network: the user's network, which has raised an error.
         error: text of the error, which may name a missing argument.
 
     Returns:
@@ -354,31 +362,31 @@ def _describe_other_inputs(network: object, error: str) -> str:
     missing = _list_missing_inputs(network, error)
     if missing:
         return (
-            f"wants {' and '.join(missing)} beside pictures; wrap it in an nn.Module "
-            "that is called with pictures alone, as it is used outside of training"
+            f"needs {' and '.join(missing)} in addition to images; wrap it in an "
+            "nn.Module that is called with images only, as outside of training"
         )
     if any(isinstance(layer, nn.Conv3d) for layer in network.modules()):
         return (
-            "is made for videos or volumes (it has an nn.Conv3d), and pictures (N, 3, "
-            "H, W) are what is given; wrap it "
-            "in an nn.Module that makes one of each picture"
+            "is made for videos or volumes (it has an nn.Conv3d), but gets images (N, "
+            "3, H, W); wrap it in an nn.Module that makes a video or volume of each "
+            "image"
         )
     return ""
 
 
 def _list_missing_inputs(network: nn.Module, error: str) -> list[str]:
-    """Return the names of the inputs that a network lacks if it is called with images.
+    """Return the names of the inputs that a network needs in addition to images.
 
-    These are arguments without a default. Arguments for training, such as `targets`,
-    often have the default None although the network then fails: they count if the text
-    of the error names them.
+    These are the arguments without a default. Arguments for training, such as
+    `targets`, often have the default None, although the network fails without them:
+    they count if the text of the error names them.
 
     Args:
         network: the user's network.
         error: text of the error that it raised.
     """
     try:
-        # the first one is the images
+        # without the first parameter, which takes the images
         parameters = list(inspect.signature(network.forward).parameters.values())[1:]
     except (TypeError, ValueError):  # it is not written in Python
         return []
@@ -398,65 +406,76 @@ def _list_missing_inputs(network: nn.Module, error: str) -> list[str]:
 
 
 def _are_probabilities(rows: Tensor, tolerance: float = PROBABILITY_TOLERANCE) -> bool:
-    """Whether rows (N, classes) are non-negative and sum to 1."""
+    """Return whether all rows (N, classes) are non-negative and sum to 1."""
     sums = rows.sum(dim=1)
     return bool((rows >= 0).all()) and bool(((sums - 1).abs() < tolerance).all())
 
 
 def _describe_odd_scores(model: Model, rows: Tensor) -> str:
-    """Describe rows of scores (N, classes) that are neither logits nor probabilities.
+    """Describe scores (N, classes) that are neither logits nor probabilities.
 
-    Scores in [0, 1] that do not sum to 1 may come from a sigmoid. They may also be
-    means of the image, or the small logits of an untrained network. Two more kinds of
-    images tell these apart: means are 0 for a black image, and logits leave [0, 1] for
-    colors far outside of it.
+    Scores in [0, 1] are those of a sigmoid if they stay in [0, 1] for colors far
+    outside of it (logits, such as the small ones of an untrained network, do not) and
+    are not all 0 for a black image (means of the image are).
 
     Args:
         model: model that is probed.
         rows: (N, classes) scores for the images so far.
 
     Returns:
-        A description such as "costs"; "" if the rows look like logits.
+        A description such as "costs"; "" if the scores look like logits.
     """
     is_non_negative = float(rows.min()) >= 0.0
+    all_rows = rows
     if is_non_negative and float(rows.max()) <= 1.0:
-        # More rows: a black image, and colors far outside of [0, 1].
-        with torch.no_grad():
-            height, width = model.input_size
-            far = torch.linspace(0.0, FAR_COLOR, 3 * height * width).reshape(
-                height, width, 3
-            )
-            rows = torch.cat([rows, _run(model, torch.zeros_like(far)[None])])
-            with suppress(ModelError):  # it may reject such colors
-                rows = torch.cat([rows, _run(model, torch.stack([far, -far]))])
-    is_in_unit_range = float(rows.min()) >= 0.0 and float(rows.max()) <= 1.0
-    has_no_zero_row = bool(rows.any(dim=1).all())
+        all_rows = torch.cat([rows, _run_on_extreme_images(model)])
+    is_in_unit_range = float(all_rows.min()) >= 0.0 and float(all_rows.max()) <= 1.0
+    has_no_zero_row = bool(all_rows.any(dim=1).all())
     if is_in_unit_range and has_no_zero_row:
         return (
             "scores in [0, 1] that do not sum to 1, as after a sigmoid for each class"
         )
-    # If x are minus the logarithms of probabilities, exp(-x) sums to 1.
-    sum_error = (torch.exp(-rows).sum(dim=1) - 1.0).abs()
+    # If x are the negative logarithms of probabilities, exp(-x) sums to 1.
+    sum_error = (torch.exp(-all_rows).sum(dim=1) - 1.0).abs()
     if is_non_negative and bool((sum_error < PROBABILITY_TOLERANCE).all()):
         return (
-            "costs, of which the least is meant: minus the logarithm of probabilities"
+            "costs (negative logarithms of probabilities), of which the smallest is "
+            "the predicted class"
         )
     return ""
+
+
+@torch.no_grad()
+def _run_on_extreme_images(model: Model) -> Tensor:
+    """Return the scores for a black image, and for colors far outside of [0, 1].
+
+    The latter are missing if the network rejects such colors.
+    """
+    height, width = model.input_size
+    far_colors = torch.linspace(0.0, FAR_COLOR, 3 * height * width).reshape(
+        height, width, 3
+    )
+    rows = _run(model, torch.zeros_like(far_colors)[None])
+    with suppress(ModelError):  # the network may reject such colors
+        far_rows = _run(model, torch.stack([far_colors, -far_colors]))
+        rows = torch.cat([rows, far_rows])
+    return rows
 
 
 def _check_range(model: Model, images: Tensor) -> None:
     """Warn if a network seems to be made for colors from 0 to 255.
 
-    With colors from 0 to 1 all images look black to such a network. So its outputs
-    hardly differ between unlike images, but they do with colors from 0 to 255, and are
-    of the same magnitude. A network in Python that returns no logits is not checked,
-    since an untrained one looks the same.
+    With colors from 0 to 1 all images look black to such a network, and its outputs
+    hardly differ between unlike images. With colors from 0 to 255 its outputs differ,
+    and have about the same magnitude. A network in Python that returns no logits is not
+    checked, since an untrained one behaves in the same way.
 
     Args:
         model: model that is probed.
         images: (3, H, W, 3) a black, a white and a random image.
     """
     network = _unwrap(model.module)
+    # a program from a file; `OnnxNetwork` has a method `stop`
     is_program = isinstance(network, PROGRAMS) or hasattr(network, "stop")
     returns_logits = model.read is None
     if _is_range_declared(model) or not (returns_logits or is_program):
@@ -473,9 +492,9 @@ def _check_range(model: Model, images: Tensor) -> None:
         or not _follows_images(wide_outputs)
     ):
         return
-    size = outputs.abs().amax(dim=0).mean()
-    growth = float(wide_outputs.abs().amax(dim=0).mean() / size)
-    # Outputs that grow with the colors, as of untrained networks, are no sign.
+    magnitude = outputs.abs().amax(dim=0).mean()
+    growth = float(wide_outputs.abs().amax(dim=0).mean() / magnitude)
+    # Outputs of untrained networks grow with the colors: these say nothing.
     if 1.0 / MAX_GROWTH < growth < MAX_GROWTH:
         warn(
             f"outputs of model {model.name} hardly follow the picture: they differ by "
@@ -489,7 +508,7 @@ def _check_range(model: Model, images: Tensor) -> None:
 def _is_range_declared(model: Model) -> bool:
     """Return whether the user or a library has stated how colors are normalized.
 
-    Then the range of colors is known, and need not be guessed.
+    Then their range is known, and is not guessed.
     """
     preprocessing = model.preprocessing
     return (
@@ -507,24 +526,26 @@ def _follows_images(outputs: Tensor) -> bool:
 
 @torch.no_grad()
 def _collect_numbers(model: Model, images: Tensor) -> Tensor | None:
-    """Return the numbers (K, n) that a network returns for K images, one by one.
+    """Return the numbers (K, n) that a network returns for K images.
 
-    Scores in [0, 1] become logits, since scores near 0 or 1 hardly change. The result
-    is None if the network rejects an image, returns no numbers or not finite ones, or
-    returns different counts of numbers for different images.
+    The images (K, H, W, 3) are passed one by one. Scores in [0, 1] are converted to
+    logits, since scores near 0 or 1 hardly change. The result is None if the network
+    rejects an image, if there are no numbers or not all are finite, or if the count of
+    numbers differs between images.
     """
     rows = []
     for image in images:
         try:
             returned, _ = _run_network(model, image[None])
-        except ModelError:  # it may refuse such colors
+        except ModelError:
+            # A network may reject colors of another range, such as 255.
             return None
         numbers = [
             tensor.float().flatten().cpu()
             for tensor in list_tensors(returned)
             if tensor.is_floating_point()
         ]
-        # An empty tensor first, as there may be no numbers at all.
+        # `cat` needs at least one tensor, but there may be none: an empty one is added.
         rows.append(torch.cat([torch.zeros(0, device="cpu"), *numbers]))
     if len({len(row) for row in rows}) > 1 or len(rows[0]) == 0:
         return None
@@ -538,8 +559,8 @@ def _collect_numbers(model: Model, images: Tensor) -> Tensor | None:
 def _compute_relative_change(outputs: Tensor) -> float:
     """Return how much outputs change between K images, relative to their size.
 
-    For each of n numbers this is its range over the images, divided by its largest
-    absolute value. The result is the median over the numbers.
+    The relative change of a number is its range over the images, divided by its largest
+    absolute value. The result is the median over the n numbers.
 
     Args:
         outputs: (K, n).
@@ -550,7 +571,7 @@ def _compute_relative_change(outputs: Tensor) -> float:
 
 
 def _are_equal(model: Model, rows: Tensor, repeated_rows: Tensor) -> bool:
-    """Whether outputs are equal up to the tolerance of the network's dtype."""
+    """Return whether outputs are equal up to the tolerance of the network's dtype."""
     tolerance = max(REPEAT_TOLERANCE, ROUNDING_STEPS * torch.finfo(model.dtype).eps)
     difference = (rows - repeated_rows).abs().amax()
     return bool(difference <= tolerance * rows.abs().amax().clamp_min(1e-6))
@@ -561,13 +582,13 @@ def _find_batch_limits(
 ) -> tuple[int, int]:
     """Return the minimum and maximum batch size, after running a batch of two images.
 
-    A network that fails on two images takes one at a time. Warns if an image has
-    another output in a batch than by itself.
+    A network that fails on two images takes one at a time. There is a warning if the
+    output for an image in a batch differs from that for the image alone.
 
     Args:
         model: model that is probed.
         pair: the two images.
-        rows: the outputs for each image by itself; None if they are not repeatable.
+        rows: the outputs for each image alone; None if outputs are not repeatable.
     """
     min_batch, max_batch = model.batch_limits
     if isinstance(model.module, AllAtOnce):
@@ -580,7 +601,7 @@ def _find_batch_limits(
     try:
         with torch.no_grad():
             batch_rows = _run(model, pair)
-    except ModelError:  # it takes one image alone
+    except ModelError:  # it takes only one image at a time
         return 1, 1
     if rows is not None and not _are_equal(model, rows, batch_rows):
         warn(
@@ -593,9 +614,10 @@ def _find_batch_limits(
 def _probe_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
     """Return a model with `differentiable` and `attached` set.
 
-    If the network detaches tensors, and its outputs are repeatable, the gradient that
-    ignores this is tried as well (`_try_attached`). A detector that finds nothing in
-    noise counts as differentiable.
+    `differentiable` states whether a gradient reaches the image. `attached` states
+    whether the gradient is right only if the network's calls of `detach` are ignored;
+    this is tried if it has such calls and its outputs are repeatable (`_try_attached`).
+    A detector that finds nothing in noise counts as differentiable.
 
     Args:
         model: model that is probed.
@@ -606,21 +628,23 @@ def _probe_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
     Warns:
         ModelWarning: no gradient reaches the image, or outputs do not follow it.
     """
+    # why there is no gradient, for the warning
     reason = "it is zero everywhere"
     try:
-        probed = _compute_first_gradient(model, images, repeatable)
-        if probed.reason is not None:
-            reason = probed.reason
-        if _has_no_output(model, probed.rows):
-            # It detects nothing in noise: rendered images will show its gradient.
+        first = _compute_first_gradient(model, images, repeatable)
+        if first.reason is not None:
+            reason = first.reason
+        if _has_no_output(model, first.rows):
+            # It detects nothing in noise; rendered images will show its gradient.
             return dataclasses.replace(model, differentiable=True)
-        gradient = probed.gradient
-        if repeatable and probed.has_detached:
+        gradient = first.gradient
+        if repeatable and first.has_detached:
+            # May set `model.attached`: then gradients go through `detach`.
             model, gradient = _try_attached(model, images, gradient)
         has_gradient = bool((gradient != 0).any())
         if has_gradient and repeatable:
-            is_detached = probed.has_detached and not model.attached
-            _check_gradient(model, images, gradient, is_detached)
+            is_cut_by_detach = first.has_detached and not model.attached
+            _check_gradient(model, images, gradient, detached=is_cut_by_detach)
     except (RuntimeError, ModelError) as error:
         has_gradient = False
         reason = get_first_line(error)
@@ -639,13 +663,13 @@ def _probe_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
 
 
 class _FirstGradient(NamedTuple):
-    """The gradient of a network as it is.
+    """The gradient of a network whose calls of `detach` are not ignored.
 
     Attributes:
-        rows: rows of `_run` for the images.
-        gradient: gradient by the images.
-        has_detached: whether the network detaches what has a gradient.
-        reason: why there is no gradient, if it is known.
+        rows: rows that `_run` returned for the images.
+        gradient: gradient with respect to the images (N, H, W, 3).
+        has_detached: whether the network detaches tensors with a gradient.
+        reason: why there is no gradient; None if there is one, or if it is not known.
     """
 
     rows: Tensor
@@ -657,10 +681,10 @@ class _FirstGradient(NamedTuple):
 def _compute_first_gradient(
     model: Model, images: Tensor, repeatable: bool
 ) -> _FirstGradient:
-    """Compute the gradient of a network's outputs by images (N, H, W, 3).
+    """Compute the gradient of a network's outputs with respect to images (N, H, W, 3).
 
-    If the network detaches everything, autograd finds no graph. Then the gradient is
-    zero if outputs are repeatable, as ignoring `detach` may help.
+    If the network detaches everything, autograd raises an error. If outputs are
+    repeatable, the gradient is then zero: the caller tries to ignore `detach`.
 
     Raises:
         RuntimeError: there is no gradient for another reason.
@@ -674,19 +698,20 @@ def _compute_first_gradient(
             with torch.no_grad():
                 rows = _run(model, images)
             reason = get_first_line(error)
-            return _FirstGradient(rows, torch.zeros_like(images), True, reason)
+            no_gradient = torch.zeros_like(images)
+            return _FirstGradient(rows, no_gradient, has_detached=True, reason=reason)
     return _FirstGradient(rows, gradient, detaching.has_detached)
 
 
 def _try_attached(
     model: Model, images: Tensor, gradient: Tensor
 ) -> tuple[Model, Tensor]:
-    """Return the model that ignores `detach`, if its gradient is the better one.
+    """Return the model that ignores `detach`, if its gradient is better.
 
-    Both gradients predict how outputs change over a small step, and the measured change
-    decides. The step follows the sign of their difference, where they disagree most. A
-    network that rounds behind a `detach`, with a straight-through gradient, keeps its
-    own gradient, as ignoring `detach` makes it zero.
+    Each gradient predicts how outputs change over a small step: the one that is closer
+    to the actual change is better. The step follows the sign of their difference, where
+    they disagree most. A network with a straight-through gradient, which rounds behind
+    a `detach`, keeps its own gradient, because ignoring `detach` makes it zero.
 
     Args:
         model: model that is probed.
@@ -697,8 +722,8 @@ def _try_attached(
         The model to use, and its gradient (N, H, W, 3).
     """
     attached = dataclasses.replace(model, attached=True)
-    # A network may detach what must have no gradient, such as for numpy, and then
-    # raises if that is ignored: it keeps its own.
+    # A network may have to detach a tensor, such as for numpy, and raises an error if
+    # `detach` is ignored. It keeps its own gradient.
     with suppress(RuntimeError, ModelError):
         attached_gradient = _compute_gradient(attached, images)[1]
         min_step = ROUNDING_STEPS * torch.finfo(model.dtype).eps
@@ -707,7 +732,8 @@ def _try_attached(
             change = _measure_change(model, images, step, attached_gradient, gradient)
             attached_change, detached_change = change.predicted
             detached_error = abs(change.actual - detached_change)
-            # better than the network's own gradient, and good by itself
+            # The error has to be smaller than that of the network's own gradient, and
+            # small compared to the change.
             max_error = min(detached_error, MAX_ATTACHED_ERROR * abs(attached_change))
             if abs(change.actual - attached_change) < max_error:
                 return attached, attached_gradient
@@ -724,7 +750,7 @@ def _compute_gradient(model: Model, images: Tensor) -> tuple[Tensor, Tensor]:
         model: model that is probed.
         images: (N, H, W, 3).
     """
-    leaf = images.clone().requires_grad_()
+    leaf = images.clone().requires_grad_()  # autograd differentiates with respect to it
     with torch.enable_grad():
         rows = _run(model, leaf)
         if _has_no_output(model, rows):
@@ -733,30 +759,35 @@ def _compute_gradient(model: Model, images: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _has_no_output(model: Model, rows: Tensor) -> bool:
-    """Return whether a model, such as a detector, finds nothing, by rows of `_run`."""
-    if model.read is None:
+    """Return whether a model, such as a detector, finds nothing in all images.
+
+    Args:
+        model: model that is probed.
+        rows: rows that `_run` returned.
+    """
+    if model.read is None:  # logits are never empty
         return False
-    n_numbers = rows[:, 0]
+    n_numbers = rows[:, 0]  # the first number of a row is the count of numbers
     return not bool(n_numbers.any())
 
 
 def _compute_checked_value(rows: Tensor) -> Tensor:
     """Return one number from the rows (N, n) of `_run`, whose gradient is checked.
 
-    It is a sum with weights from -1 to 1, so that columns do not cancel out as in the
-    sum of probabilities.
+    It is a sum with weights from -1 to 1. A plain sum of probabilities would always be
+    1.
     """
     return (rows * torch.linspace(-1.0, 1.0, rows.shape[1])).sum()
 
 
 class _Change(NamedTuple):
-    """How the number of `_compute_checked_value` changes between two images.
+    """The change of `_compute_checked_value` between images a step before and after.
 
     Attributes:
         actual: the change.
-        predicted: what each of some gradients predicts of it.
-        ends: the images.
-        total: sum of the absolute values of the outputs at the first of them.
+        predicted: the change that each gradient predicts.
+        ends: the two batches of images, after the step and before it.
+        total: sum of the absolute values of the outputs for the first batch.
     """
 
     actual: float
@@ -769,58 +800,64 @@ class _Change(NamedTuple):
 def _measure_change(
     model: Model, images: Tensor, step: Tensor, *gradients: Tensor
 ) -> _Change:
-    """Measure how outputs change around images, and what gradients predict of it.
+    """Measure how outputs change around images, and how gradients predict the change.
 
-    Outputs are summed up in one number (`_compute_checked_value`), and its change is
-    the central difference f(x + step) - f(x - step).
+    Outputs are summarized by one number f (`_compute_checked_value`). Its change is the
+    central difference f(x + step) - f(x - step).
 
     Args:
         model: model that is run.
         images: (N, H, W, 3).
         step: (N, H, W, 3) change of the images; x + step and x - step are clipped to
             [0, 1].
-        *gradients: gradients (N, H, W, 3) of that number by the images.
+        *gradients: gradients (N, H, W, 3) of f with respect to the images.
     """
-    ends = [(images + step).clamp(0.0, 1.0), (images - step).clamp(0.0, 1.0)]
-    outputs = [_run(model, end) for end in ends]
-    actual = float(_compute_checked_value(outputs[0] - outputs[1]))
-    predicted = [
-        float(((ends[0] - ends[1]) * gradient).sum()) for gradient in gradients
-    ]
-    return _Change(actual, predicted, ends, float(outputs[0].abs().sum()))
+    end = (images + step).clamp(0.0, 1.0)
+    start = (images - step).clamp(0.0, 1.0)
+    end_rows = _run(model, end)
+    start_rows = _run(model, start)
+    return _Change(
+        actual=float(_compute_checked_value(end_rows - start_rows)),
+        predicted=[float(((end - start) * gradient).sum()) for gradient in gradients],
+        ends=[end, start],
+        total=float(end_rows.abs().sum()),
+    )
 
 
 def _check_gradient(
-    model: Model, images: Tensor, gradient: Tensor, detached: bool
+    model: Model, images: Tensor, gradient: Tensor, *, detached: bool
 ) -> None:
     """Warn if a network's outputs do not change as its gradient predicts.
 
-    A defence may mask the gradient, or a rounding may cut it off. The change of outputs
-    over a small step along the sign of the gradient is compared with what the gradient
-    predicts. The gradient counts as right if it holds for one of the step sizes.
+    A defense may mask the gradient, or a rounding may cut it off. The change of outputs
+    over a small step along the sign of the gradient is compared with the change that
+    the gradient predicts. The gradient counts as right if they agree for one of the
+    step sizes.
 
     Args:
         model: model that is probed.
         images: (N, H, W, 3).
-        gradient: (N, H, W, 3) of `_compute_checked_value`.
+        gradient: (N, H, W, 3), the gradient of `_compute_checked_value`.
         detached: whether the network detaches tensors, for the message.
     """
+    returns_logits = model.read is None
     for step_size in _choose_step_sizes(model):
         step = step_size * gradient.sign()
         change = _measure_change(model, images, step, gradient)
-        if model.read is not None:
+        if not returns_logits:
             discrete_values = {
                 _collect_discrete_values(model, image)
                 for image in (images, *change.ends)
             }
             if len(discrete_values) > 1:
                 return  # outputs that jump cannot be compared with a gradient
-        (predicted,) = change.predicted
+        predicted = change.predicted[0]  # there is one gradient
         size = max(abs(change.actual), abs(predicted))
         is_too_small_to_tell = size <= MIN_CHANGE * change.total
         is_predicted = abs(change.actual - predicted) <= MAX_GRADIENT_ERROR * size
         if is_too_small_to_tell or is_predicted:
             return
+    # The change for the last step size is reported.
     reason = "Steps that round, or a defence that masks gradients?"
     if detached:
         reason = (
@@ -829,29 +866,37 @@ def _check_gradient(
         )
     warn(
         f"the gradient of model {model.name} does not say how its outputs change: "
-        f"{predicted:.3g} expected, {change.actual:.3g} seen for a small step along "
-        f"it. {reason} A search that follows them may find nothing: try a policy "
-        "without gradients beside it"
+        f"{predicted:.3g} expected, {change.actual:.3g} observed for a small step "
+        f"along it. {reason} A search by this gradient may find nothing: try a policy "
+        "without gradients, too"
     )
 
 
 def _choose_step_sizes(model: Model) -> tuple[float, ...]:
-    """Return the steps over which the gradient of a model is checked, in turn."""
+    """Return the step sizes over which the gradient of a model is checked.
+
+    They are tried in this order, and it is enough if the gradient holds for one.
+    """
     min_step = ROUNDING_STEPS * torch.finfo(model.dtype).eps
     if min_step > STEP:
-        # A network in half precision is nonlinear in the first, and rounds the second.
-        return (min_step, min_step / 8.0)
-    # Suppression of boxes may make outputs jump in the larger step only.
-    return (STEP,) if model.read is None else (STEP, SMALL_STEP)
+        # Half precision: a step that is large compared to rounding may be too large for
+        # a linear prediction, and a smaller one may be rounded. Both are tried.
+        return (min_step, min_step / STEP_RATIO)
+    returns_logits = model.read is None
+    if returns_logits:
+        return (STEP,)
+    # Outputs of detectors may jump over the larger step only: then other boxes are
+    # suppressed.
+    return (STEP, SMALL_STEP)
 
 
 @torch.no_grad()
 def _collect_discrete_values(model: Model, images: Tensor) -> str:
     """Return the part of an output that no gradient changes, as a string to compare.
 
-    That part is its shapes, its columns of integers (such as classes), and its texts.
-    It jumps if a detector with suppression keeps other boxes after a small step, or if
-    a text continues differently. It is "" if the output is a single tensor.
+    These are its shapes, its columns of integers (such as classes), and its texts. They
+    jump if a detector suppresses other boxes after a small step, or if a text continues
+    differently. The result is "" if the output is a single tensor.
 
     Args:
         model: model that is probed.

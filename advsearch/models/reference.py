@@ -1,9 +1,10 @@
 """The bundled reference classifier: a small residual network for images of 128 x 128
 pixels.
 
-Plain on purpose: it is the victim, not the method. 1.2 million parameters, 4.7 MB in
-float32, about 65 million multiply-adds an image. SiLU instead of ReLU keeps the logits
-smooth in the image, so that gradients mean something.
+The network is simple on purpose, because it is only an example of a model to attack. It
+has 1.2 million parameters (4.7 MB in float32) and needs about 65 million multiply-adds
+per image. It has SiLU in place of ReLU so that the logits are smooth functions of the
+image, whose gradients are informative.
 """
 
 from __future__ import annotations
@@ -26,10 +27,11 @@ from advsearch.models.probe import probe
 from advsearch.models.source import freeze_network, load_weights
 
 INPUT_SIZE = (128, 128)
-STEM = 24
-WIDTHS = (32, 64, 128, 192)
-DEPTHS = (1, 1, 2, 1)
-MEAN = 0.45  # of display-referred values; one pair for all channels is enough
+STEM = 24  # channels of the first convolution
+WIDTHS = (32, 64, 128, 192)  # channels of each stage
+DEPTHS = (1, 1, 2, 1)  # residual blocks of each stage
+# Mean and standard deviation of display-referred values, for all channels.
+MEAN = 0.45
 STD = 0.25
 WEIGHTS = "reference.safetensors"
 METADATA = "reference.json"
@@ -37,9 +39,10 @@ REMEDY = "run `make reference` to train it, or install a release, which contains
 
 
 class ReferenceNet(nn.Module):
-    """A residual network for at least 2 classes: stem of stride 2, four stages of
-    strides 4 to 32, average pooling, dropout of pooled features in training, a linear
-    layer.
+    """A residual network for at least 2 classes.
+
+    It has a stem of stride 2, four stages of strides 4 to 32, average pooling, dropout
+    of pooled features in training, and a linear layer.
     """
 
     def __init__(self, classes: int, *, dropout: float = 0.1) -> None:
@@ -71,8 +74,10 @@ class ReferenceNet(nn.Module):
         nn.init.zeros_(self.head.bias)
 
     def forward(self, images: Tensor) -> Tensor:
-        """Return logits (N, classes) of images (N, 3, H, W), display-referred sRGB in
-        [0, 1]; H and W at least 32.
+        """Return logits (N, classes) of images.
+
+        Args:
+            images: (N, 3, H, W), display-referred sRGB in [0, 1]; H and W at least 32.
         """
         x = ((images - MEAN) * (1.0 / STD)).contiguous(
             memory_format=torch.channels_last
@@ -83,12 +88,18 @@ class ReferenceNet(nn.Module):
 
 
 class _Convolution(nn.Module):
-    """A convolution without bias, then batch normalisation."""
+    """A convolution without bias, followed by batch normalization."""
 
     def __init__(
         self, inputs: int, outputs: int, size: int, *, stride: int = 1
     ) -> None:
-        """Build the layers; `size` is the side of the kernel in pixels."""
+        """Build the layers.
+
+        Args:
+            inputs, outputs: channels.
+            size: side of the kernel in pixels.
+            stride: stride of the convolution.
+        """
         super().__init__()
         self.convolve = nn.Conv2d(inputs, outputs, size, stride, size // 2, bias=False)
         self.normalise = nn.BatchNorm2d(outputs)
@@ -99,8 +110,9 @@ class _Convolution(nn.Module):
 
 
 class _Residual(nn.Module):
-    """Two 3 x 3 convolutions beside a shortcut, which is average-pooled and projected
-    where the shape changes.
+    """A residual block of two 3 x 3 convolutions and a shortcut.
+
+    The shortcut is average-pooled and projected where the shape changes.
     """
 
     def __init__(self, inputs: int, outputs: int, *, stride: int) -> None:
@@ -120,14 +132,19 @@ class _Residual(nn.Module):
         self.activation = nn.SiLU()
 
     def forward(self, x: Tensor) -> Tensor:
+        """Return the output of the block for an input (N, channels, H, W)."""
         branch = self.second(self.activation(self.first(x)))
         result: Tensor = self.activation(branch + self.shortcut(x))
         return result
 
 
 def build(classes: int, *, dropout: float = 0.1) -> ReferenceNet:
-    """Return an untrained network in channels-last memory format; weights come from
-    torch's current random state.
+    """Return an untrained network in channels-last memory format.
+
+    Its weights depend on torch's current random state.
+
+    Raises:
+        ModelError: there are fewer than two classes.
     """
     if classes < 2:
         raise ModelError(
@@ -161,7 +178,7 @@ def load(folder: Path | None = None, weights: Path | None = None) -> Model:
     """Return the model "reference" with its labels.
 
     Args:
-        folder: folder with its two files; by default the package's own.
+        folder: folder with `WEIGHTS` and `METADATA`; by default that of the package.
         weights: a safetensors file with other weights for the same labels.
 
     Raises:
@@ -176,7 +193,7 @@ def load(folder: Path | None = None, weights: Path | None = None) -> Model:
         name,
         labels=(),  # set by `probe`
         preprocessing=Preprocessing(INPUT_SIZE),
-        # The folded network has no batch norms: to be trained it is loaded once more.
+        # The folded network has no batch norms. For training it is loaded once more.
         make_trainable=lambda: load_network(folder, weights)[0],
     )
     return probe(model, labels, LabelsOrigin("labels of the reference model"))
@@ -185,10 +202,10 @@ def load(folder: Path | None = None, weights: Path | None = None) -> Model:
 def load_network(
     folder: Path | None = None, weights: Path | None = None
 ) -> tuple[ReferenceNet, tuple[str, ...]]:
-    """Return the network with its weights, which can be trained further, and its labels.
+    """Return the network, which can be trained further, and its labels.
 
     Args:
-        folder: folder with its two files; by default the package's own.
+        folder: folder with `WEIGHTS` and `METADATA`; by default that of the package.
         weights: a safetensors file whose weights replace those of the folder.
 
     Raises:
@@ -203,7 +220,7 @@ def load_network(
         state = safetensors.load((folder / WEIGHTS).read_bytes())
     except FileNotFoundError as error:
         raise ModelError(
-            f"the reference model is not there ({error.filename}); {REMEDY}"
+            f"the reference model is missing ({error.filename}); {REMEDY}"
         ) from None
     except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
         raise ModelError(

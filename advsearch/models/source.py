@@ -1,7 +1,8 @@
-"""Define what a loader returns: a network ready to run, and what its file or author
-states about it.
+"""Define `Source`: what a loader of models returns.
 
-The author may be Python code: ``package.module:callable``, with weights after an ``@``.
+It is a network that is ready to run, with what its file or its author states about it.
+Networks that Python code builds are loaded here: ``package.module:callable``, perhaps
+with weights after an ``@``.
 """
 
 from __future__ import annotations
@@ -48,25 +49,26 @@ from advsearch.trust.code import check_import, current_directory_importable
 from advsearch.trust.foreign_code import get_first_line
 from advsearch.trust.stored_files import open_regular
 
-# what is asked where nothing else is said
+# the default question about an image
 QUESTION = "What is this? Answer with its name only."
 DEFAULT_SIZE = 448
-"""Side in pixels of pictures for networks that take any size: a multiple of 28 and of
-32, the cells of Qwen's.
+"""Side in pixels of images for networks that take any size: a multiple of 28 and of 32,
+the sizes of patches of Qwen's networks.
 """
 
 
 @dataclass(frozen=True)
 class Purpose:
-    """What a network is needed for.
+    """What a network is loaded for.
 
     Attributes:
-        task: its name.
-        names: names of classes, by the user; None without.
-        prompts: prompts by the user; None without.
-        tokens: maximum length of a free answer.
+        task: name of the task.
+        names: names of classes that the user set; None if there are none.
+        prompts: prompts that the user set; None if there are none.
+        tokens: maximum length of a free answer, in tokens.
         times: number of answers per image.
-        ask: limits of a model behind an address (`advsearch.models.address.LIMITS`).
+        ask: limits and prices of a model behind an address
+            (`advsearch.models.address.LIMITS`).
     """
 
     task: str = "classification"
@@ -77,7 +79,7 @@ class Purpose:
     ask: Mapping[str, float] = field(default_factory=dict)
 
     def check(self, model: str, what: str, *tasks: str) -> None:
-        """Check that a network can do the task; any network may do a user's own task.
+        """Check that a network can do the task; a task of the user is not checked.
 
         Args:
             model: name of the model.
@@ -95,15 +97,15 @@ class Purpose:
             )
 
     def parse_question(self, model: str, what: str) -> tuple[bool, str | None]:
-        """Return how a network that returns texts is to be asked.
+        """Return how to question a network that returns texts.
 
         Args:
             model: name of the model, for messages.
             what: what the network does, such as "is behind an address".
 
         Returns:
-            Whether it answers in free words, as for the task `answer`, and does not
-            choose a class; and the user's question, or None for the default one.
+            Whether it answers in free words, as for the task `answer`, and not by
+            choosing a class; and the user's question, or None for the default question.
 
         Raises:
             ModelError: the network cannot do the task.
@@ -115,7 +117,7 @@ class Purpose:
         if free and self.names is not None:
             raise InputError(
                 "labels: task answer has no classes; leave them out, and "
-                "say the right words with `label`"
+                "set the right words with `label`"
             )
         if len(prompts) > 1:
             raise InputError(
@@ -138,8 +140,8 @@ class Purpose:
         self.check(model, what, task)
         if self.names is None:
             raise InputError(
-                f"model {model} {what} and has no classes of its own: name them, two "
-                "at least, such as `labels=mug,cup,bowl` or `labels=imagenet`"
+                f"model {model} {what} and has no classes itself: set at least two, "
+                "such as `labels=mug,cup,bowl` or `labels=imagenet`"
             )
         return self.names
 
@@ -148,10 +150,19 @@ class Purpose:
 class Source:
     """A frozen network with its own defaults, which options of `load_model` override.
 
-    The defaults are as in `load_model`, and None if the source does not state them.
+    Fields without a description are as in `Preprocessing` and `Model`. They are None if
+    the source does not state them.
+
+    Attributes:
+        module: the network in evaluation mode; its parameters have no gradients.
+        batch_limits: (minimum, maximum) number of images in one call.
+        dtype: dtype of the network's input.
+        reads_text: whether the network also gets texts.
+        takes_more: whether the network needs further inputs that are not images.
+        size_type: dtype of the image size, for a network that takes it as second input
+            (`WithImageSize`); None for other networks.
     """
 
-    # Module in evaluation mode, its parameters without gradients.
     module: Callable[[torch.Tensor], Any]
     name: str
     input_size: tuple[int, int] | None = None
@@ -160,22 +171,20 @@ class Source:
     layout: str | None = None
     channels: str | None = None
     labels: tuple[str, ...] | None = None
-    # as in `Preprocessing`
     processor: Callable[[torch.Tensor], torch.Tensor] | None = None
-    batch_limits: tuple[int, int] = (1, 64)  # (fewest, most) images at once
-    dtype: torch.dtype = torch.float32  # dtype of the input
+    batch_limits: tuple[int, int] = (1, 64)
+    dtype: torch.dtype = torch.float32
     device: torch.device = CPU
-    reads_text: bool = False  # it is given texts beside the picture
-    takes_more: bool = False  # it is called with more than pictures
+    reads_text: bool = False
+    takes_more: bool = False
     value_range: tuple[float, float] | None = None
-    # The type in which it takes the size of images, see `WithImageSize`.
     size_type: torch.dtype | None = None
 
 
 def _check_not_lazy(module: nn.Module, name: str) -> None:
     """Raise ModelError if a layer of a network has no weights yet.
 
-    Layers such as `nn.LazyLinear` get their weights when the first image passes.
+    Layers such as `nn.LazyLinear` create their weights in the first call.
 
     Args:
         module: the network.
@@ -191,9 +200,9 @@ def _check_not_lazy(module: nn.Module, name: str) -> None:
     layer = lazy_keys[0].rpartition(".")[0]
     raise ModelError(
         f"model {name}: its layer {layer} "
-        f"({type(module.get_submodule(layer)).__name__}) has no weights before it "
-        "has seen a picture; call the network once with one, load its weights, and "
-        "give it then"
+        f"({type(module.get_submodule(layer)).__name__}) has no weights before its "
+        "first call; call the network once with an image, load its weights, and pass "
+        "it then"
     )
 
 
@@ -212,10 +221,11 @@ def make_source(module: nn.Module, name: str, **fields: Any) -> Source:
     _check_not_lazy(module, name)
     tensors = (*module.parameters(), *module.buffers())
     first = next((tensor for tensor in tensors if tensor.is_floating_point()), None)
-    # `fields` stand last, so that what the caller states takes precedence.
+    # `fields` come last: what the caller states takes precedence.
     if first is not None:
         fields = {"dtype": first.dtype, "device": first.device, **fields}
     if takes_image_size(module):
+        # the usual dtype of sizes, unless the caller states another
         fields = {"size_type": torch.int64, **fields}
     return Source(freeze_network(module, name), name, **fields)
 
@@ -224,9 +234,10 @@ def freeze_network(module: nn.Module, name: str) -> nn.Module:
     """Return the module in evaluation mode, with parameters that collect no gradient.
 
     An ordinary module is copied, except for its weights, which the copy shares. So the
-    caller may go on training the original, and the copy sees the new weights if they
-    are changed in place, as optimizers do. Exported and scripted programs are frozen
-    themselves. So are modules that cannot be copied, with a warning.
+    caller may continue to train the original, and the copy has the new weights if they
+    are changed in place, as optimizers do. Exported and scripted programs are not
+    copied: they are frozen themselves. So are modules that cannot be copied, with a
+    warning.
 
     Args:
         module: the network.
@@ -288,7 +299,7 @@ def _read_weights(path: Path, name: str) -> dict[str, Tensor]:
         FileFormatError: the file is missing or is not safetensors.
     """
     try:
-        # a check: this opens regular files only, of limited size
+        # Opened only to check that it is a regular file of limited size.
         open_regular(path, "weights", LARGEST).close()
         return load_file(path)
     except FileNotFoundError:
@@ -325,12 +336,12 @@ def _describe_misfit(
         for key in expected
         if key in state and state[key].shape != expected[key].shape
     ]
-    problems = [
-        f"{len(keys)} {what} ({', '.join(keys[:3])}{', ...' if len(keys) > 3 else ''})"
-        for what, keys in (("missing", missing), ("not in the network", unexpected))
-        if keys
-    ]
-    return [*problems, *shapes[:2]]  # two examples are enough
+    problems = []
+    for problem, keys in (("missing", missing), ("not in the network", unexpected)):
+        if keys:
+            suffix = ", ..." if len(keys) > 3 else ""
+            problems.append(f"{len(keys)} {problem} ({', '.join(keys[:3])}{suffix})")
+    return [*problems, *shapes[:2]]  # two examples of wrong shapes are enough
 
 
 def split_weights(spec: str) -> tuple[str, Path | None]:
@@ -342,27 +353,28 @@ def split_weights(spec: str) -> tuple[str, Path | None]:
 def load_callable(spec: str, libraries: Iterable[str] = ()) -> Source | Model:
     """Return the model behind ``package.module:callable[@weights.safetensors]``.
 
-    The module is looked for on `sys.path` and in the current directory. The attribute
+    The module is searched on `sys.path` and in the current directory. The attribute
     is an `nn.Module`, a `Model`, or something that returns one when called without
     arguments (a function, or a class of modules).
 
     Args:
         spec: the text.
-        libraries: names that may stand before the colon too, for the message about a
-            module that does not exist: it may be one of them, misspelt.
+        libraries: names of model sources, such as "timm". If there is no such module,
+            it may be a misspelling of one of them, which the message suggests.
 
     Raises:
-        ModelError: it cannot be imported, raises, returns something else, or the
-            weights do not fit.
-        UnknownNameError: the module has no such attribute; near matches are named.
-        InputError: it must not be imported (`trust.code.check_import`).
+        ModelError: the module cannot be imported; or what it defines raises, returns
+            something else, or does not fit the weights.
+        UnknownNameError: the module has no such attribute; the message has similar
+            names. InputError: the module may not be imported
+            (`trust.code.check_import`).
     """
     target, weights = split_weights(spec)
     check_import(target)
     module_name, _, attribute = target.partition(":")
     module = _import_module(module_name, spec, libraries)
     value = _get_attribute(module, attribute, module_name)
-    if not isinstance(value, (nn.Module, Model)):  # a function or a class makes it
+    if not isinstance(value, (nn.Module, Model)):  # a function or a class
         value = _call_factory(value, spec)
     if isinstance(value, Model):
         if weights is not None:
@@ -449,8 +461,8 @@ def _import_module(name: str, spec: str, libraries: Iterable[str]) -> ModuleType
             return importlib.import_module(name)
         except ModuleNotFoundError as error:
             missing = error.name
-            # whether the module itself, or a package that holds it, is missing, and not
-            # another module that it imports
+            # Either the module itself, or a package that holds it, is missing; or
+            # another module that it imports.
             is_module_itself = missing is not None and f"{name}.".startswith(
                 f"{missing}."
             )
@@ -473,7 +485,7 @@ def _suggest_library(name: str, spec: str, libraries: Iterable[str]) -> str:
     Args:
         name: name of a module that does not exist.
         spec: what the user wrote, "NAME:REST".
-        libraries: names that may have been meant.
+        libraries: names of model sources, such as "timm".
 
     Returns:
         The suggestion; "" if no library has a similar name.
@@ -493,7 +505,10 @@ def _where(error: BaseException) -> str:
 
 
 def find_near_names(name: str, known: Iterable[str]) -> list[str]:
-    """Return at most a dozen names to show, the nearest first."""
+    """Return at most 12 known names for a message, the most similar first.
+
+    If none is similar, they are the first in alphabetical order.
+    """
     names = sorted(known)
     return difflib.get_close_matches(name, names, n=12, cutoff=0.3) or names[:12]
 

@@ -1,6 +1,6 @@
-"""Guards against what comes from others: what runs, connects, is written, is read, and
-what a served page may do.
+"""Guards against files, code and requests of others.
 
-Each module has one rule. Anybody may import from here; nothing here imports more than
-errors and other small modules.
+Each module has one rule: about code that runs, connections, files that are written or
+read, or pages that are served. All modules may import from here. Modules here import
+only errors and other small modules.
 """

@@ -1,14 +1,14 @@
-"""Archives of model files, checked before torch, which trusts them, makes anything of
-them that could run or swell.
+"""Check the archives of model files before torch, which trusts them, loads them.
 
-The threat: a model file of somebody else runs code as it is unpickled or loaded,
-unpacks to more than the memory holds, or has members that lead elsewhere. So members
-have distinct, plain names in one folder, are not encrypted, and unpack to no more than
-a limit; nothing is unpickled. TorchScript is rewritten: torch runs a part of its code
-(`__setstate__`) while it loads, which can call operators that touch files.
+The threat: a model file of somebody else runs code when it is unpickled or loaded,
+unpacks to more than fits into the memory, or has members whose names lead out of the
+archive. So members must have distinct, plain names in one folder, must not be
+encrypted, and must unpack to no more than a limit. Nothing is unpickled. TorchScript is
+rewritten: while torch loads it, torch runs a part of its code (`__setstate__`), which
+can call operators that access files.
 
-Used by `models/files.py` and `models/source.py`; `exported_programs.py` has what
-archives of `torch.export` need more.
+Used by `models/files.py` and `models/source.py`; `exported_programs.py` has further
+checks of archives of `torch.export`.
 """
 
 from __future__ import annotations
@@ -32,20 +32,24 @@ from advsearch.errors import FileFormatError
 from advsearch.trust.foreign_code import get_first_line
 from advsearch.trust.stored_files import make_size_error, parse_json, scale_limit
 
-LARGEST = 16 << 30  # bytes of a model file, and of what it unpacks to
-# bytes of a member that describes the network: JSON, source code, a pickle of names
+LARGEST = 16 << 30  # maximum bytes of a model file, packed and unpacked
+# maximum bytes of a member that describes the network: JSON, source code or a pickle
 LARGEST_TEXT = 64 << 20
-# bytes that a byte of the file may unpack to; torch itself does not compress
+# maximum ratio of unpacked to packed bytes; torch itself does not compress
 LARGEST_RATIO = 20
-SLACK = 4 << 20  # bytes that a small file may unpack to, whatever the ratio
+SLACK = 4 << 20  # unpacked bytes that are allowed in addition, whatever the ratio
 _NAME = re.compile(r"[\w.+ -]+(/[\w.+ -]+)*")
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
 @dataclass(frozen=True, eq=False)
 class Archive:
-    """An open archive that has passed the checks, with its members by name without the
-    root folder. Made by `open_archive`.
+    """An open archive that has passed the checks; `open_archive` creates it.
+
+    Attributes:
+        path: path of the archive.
+        zip: the open archive.
+        members: members by name, without the root folder.
     """
 
     path: Path
@@ -168,7 +172,7 @@ def _check_unpacked_size(path: Path, unpacked: int, size: int) -> None:
 
 
 def make_archive_error(path: Path, what: str) -> FileFormatError:
-    """Return the error for an archive with something in it that is never loaded."""
+    """Return the error for an archive with a content that is never loaded."""
     return FileFormatError(
         f"model file {path}: {what}; export a plain network with torch.export.save"
     )
@@ -181,24 +185,26 @@ def make_truncation_error(path: Path, error: BaseException) -> FileFormatError:
     )
 
 
-LARGEST_PICKLE = 8 << 20  # bytes of a pickle that describes the modules
-LARGEST_CODE = 16 << 20  # bytes of source code, all files together
-DEPTH = 200  # of modules and values in one another
-# that torch reads, and the folder of their tensors
-PICKLES = {"data.pkl": "data", "constants.pkl": "constants"}
+LARGEST_PICKLE = 8 << 20  # maximum bytes of a pickle that describes the modules
+LARGEST_CODE = 16 << 20  # maximum bytes of all source code
+DEPTH = 200  # maximum nesting of modules and values
+# folder of the tensors of each pickle that torch reads
+FOLDER_OF_PICKLE = {"data.pkl": "data", "constants.pkl": "constants"}
 
 _HARMFUL = re.compile(
     r"\b(save|load|from_file|load_tensor|read_file|write_file|set_data|print|debugprims|symm_mem|inductor|profiler"
     r"|c10d|_c10d_functional|dist_c10d|dist_rpc|static_runtime|_TorchScriptTesting)\b"
 )
-"""Operators that touch files, the terminal or other processes, and families of such; as
-whole words anywhere.
+"""Pattern of the names of operators that access files, the terminal or other processes,
+and of modules with such operators.
 """
 
+# Escapes of a character by its number or name. Escapes such as "\n" do not match.
 _ESCAPE = re.compile(r"\\(x[0-9a-fA-F]{1,2}|u|U|N|[0-7]{1,3})")
-_CLASS = re.compile(r"torch\s*\.\s*classes\s*\.\s*(\w*)")
-_CLASSES = frozenset(["quantized", "rnn", "mkldnn", "sparse"])
-_WHITE = frozenset((9, 10, 13))
+_NATIVE_CLASS = re.compile(r"torch\s*\.\s*classes\s*\.\s*(\w*)")
+# Families of native classes ("torch.classes.FAMILY.NAME") that networks may use.
+_HARMLESS_FAMILIES = frozenset(["quantized", "rnn", "mkldnn", "sparse"])
+_WHITE_SPACE_CODES = frozenset((9, 10, 13))  # tab and line breaks
 
 _ITEM_BYTES = {
     **dict.fromkeys(
@@ -225,21 +231,23 @@ def rewrite_torchscript(archive: Archive) -> tuple[io.BytesIO, bool]:
             those for files, or the pickles name tensors whose data is missing.
     """
     code = _read_code(archive)
-    for name in PICKLES:
+    pickles = list(FOLDER_OF_PICKLE)
+    for name in pickles:
         _check_pickle(archive, name)
+    tensor_folders = FOLDER_OF_PICKLE.values()
     tensors = [
-        name for name in archive.members if name.partition("/")[0] in PICKLES.values()
+        name for name in archive.members if name.partition("/")[0] in tensor_folders
     ]
     version = _read_version(archive)
     buffer = io.BytesIO()
     writer = torch._C.PyTorchFileWriter(buffer)
     writer.set_min_version(version)
-    for name in (*code, *PICKLES, *tensors):
+    for name in (*code, *pickles, *tensors):
         content = code[name] if name in code else archive.read(name)
         writer.write_record(name, content, len(content))
     writer.write_end_of_file()
     buffer.seek(0)
-    # torch calls a module's own __setstate__ on loading
+    # torch calls the method __setstate__ of a module while it loads it.
     runs_code = any(b"__setstate__" in content for content in code.values())
     return buffer, runs_code
 
@@ -275,7 +283,7 @@ def _read_version(archive: Archive) -> int:
     Raises:
         FileFormatError: the version is missing, or is not a number of 1 to 3 digits.
     """
-    # torch writes it under one of two names
+    # torch writes the version under one of two names.
     name = "version" if "version" in archive else ".data/version"
     version = archive.read(name, 100).decode("ascii", "replace").strip()
     if not re.fullmatch("[0-9]{1,3}", version):
@@ -296,10 +304,12 @@ def _find_code_problem(content: bytes) -> str:
         return "is not text"
     if found := _HARMFUL.search(text):
         return f"uses {found[0]!r}"
-    if any(family not in _CLASSES for family in _CLASS.findall(text)):
+    # Group 1 of the pattern is the family of a native class.
+    families = _NATIVE_CLASS.findall(text)
+    if not _HARMLESS_FAMILIES.issuperset(families):
         return "uses native classes other than those of quantized networks"
     has_control_character = any(
-        ord(sign) < 32 and ord(sign) not in _WHITE for sign in text
+        ord(char) < 32 and ord(char) not in _WHITE_SPACE_CODES for char in text
     )
     if has_control_character or any(map(_hides_character, _ESCAPE.findall(text))):
         return "has text with hidden characters"
@@ -307,32 +317,34 @@ def _find_code_problem(content: bytes) -> str:
 
 
 def _hides_character(escape: str) -> bool:
-    r"""Return whether an escape in source code may hide a character from a reader.
+    """Return whether an escape in source code may hide a character from a reader.
 
-    Torch writes printable ASCII characters plainly. So an escape of one was made to
-    hide it, and an escape of a control character could change the terminal. Octal
-    escapes of bytes over 127 are letters of other languages, and are fine.
+    Torch writes printable ASCII characters without escapes. So an escape of one was
+    made to hide it. An escape of a control character could change the terminal. Octal
+    escapes of bytes over 127 are parts of letters of other languages, and are allowed.
 
     Args:
-        escape: text after the backslash: octal digits, such as 303, or the beginning of
-            another escape, such as x1b.
+        escape: text after the backslash as `_ESCAPE` finds it: octal digits, such as
+            303, or the beginning of another escape by a number, such as x1b.
     """
-    if not escape.isdecimal():
+    is_octal = escape.isdecimal()
+    if not is_octal:
         return True
     code = int(escape, 8)
     is_ascii = code < 128
-    return is_ascii and code not in _WHITE
+    return is_ascii and code not in _WHITE_SPACE_CODES
 
 
 class _Inert:
-    """Stands for whatever a pickle makes. Does nothing."""
+    """A placeholder for any object that a pickle creates. It does nothing."""
 
     name = ""
     parts: list[Any]
 
     def __new__(cls, *parts: Any) -> _Inert:
-        """Make one as `__reduce__` or as ``cls.__new__`` would; there is no
-        `__init__`.
+        """Create a placeholder, as a pickle does by `__reduce__` or ``cls.__new__``.
+
+        There is no `__init__`.
         """
         instance = super().__new__(cls)
         instance.parts = list(parts)
@@ -343,9 +355,15 @@ class _Inert:
 
 
 class _Unpickler(pickle._Unpickler):
-    """Reads a pickle without making anything that it names: every class and every
-    function is an `_Inert`. It is Python's own slow reader, since the fast one makes
-    room for any number that a pickle gives its memory.
+    """Read a pickle without creating any object that it names.
+
+    Every class and every function is replaced by an `_Inert`. The base class is the
+    slow reader in Python, since the fast one in C allocates as much memory as a pickle
+    states.
+
+    Attributes:
+        storages: references to the data of tensors.
+        names: names of all classes and functions in the pickle.
     """
 
     def __init__(self, data: bytes) -> None:
@@ -376,23 +394,24 @@ def _check_pickle(archive: Archive, name: str) -> None:
     reader = _Unpickler(archive.read(name, LARGEST_PICKLE))
     try:
         value = reader.load()
-    except Exception as error:  # a damaged pickle raises nearly anything
+    except Exception as error:  # a corrupt pickle raises errors of many types
         raise make_archive_error(
             archive.path, f"{name!r} is damaged ({get_first_line(error)})"
         ) from None
-    # Of torch's native classes only some, such as those of quantized networks, are
-    # harmless.
+    # Only some families of native classes of torch, such as those of quantized
+    # networks, are harmless.
     if any(
-        family not in _CLASSES
+        family not in _HARMLESS_FAMILIES
         for text in reader.names
-        for family in _CLASS.findall(text)
+        for family in _NATIVE_CLASS.findall(text)
     ):
         raise make_archive_error(
             archive.path, f"{name!r} holds native objects, which are never loaded"
         )
     _check_values(archive, name, value)
+    tensor_folder = FOLDER_OF_PICKLE[name]
     for storage in reader.storages:
-        _check_storage(archive, PICKLES[name], storage)
+        _check_storage(archive, tensor_folder, storage)
 
 
 def _check_storage(archive: Archive, folder: str, storage: Any) -> None:
@@ -446,7 +465,8 @@ def _check_values(archive: Archive, name: str, value: Any) -> None:
     for _ in range(DEPTH):
         characters = {char for item in level if isinstance(item, str) for char in item}
         if any(
-            ord(char) not in _WHITE and not char.isprintable() for char in characters
+            ord(char) not in _WHITE_SPACE_CODES and not char.isprintable()
+            for char in characters
         ):
             raise make_archive_error(
                 archive.path, f"{name!r} has text with hidden characters"
@@ -464,7 +484,7 @@ def _check_values(archive: Archive, name: str, value: Any) -> None:
 
 
 def _list_inner_values(value: Any) -> Iterable[Any]:
-    """Return what is directly in a value that was read from a pickle."""
+    """Return the values that are directly inside a value from a pickle."""
     if isinstance(value, dict):
         return chain(value, value.values())
     if isinstance(value, _Inert):
@@ -480,7 +500,7 @@ def without_unpickling() -> Iterator[None]:
     is set. Its old value is restored afterwards.
     """
     switch = "TORCH_FORCE_WEIGHTS_ONLY_LOAD"
-    # torch refuses to load anything if both variables are set
+    # torch loads nothing if both variables are set, so that both are removed first.
     switches = (switch, "TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD")
     before = {key: os.environ.pop(key) for key in switches if key in os.environ}
     os.environ[switch] = "1"

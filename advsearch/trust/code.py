@@ -1,11 +1,10 @@
-"""What runs Python code, fetches weights of a library, or asks a model's address: only
-what a person has named.
+"""Allow Python code, weights of a library or an address only if the user has named it.
 
 The threat: a run, a suite, a recipe or a model file of somebody else names code, and
-whoever opens it would run that code. So a name that only a file has is refused, and the
-message says how a person allows it (`allow_code`, the setting `code`). Modules of the
-current directory come last, and processes of Python that we start begin in our own
-folder.
+whoever opens it would run that code. So a name that is only in a file is rejected, and
+the message explains how the user allows it (`allow_code`, the setting `code`). Modules
+are searched in the current directory last, and Python processes that we start have our
+own folder as theirs.
 
 Used wherever a name becomes code: controls, objectives, models and metrics
 (`registry.py`, `models/source.py`, `engine/judging.py`), models of libraries and
@@ -31,9 +30,8 @@ from advsearch.errors import CodeNotAllowedError, InputError
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 _ALLOWED: set[str] = set()
-"""The Python code, and the models of libraries, that whoever uses this process has
-named. Of the process, so that it holds in every thread; empty at first, so that what
-only a file names is refused, whoever reads that file.
+"""Python code, models of libraries and addresses that the user of this process has
+named. The set belongs to the process, so that it is the same in every thread.
 """
 _CODE = re.compile(r"[^\W\d][\w.]*:[^\W\d][\w.]*|(?:hf|timm|torchvision|https?):\S+")
 
@@ -45,7 +43,7 @@ def allow_code(*names: str) -> None:
     code before you allow it.
 
     Args:
-        names: what is allowed, as the file names it: code,
+        names: names to allow, as in the file: code,
             "package.module:attribute", without weights after an @; a model of a
             library, "hf:OWNER/NAME", whose weights may then be downloaded; or the
             address of a model, "https://...", to which images may then be sent.
@@ -62,6 +60,7 @@ def allow_code(*names: str) -> None:
 
 
 def allowed_code() -> tuple[str, ...]:
+    """Return all names that are allowed, sorted."""
     return tuple(sorted(_ALLOWED))
 
 
@@ -83,13 +82,15 @@ def allow_named(settings: Mapping[str, Any]) -> None:
     if isinstance(metrics, Mapping):
         names += map(_name_metric, metrics.values())
     texts = [name.strip() for name in names if isinstance(name, str)]
-    # plain names, such as those of bundled models, need no permission
+    # Other names, such as those of bundled models, need no permission.
     _ALLOWED.update(filter(_CODE.fullmatch, texts))
 
 
 def _list_model_names(value: Any) -> list[str]:
-    """Return the names in a setting of models: one, or several with commas between
-    them or in a list, each perhaps with @WEIGHTS.
+    """Return the names in a setting of models, without @WEIGHTS.
+
+    Args:
+        value: names separated by commas, or a list of these.
     """
     texts = [text for text in _to_list(value) if isinstance(text, str)]
     return [part.partition("@")[0] for text in texts for part in text.split(",")]
@@ -99,9 +100,10 @@ def _list_control_names(value: Any) -> list[object]:
     """Return what may name code in a setting of controls: their names and kinds.
 
     Args:
-        value: a list of names, mappings or instances; or a mapping from names to
-            mappings or instances.
+        value: names separated by commas; a list of names, mappings of settings, or
+            instances of controls; or a mapping from names to mappings or instances.
     """
+    # For a mapping, this is the list of its keys, the names of controls.
     controls = _to_list(value)
     if isinstance(value, Mapping):
         controls += value.values()
@@ -110,6 +112,7 @@ def _list_control_names(value: Any) -> list[object]:
         if isinstance(control, str):
             names += control.split(",")
         elif isinstance(control, Mapping):
+            # a mapping of settings, of which "kind" may name code
             names.append(control.get("kind"))
         else:
             names.append(getattr(control, "kind", None))
@@ -117,7 +120,7 @@ def _list_control_names(value: Any) -> list[object]:
 
 
 def _name_metric(metric: Any) -> Any:
-    """Return the name of the code of a metric that is a function; any other as it is."""
+    """Return the name of a metric's function; a metric that is no function as it is."""
     if callable(metric):
         return f"{metric.__module__}:{getattr(metric, '__qualname__', '')}"
     return metric
@@ -133,6 +136,7 @@ def allow_code_of_call(function: Function) -> Function:
 
     @wraps(function)
     def wrapper(*args: Any, **keywords: Any) -> Any:
+        """Allow the code in the arguments, and call the function."""
         # Arguments that do not fit the signature raise TypeError here; the call below
         # raises a better one.
         with suppress(TypeError):
@@ -143,13 +147,16 @@ def allow_code_of_call(function: Function) -> Function:
 
 
 def _to_list(value: Any) -> list[Any]:
-    """Return the items of a list, the names of a mapping, or any other value alone."""
+    """Return the items of a list, the keys of a mapping, or a list of another value."""
     return list(value) if isinstance(value, (list, tuple, Mapping)) else [value]
 
 
 @contextmanager
 def restrict_allowed_code() -> Iterator[None]:
-    """Begin the block with no code allowed; after it, only what was allowed before is."""
+    """Allow no code at the beginning of the block.
+
+    After it, exactly the code is allowed that was allowed before.
+    """
     before = allowed_code()
     _ALLOWED.clear()
     try:
@@ -160,14 +167,15 @@ def restrict_allowed_code() -> Iterator[None]:
 
 
 def is_fetch_allowed(model: str) -> bool:
-    """Return whether a person has named a model of a library, so that its weights may
-    be fetched.
+    """Return whether weights of a library's model may be fetched.
+
+    They may if the user has named the model.
     """
     return model in _ALLOWED or model.partition("@")[0] in _ALLOWED
 
 
 def explain_how_to_allow(name: str) -> str:
-    """Return how a person allows what only a file names, for messages."""
+    """Return how the user allows a name that is only in a file, for messages."""
     return (
         "if you trust it, allow it yourself: in Python with "
         f"advsearch.allow_code({name!r}), or with `code={name}`"
@@ -178,14 +186,14 @@ def check_import(name: str) -> None:
     """Check that "package.module:attribute" may be imported.
 
     Raises:
-        CodeNotAllowedError: only a file names it. The message says which file would be
-            run, and how to allow it.
+        CodeNotAllowedError: only a file names it. The message states the Python file
+            that would be run, and how to allow it.
     """
     if name in _ALLOWED:
         return
     importlib.invalidate_caches()
-    # Only the top package is searched for: that runs no code, while finding a module
-    # inside of it would import the package.
+    # Only the top package is searched. That runs no code, but searching a module inside
+    # of it would import the package.
     top_package = name.partition(":")[0].partition(".")[0]
     spec = PathFinder.find_spec(top_package, [*sys.path, os.getcwd()])
     where = f" from {spec.origin}" if spec is not None and spec.origin else ""
@@ -196,15 +204,16 @@ def check_import(name: str) -> None:
 
 
 SUBPROCESS_DIRECTORY = Path(__file__).resolve().parents[2]
-"""Where processes of Python that we start begin: Python looks there for modules first,
-and the folder that a user is in may be somebody else's.
+"""Working directory of Python processes that we start. Python searches it for modules
+first, and the current directory of the user may have files of somebody else.
 """
 
 
 @contextmanager
 def current_directory_importable() -> Iterator[None]:
-    """Inside the block, look for modules in the current directory as well, after all
-    other places.
+    """Search modules in the current directory, too, inside the block.
+
+    It is searched after all other directories.
     """
     directory = os.getcwd()
     added = directory not in sys.path and "" not in sys.path

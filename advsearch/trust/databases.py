@@ -1,8 +1,7 @@
-"""SQLite's files: they hold the tables that we make and no code, and opening one
-touches no other file.
+"""Check files of SQLite before they are used.
 
 The threat: a database of somebody else has a view or a trigger, which is code that
-SQLite runs and that may never end; its pages are damaged; or the journal beside it
+SQLite runs and that may never end; its pages are corrupt; or the journal next to it
 names a file that SQLite would delete.
 
 Used by the results of runs (`runs/store.py`, `runs/files.py`).
@@ -24,23 +23,27 @@ from advsearch.errors import FileFormatError
 from advsearch.trust.stored_files import open_regular
 
 DAMAGED = "it is damaged, or not made by advsearch: take it from a copy, or run again"
-LARGEST = 64 << 30  # bytes of a database, and of its journal
-MAX_SCHEMA_ENTRIES = 100  # of a schema that are looked at; ours has fewer than ten
-_JOURNAL = bytes.fromhex("d9d505f920a163d7")
-"""The last bytes of a journal that names a file
+LARGEST = 64 << 30  # maximum bytes of a database, and of its journal
+# maximum number of entries of a schema that are read; ours has fewer than ten
+MAX_SCHEMA_ENTRIES = 100
+_SUPER_JOURNAL_END = bytes.fromhex("d9d505f920a163d7")
+"""Last bytes of a journal that names another file
 (https://www.sqlite.org/fileformat2.html).
 """
 
 
 @contextmanager
 def translate_database_errors(path: Path) -> Iterator[None]:
-    """Turn what SQLite says of a damaged file inside the block into an error that names
-    it.
+    """Turn errors of SQLite inside the block into errors that name the file.
+
+    Raises:
+        FileFormatError: in place of an error of SQLite.
     """
     try:
         yield
     except (sqlite3.Error, UnicodeDecodeError) as error:
-        text = repr(str(error))[1:-1][:200]  # it quotes what is in the file
+        # The message may quote the content of the file, so that it is escaped and cut.
+        text = repr(str(error))[1:-1][:200]
         raise FileFormatError(
             f"{path}: expected a results.sqlite of advsearch, got {text}; {DAMAGED}"
         ) from error
@@ -49,7 +52,7 @@ def translate_database_errors(path: Path) -> Iterator[None]:
 def check_schema(db: sqlite3.Connection, path: Path, statements: str) -> None:
     """Check that a database has exactly the tables and indices of a schema.
 
-    Any other entry is refused: a view or a trigger is code, which may never end.
+    Any other entry is rejected: a view or a trigger is code, which may never end.
 
     Args:
         db: the database; it is closed if the check fails.
@@ -72,10 +75,10 @@ def _schema_of(statements: str) -> Counter[Any]:
 
 
 def read_schema(db: sqlite3.Connection) -> Counter[Any]:
-    """Return every entry of a schema, whatever its name, and how often it is there.
+    """Return all entries of a schema, with the number of times that each occurs.
 
-    An entry is (type, name, table, statement). The statement has no comments and line
-    breaks, which mean nothing to SQLite.
+    An entry is (type, name, table, statement). Comments and line breaks, which SQLite
+    ignores, are removed from the statement.
     """
     entries = db.execute(
         "SELECT type, name, tbl_name, sql FROM sqlite_master"
@@ -88,6 +91,7 @@ def read_schema(db: sqlite3.Connection) -> Counter[Any]:
 
 
 def _strip_comments(statement: str) -> str:
+    """Return a statement without comments, on one line."""
     without_comments = "\n".join(
         line.partition("--")[0] for line in statement.split("\n")
     )
@@ -95,10 +99,12 @@ def _strip_comments(statement: str) -> str:
 
 
 def protect(db: sqlite3.Connection) -> None:
-    """Make SQLite careful with a database that may be somebody else's: its schema calls
-    no functions, and each page is checked when it is read.
+    """Set the options of SQLite that are recommended for a database of somebody else.
 
-    Nothing here reads the schema, so none of the file's own statements has run by then.
+    Its schema may not call functions and may not be changed, each page is checked when
+    it is read, and the file is not mapped into the memory
+    (https://www.sqlite.org/security.html). These statements do not read the schema, so
+    that no code in it runs before the options are set.
     """
     db.execute("PRAGMA trusted_schema = OFF")
     db.execute("PRAGMA writable_schema = OFF")
@@ -109,8 +115,8 @@ def protect(db: sqlite3.Connection) -> None:
 def check_before_writing(path: Path) -> None:
     """Check that it is safe to let SQLite write to a path.
 
-    There must be no file yet, or an ordinary file. A link could lead the writing to
-    another file, and a journal can make SQLite delete another file.
+    There must be no file yet, or an ordinary file. Through a link SQLite would write to
+    another file, and a journal can make it delete another file.
 
     Raises:
         FileFormatError: the path is a link or a special file, or its journal names
@@ -121,16 +127,17 @@ def check_before_writing(path: Path) -> None:
             f"{path}: expected a file of this run, got a link to another; {DAMAGED}"
         )
     if path.exists():
-        # raises where it is no ordinary file
+        # Raises FileFormatError if it is no ordinary file.
         open_regular(path, "a results.sqlite", LARGEST).close()
     _check_journal(path.with_name(f"{path.name}-journal"))
 
 
 def _check_journal(journal: Path) -> None:
-    """Refuse a journal that names a file, as a transaction on several databases writes.
+    """Reject a journal that names another file.
 
-    Such a journal ends with the name of a file (a super-journal), which SQLite would
-    delete. Our own journals have none.
+    SQLite writes such a journal for a transaction on several databases. It ends with
+    the name of a file (the super-journal), which SQLite would delete, and with
+    `_SUPER_JOURNAL_END`. Our own journals have neither.
 
     Args:
         journal: path of the journal; it need not exist.
@@ -142,9 +149,10 @@ def _check_journal(journal: Path) -> None:
         return
     with open_regular(journal, "a journal of SQLite", LARGEST) as file:
         size = os.fstat(file.fileno()).st_size
-        file.seek(-min(len(_JOURNAL), size), os.SEEK_END)
+        file.seek(-min(len(_SUPER_JOURNAL_END), size), os.SEEK_END)
         last_bytes = file.read()
-        if last_bytes == _JOURNAL:
+        names_other_file = last_bytes == _SUPER_JOURNAL_END
+        if names_other_file:
             raise FileFormatError(
                 f"{journal}: expected the journal of one file, got one that names "
                 "another; remove it"
@@ -168,7 +176,7 @@ def connect_to_read(path: Path) -> sqlite3.Connection:
     address = path.resolve().as_uri()
     db = sqlite3.connect(f"{address}?mode=ro", uri=True)
     try:
-        # any query would do: it shows whether the file can be read
+        # Any query would do, to find out whether the file can be read.
         read_version(db)
     except sqlite3.OperationalError:
         db.close()
@@ -178,5 +186,5 @@ def connect_to_read(path: Path) -> sqlite3.Connection:
 
 
 def read_version(db: sqlite3.Connection) -> int:
-    """Return the version that the header has."""
+    """Return the version of our schema in the header of a database."""
     return int(db.execute("PRAGMA user_version").fetchone()[0])

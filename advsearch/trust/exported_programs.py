@@ -1,11 +1,12 @@
-"""`torch.export` archives (.pt2), rewritten before torch reads them.
+"""Rewrite `torch.export` archives (.pt2) before torch reads them.
 
 torch's reader evaluates expressions and guards as Python, writes names of the graph
-into code that it runs, imports modules for containers, and unpickles. So it never sees
-the file: a new archive is made in memory of its description of the network and its
-weights. What cannot be checked is left out, and all else has to have the form that
-`torch.export.save` gives it; expressions of sizes are arithmetic with whole numbers,
-symbols and listed functions.
+into code that it runs, imports modules for containers, and unpickles. So it does not
+read the original file, but a new archive in memory, which has the description of the
+network and its weights. Entries that cannot be checked are left out. All others must
+have the form in which `torch.export.save` writes them: for example, expressions of
+sizes may only have arithmetic with whole numbers, symbols and the functions listed
+here.
 
 Used by `models/files.py`.
 """
@@ -32,12 +33,15 @@ from advsearch.trust.archives import (
 )
 from advsearch.trust.stored_files import parse_json
 
-LENGTH = 20_000  # characters of an expression
-DEPTH = 60  # of its nesting
-# multiplied over nested powers: nobody writes s0**65, and 9**9**9 never ends
+LENGTH = 20_000  # maximum number of characters of an expression
+DEPTH = 60  # maximum nesting of an expression
+# Maximum product of the exponents of nested powers. Real sizes have no power s0**65,
+# and 9**9**9 would take forever to compute.
 EXPONENT = 64
-NUMBER = 1 << 63  # numbers are smaller than this
+MAX_TEXT_CHARACTERS = 1000  # of names and arguments
+NUMBER = 1 << 63  # the absolute values of integers have to be smaller
 
+# functions of expressions, apart from powers
 FUNCTIONS = frozenset(
     "Integer Rational Float Add Mul Max Min Mod Abs Eq Ne Lt Le Gt Ge Equality "
     "Unequality StrictLessThan LessThan StrictGreaterThan GreaterThan And Or Not "
@@ -46,6 +50,7 @@ FUNCTIONS = frozenset(
     "IsNonOverlappingAndDenseIndicator TruncToFloat TruncToInt "
     "RoundToInt RoundDecimal ToFloat Identity floor ceiling".split()
 )
+MAX_ARGUMENTS = 16  # maximum number of arguments of a function
 POWERS = frozenset(["Pow", "PowByNatural", "FloatPow", "LShift", "RShift"])
 NAMES = frozenset(["true", "false", "oo", "int_oo"])
 
@@ -66,8 +71,9 @@ _COMPARISONS = (ast.Eq, ast.NotEq, ast.Lt, ast.LtE, ast.Gt, ast.GtE)
 
 
 def is_symbol(text: str) -> bool:
-    """Whether a text may name a symbol: letters, then at most five digits (torch counts
-    up to the number).
+    """Return whether a text may name a symbol: letters, then at most five digits.
+
+    Torch counts up to the number, so that it has to be small.
     """
     return _SYMBOL.fullmatch(text) is not None
 
@@ -86,9 +92,9 @@ def problem(text: object) -> str:
         _check(tree.body, DEPTH, EXPONENT)
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         reason = "it cannot be read"
-        # A plain ValueError is that of `_check`, whose message is for the user. A
-        # subclass of it, such as UnicodeError, comes from Python's parser, as do the
-        # other errors.
+        # `_check` raises a plain ValueError, whose message is for the user. Its
+        # subclasses, such as UnicodeError, and the other errors come from Python's
+        # parser.
         if type(error) is ValueError:
             reason = str(error.args[0])
         return (
@@ -98,14 +104,21 @@ def problem(text: object) -> str:
     return ""
 
 
-def _check(node: ast.expr, depth: int, power: int) -> None:
-    """Raise ValueError unless a node of an expression is arithmetic that ends soon.
+def _check(node: ast.expr, depth: int, max_power: int) -> None:
+    """Check that a node of an expression is arithmetic that takes little time.
+
+    The allowed nodes are numbers, symbols, functions, powers with small exponents,
+    operators, comparisons and tuples. Each case below checks the node itself, and
+    lists its operands, which are checked in the same way.
 
     Args:
         node: node to check, with all nodes below it.
         depth: number of levels that may still be nested.
-        power: largest value that the product of exponents below may have. Powers of
-            powers multiply their exponents, so that (9**9)**9 is bounded too.
+        max_power: maximum product of the exponents in this node and below. Exponents of
+            nested powers multiply, so that (9**9)**9 is bounded, too.
+
+    Raises:
+        ValueError: it is not; the message is a clause about what was got instead.
     """
     if depth <= 0:
         raise ValueError("it is nested too deeply")
@@ -114,30 +127,16 @@ def _check(node: ast.expr, depth: int, power: int) -> None:
         case ast.Constant(value=number):
             _check_number(number)
         case ast.Name(id=name):
-            # symbols are numbered by torch: s0, u12
+            # Torch numbers its symbols: s0, u12.
             is_numbered_symbol = is_symbol(name) and name[-1].isdecimal()
             if name not in NAMES and not is_numbered_symbol:
                 raise ValueError(f"the name {name[:40]!r}")
-        case ast.Call(func=ast.Name(id="Symbol")):
-            _check_symbol(node)
-        case ast.Call(func=ast.Name(id="Float")):
-            _check_decimal(node)
-        # The two calls above may have keywords, such as Symbol("s0", integer=True).
-        # Calls of other functions may not.
-        case ast.Call(keywords=[_, *_]):
-            raise ValueError("keywords")
-        case ast.Call(func=ast.Name(id=name), args=[base, exponent]) if name in POWERS:
-            operands = [base]
-            power = _power_left(exponent, power)
-        case ast.Call(func=ast.Name(id=name), args=arguments) if (
-            name in FUNCTIONS and len(arguments) <= 16
-        ):
-            operands = arguments
-        case ast.Call(func=function):
-            raise ValueError(f"a call of {ast.unparse(function)[:40]!r}")
+        case ast.Call():
+            operands, max_power = _check_call(node, max_power)
+        # `_divide_max_power` checks the exponent of a power: only the base is left.
         case ast.BinOp(left=base, op=ast.Pow(), right=exponent):
             operands = [base]
-            power = _power_left(exponent, power)
+            max_power = _divide_max_power(exponent, max_power)
         case ast.BinOp(left=left, op=operator, right=right) if isinstance(
             operator, _OPERATORS
         ):
@@ -152,9 +151,42 @@ def _check(node: ast.expr, depth: int, power: int) -> None:
         case ast.BoolOp(values=parts) | ast.Tuple(elts=parts):
             operands = parts
         case _:
-            raise ValueError(f"{type(node).__name__} is none")
+            raise ValueError(f"{type(node).__name__} is no arithmetic")
     for operand in operands:
-        _check(operand, depth - 1, power)
+        _check(operand, depth - 1, max_power)
+
+
+def _check_call(call: ast.Call, max_power: int) -> tuple[list[ast.expr], int]:
+    """Check that an expression may call a function.
+
+    Args:
+        call: node of the call.
+        max_power: maximum product of the exponents in the call.
+
+    Returns:
+        The arguments that are still to be checked, and the maximum product of the
+        exponents in them.
+
+    Raises:
+        ValueError: it may not; the message is a clause about what was got instead.
+    """
+    match call:
+        case ast.Call(func=ast.Name(id="Symbol")):
+            _check_symbol(call)
+            return [], max_power
+        case ast.Call(func=ast.Name(id="Float")):
+            _check_decimal(call)
+            return [], max_power
+        # Only the two calls above may have keywords: Symbol("s0", integer=True).
+        case ast.Call(keywords=[_, *_]):
+            raise ValueError("a call with keywords")
+        case ast.Call(func=ast.Name(id=name), args=[base, exponent]) if name in POWERS:
+            return [base], _divide_max_power(exponent, max_power)
+        case ast.Call(func=ast.Name(id=name), args=arguments) if (
+            name in FUNCTIONS and len(arguments) <= MAX_ARGUMENTS
+        ):
+            return arguments, max_power
+    raise ValueError(f"a call of {ast.unparse(call.func)[:40]!r}")
 
 
 def _check_number(value: object) -> None:
@@ -166,7 +198,7 @@ def _check_number(value: object) -> None:
 
 
 def _check_symbol(call: ast.Call) -> None:
-    """Raise ValueError unless a call is like Symbol('s0', positive=True, integer=True)."""
+    """Raise ValueError unless a call is like Symbol('s0', integer=True)."""
     text = _get_only_argument(call)
     assumptions = [_get_constant(keyword.value) for keyword in call.keywords]
     # None is the name of **keywords
@@ -179,8 +211,8 @@ def _check_symbol(call: ast.Call) -> None:
 def _check_decimal(call: ast.Call) -> None:
     """Raise ValueError unless a call is like Float('0.5', precision=53).
 
-    Sympy computes with as many bits as the precision says (53 for float64), so that a
-    huge one would take all memory. 200 is more than torch writes.
+    Sympy computes with as many bits as the precision states (53 for float64), so that a
+    huge one would fill the memory. 200 is more than torch writes.
     """
     text = _get_only_argument(call)
     if not isinstance(text, str) or not _DECIMAL.fullmatch(text):
@@ -194,8 +226,9 @@ def _check_decimal(call: ast.Call) -> None:
 
 
 def _get_only_argument(call: ast.Call) -> object:
-    """Return the constant that is the only positional argument of a call; None if it is
-    something else, or not the only one.
+    """Return the constant that is the only positional argument of a call.
+
+    None if the argument is no constant, or if it is not the only one.
     """
     return _get_constant(call.args[0]) if len(call.args) == 1 else None
 
@@ -205,22 +238,21 @@ def _get_constant(node: ast.expr) -> object:
     return node.value if isinstance(node, ast.Constant) else None
 
 
-def _power_left(exponent: ast.expr, power: int) -> int:
-    """Return the bound on exponents that remains after this exponent.
+def _divide_max_power(exponent: ast.expr, max_power: int) -> int:
+    """Return the maximum product of exponents in the base of a power.
 
     The exponent may be an integer, also with a sign or as ``Integer(3)``. It may also
-    be 1/2 or -1/2: a root makes no number large, and leaves the bound as it is.
+    be 1/2 or -1/2: a root makes no number large, and does not change the maximum.
 
     Args:
         exponent: node of the exponent.
-        power: largest value that the product of this exponent and those below it may
-            have.
+        max_power: maximum product of this exponent and the exponents in the base.
 
     Returns:
-        `power` divided by the exponent, rounded down.
+        `max_power` divided by the exponent, rounded down.
 
     Raises:
-        ValueError: the exponent is anything else, or larger than `power`.
+        ValueError: the exponent is anything else, or larger than `max_power`.
     """
     exponent = _without_sign(exponent)
     match exponent:
@@ -230,11 +262,12 @@ def _power_left(exponent: ast.expr, power: int) -> int:
         "Rational(1, 2)",
         "Rational(-1, 2)",
     ):
-        return power
+        return max_power
     value = _get_constant(exponent)
-    if not isinstance(value, int) or isinstance(value, bool) or value > power:
+    if not isinstance(value, int) or isinstance(value, bool) or value > max_power:
         raise ValueError("an exponent that is not a small number")
-    return power // max(value, 1)
+    # An exponent of 0 is allowed, but must not divide.
+    return max_power // max(value, 1)
 
 
 def _without_sign(node: ast.expr) -> ast.expr:
@@ -251,7 +284,7 @@ OLD_NAMES = {
     "data/weights/model.pt": "serialized_state_dict.pt",
     "data/constants/model.pt": "serialized_constants.pt",
 }
-"""What the members were called up to torch 2.7."""
+"""Names of members in archives of torch up to 2.7, by their present names."""
 
 EXAMPLE = ("data/sample_inputs/model.pt", "serialized_example_inputs.pt")
 
@@ -271,13 +304,16 @@ HARMFUL = frozenset(
         "manual_seed",
     ]
 )
-"""Operators of these namespaces that touch files, the terminal or the process."""
+"""Names of operators of these namespaces that access files, the terminal or the state
+of the process. They are not allowed.
+"""
 
 HIGHER_ORDER = (
     "cond|map_impl|scan|associative_scan|flex_attention|wrap_with_set_grad_enabled|"
     "wrap_with_autocast"
 )
 
+# Group 1 is the name of an operator, as in "torch.ops.aten.NAME.default".
 _OPERATOR = re.compile(
     rf"torch\.ops\.(?:{NAMESPACES})\.(\w+)\.\w+|torch\.ops\.higher_order\.(?:{HIGHER_ORDER})"
 )
@@ -294,9 +330,9 @@ _GLOBALS = re.compile(
     r"_get_layout"
     r"|torch (u?int|b?float|complex|bool)[0-9]*\w*"
 )
-"""What the pickle of a tensor names; nothing of it runs anything."""
+"""Pattern of the classes and functions in the pickle of a tensor, which run no code."""
 _OTHER_IMPORTS = ("STACK_GLOBAL", "INST", "OBJ", "EXT1", "EXT2", "EXT4")
-"""Steps of a pickle that name a class in another way; torch.save uses none of them."""
+"""Other steps of a pickle that import a class. torch.save writes none of them."""
 
 _CONTAINERS = frozenset(
     [
@@ -307,18 +343,19 @@ _CONTAINERS = frozenset(
         "collections.OrderedDict",
     ]
 )
-_FORGOTTEN: JsonObject = {"metadata": {}, "guards_code": []}
+# Entries that the network does not need, and their replacements.
+_EMPTIED_ENTRIES: JsonObject = {"metadata": {}, "guards_code": []}
 
 
 def rewrite_program(archive: Archive) -> io.BytesIO:
-    """Copy the network and the weights of an archive into a new one that is safe to load.
+    """Copy the network and the weights of an archive into a new, safe archive.
 
     `torch.export.load` reads the new archive. Members that could run code, such as
-    compiled code and pickled objects, are left out or refused.
+    compiled code and pickled objects, are left out or rejected.
 
     Raises:
         FileFormatError: the archive has something that a plain network does not have;
-            the message says what.
+            the message names it.
     """
     # This import takes a second, and only this kind of model needs it.
     from torch.export.pt2_archive import PT2ArchiveWriter
@@ -372,7 +409,7 @@ def _read_program(archive: Archive, name: str) -> Any:
 def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> None:
     """Copy the tensors that a table names from an archive to a new one.
 
-    Only files with plain numbers are copied, and no pickles. An empty file is refused
+    Only files with plain numbers are copied, and no pickles. An empty file is rejected
     for a tensor that should have numbers.
 
     Args:
@@ -393,8 +430,9 @@ def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> No
             archive.path,
             f"expected a table of tensors in {config!r}, got something else",
         )
+    # "tensor_name" has no special check: the keys of the table have to be plain names.
     table = _check_value(archive.path, table, "tensor_name")
-    copied: set[str] = set()  # several tensors may share one file of numbers
+    copied: set[str] = set()  # multiple tensors may share a file of numbers
     for name, entry in table.items():
         member = f"{folder}{_get_record(archive, name, entry)}"
         shape = _read_shape(archive, member, entry)
@@ -446,7 +484,7 @@ def _read_shape(archive: Archive, member: str, entry: JsonObject) -> list[int]:
     meta = entry.get("tensor_meta")
     sizes: Any = meta.get("sizes") if isinstance(meta, dict) else None
     if not isinstance(sizes, list):
-        sizes = [None]  # refused below
+        sizes = [None]  # rejected below
     shape: list[Any] = [
         size.get("as_int") if isinstance(size, dict) else None for size in sizes
     ]
@@ -472,8 +510,8 @@ def _check_value(path: Path, value: JsonValue, key: str) -> Any:
             of the entry that holds the list.
 
     Returns:
-        The value, in which entries that the network does not need (`_FORGOTTEN`) are
-        replaced by harmless ones.
+        The value, in which entries that the network does not need (`_EMPTIED_ENTRIES`)
+        are replaced by harmless ones.
 
     Raises:
         FileFormatError: a text, number or name cannot be part of a plain network.
@@ -481,80 +519,93 @@ def _check_value(path: Path, value: JsonValue, key: str) -> Any:
     if isinstance(value, list):
         return [_check_value(path, inner, key) for inner in value]
     if not isinstance(value, dict):
-        if wrong := _problem(value, key):
+        if wrong := _find_problem(value, key):
             raise make_archive_error(path, wrong)
         return value
     checked: JsonObject = {}
     for name, inner in value.items():
-        # Keys of a mapping may be names of tensors. So a key is checked like a text
-        # that stands under the name of the mapping.
-        wrong = "" if name in ("", *_FORGOTTEN) else _problem(name, key)
+        # Keys of a mapping may be names of tensors. So in {"tensor_values": {"x":
+        # ...}}, the key "x" is checked in the same way as a text in "tensor_values"
+        # would be.
+        is_unchecked_key = name in ("", *_EMPTIED_ENTRIES)
+        wrong = "" if is_unchecked_key else _find_problem(name, key)
         is_custom_object = name in ("as_custom_obj", "custom_obj")
-        if is_custom_object or (name == "custom_obj_values" and inner):
+        # torch always writes this table, which is empty for a plain network.
+        has_custom_objects = name == "custom_obj_values" and bool(inner)
+        if is_custom_object or has_custom_objects:
             wrong = "holds a custom object, which is never loaded"
         if wrong:
             raise make_archive_error(path, wrong)
-        if name in _FORGOTTEN:
-            checked[name] = _FORGOTTEN[name]
+        if name in _EMPTIED_ENTRIES:
+            checked[name] = _EMPTIED_ENTRIES[name]
         else:
             checked[name] = _check_value(path, inner, name)
     return checked
 
 
-def _problem(value: Any, key: str) -> str:
-    """Return what is wrong with a text, number or name; "" for nothing.
+def _find_problem(value: Any, key: str) -> str:
+    """Return what is wrong with a text or a number; "" for nothing.
+
+    The result is the end of a message that begins with the file.
 
     Args:
         value: the value.
-        key: name of the entry that holds it. It decides which check a text needs: for
-            instance "expr_str" holds an expression.
+        key: name of the entry that has the value. It decides how a text is checked
+            (`_TEXT_CHECKS`): for example, "expr_str" has an expression.
     """
     if isinstance(value, str):
-        find_problem = _TEXTS.get(key, _plain_problem)
+        find_problem = _TEXT_CHECKS.get(key, _find_plain_problem)
         return find_problem(value)
     if key == "expr_str":
-        return "an expression that is no text"
+        return "has an expression that is no text"
     if isinstance(value, int) and abs(value) >= NUMBER:
         return "has a number of more than 64 bits"
     return ""
 
 
-def _plain_problem(text: str) -> str:
+def _find_plain_problem(text: str) -> str:
+    """Return what is wrong with a text that is only a name; "" for nothing."""
     return "" if _PLAIN.fullmatch(text) else f"has an unusual name, {text[:60]!r}"
 
 
-def _identifier_problem(text: str) -> str:
-    """Return what speaks against a name that torch writes into code, "" if nothing does."""
+def _find_identifier_problem(text: str) -> str:
+    """Return what is wrong with a name that torch writes into code; "" for nothing.
+
+    It has to be a short identifier of Python, or empty.
+    """
     is_proper = text == "" or (
         text.isascii()
         and text.isidentifier()
         and not keyword.iskeyword(text)
-        and len(text) < 1000
+        and len(text) < MAX_TEXT_CHARACTERS
     )
     return "" if is_proper else f"expected a name of a value, got {text[:60]!r}"
 
 
-# that an operator is called with, such as 'same' or 'bilinear'
-def _argument_problem(text: str) -> str:
-    return (
-        ""
-        if len(text) <= 1000 and text.isprintable()
-        else "has text that is too long or not printable"
-    )
+def _find_argument_problem(text: str) -> str:
+    """Return what is wrong with a text that is the argument of an operator.
+
+    Such a text is "same" or "bilinear". The result is "" if nothing is wrong.
+    """
+    if len(text) <= MAX_TEXT_CHARACTERS and text.isprintable():
+        return ""
+    return "has text that is too long or not printable"
 
 
-def _operator_problem(text: str) -> str:
-    """Return what speaks against the name of an operator, "" if nothing does."""
-    operator = _OPERATOR.fullmatch(text)
-    if _ARITHMETIC.fullmatch(text) or (operator and operator[1] not in HARMFUL):
+def _find_operator_problem(text: str) -> str:
+    """Return what is wrong with the name of an operator; "" for nothing."""
+    if _ARITHMETIC.fullmatch(text):
+        return ""
+    match = _OPERATOR.fullmatch(text)
+    if match and match[1] not in HARMFUL:
         return ""
     return (
-        f"names the operator {text[:80]!r}, which is none of a plain network, and "
+        f"has the operator {text[:80]!r}, which plain networks do not have and which "
         "is never run"
     )
 
 
-def _tree_problem(text: str) -> str:
+def _find_tree_problem(text: str) -> str:
     """Return what is wrong with the structure of inputs or outputs; "" for nothing.
 
     Torch imports the types of containers that the structure names. So only tuples,
@@ -594,25 +645,27 @@ def _has_plain_keys(context: Any) -> bool:
         return False
     keys = parse_json(context)
     return isinstance(keys, list) and all(
-        isinstance(key, (str, int)) and not _plain_problem(str(key)) for key in keys
+        isinstance(key, (str, int)) and not _find_plain_problem(str(key))
+        for key in keys
     )
 
 
-_TEXTS: dict[str, Callable[[str], str]] = {
+_TEXT_CHECKS: dict[str, Callable[[str], str]] = {
     **dict.fromkeys(
-        ("name", "as_name", "user_input_name", "forward_arg_names"), _identifier_problem
+        ("name", "as_name", "user_input_name", "forward_arg_names"),
+        _find_identifier_problem,
     ),
     **dict.fromkeys(
         ("tensor_values", "sym_int_values", "sym_float_values", "sym_bool_values"),
-        _identifier_problem,
+        _find_identifier_problem,
     ),
     "expr_str": problem,
-    "target": _operator_problem,
-    "as_operator": _operator_problem,
-    "in_spec": _tree_problem,
-    "out_spec": _tree_problem,
-    "as_string": _argument_problem,
-    "as_strings": _argument_problem,
+    "target": _find_operator_problem,
+    "as_operator": _find_operator_problem,
+    "in_spec": _find_tree_problem,
+    "out_spec": _find_tree_problem,
+    "as_string": _find_argument_problem,
+    "as_strings": _find_argument_problem,
     "range_constraints": lambda text: "" if is_symbol(text) else problem(text),
 }
 
@@ -624,9 +677,9 @@ _TEXTS: dict[str, Callable[[str], str]] = {
 def _check_pickle(archive: Archive, name: str) -> None:
     """Check that a member is a file of `torch.save` that holds only tensors.
 
-    They may be in tuples and dicts; an empty member is accepted too. Nothing is
+    They may be in tuples and dicts. An empty member is accepted, too. Nothing is
     unpickled here, since that may run code: the steps of the pickle are read one by
-    one, and a step that imports anything but the classes of tensors is refused.
+    one, and a step that imports anything but the classes of tensors is rejected.
 
     Args:
         archive: archive of the network.
@@ -640,7 +693,7 @@ def _check_pickle(archive: Archive, name: str) -> None:
         return
     refusal = make_archive_error(
         archive.path,
-        f"cannot be read as torch.export ({name!r} is in need of unpickling, which "
+        f"cannot be read as torch.export ({name!r} would have to be unpickled, which "
         "is never done)",
     )
     is_zip = data[:2] == b"PK"

@@ -1,11 +1,11 @@
-"""What code of others must not do to us: never end, leave torch's global switches
-turned, or say what it likes.
+"""Call code of others with a time limit, and isolate its switches and errors.
 
-The threat: a network, a file of one or a library that reads it hangs, changes how all
-later tensors are made, or raises any error with any text. A call goes on in a thread of
-its own, left behind when the time is up, for nothing ends torch's loops; what would
-hold Python up too is tried in a process of its own. A network has the type and device
-for new tensors that its code chose. Of an error of others one short line is shown.
+The threat: a network, its file, or a library that reads the file never ends, changes
+how all later tensors are created, or raises any error with any text. So a call runs in
+another thread, which is abandoned when the time is up, since nothing can end a loop
+inside torch. A call that would block Python as well is tried in another process first.
+Each network creates its tensors with the dtype and device that its code has chosen. An
+error of foreign code is reported as one short line.
 
 Used by all that loads and calls models (`models/`) and around what the engine does
 (`engine/`).
@@ -30,10 +30,10 @@ from advsearch.errors import AdvsearchError, ModelError
 from advsearch.trust.code import SUBPROCESS_DIRECTORY
 from advsearch.trust.stored_files import FACTOR, scale_limit
 
-# seconds that a file's first passes may take each, and its loading, where that runs a
-# part of it
+# maximum seconds of each of the first calls of a network from a file, and of loading it
+# if that runs a part of it
 LONGEST = 120
-GRACE = 5  # seconds for a call to end that was asked to
+GRACE = 5  # seconds that a call has to end after `stop` was called
 _CPU = torch.device("cpu")
 _TRIAL = (
     "import io, sys, torch; torch.jit.load(io.BytesIO(sys.stdin.buffer.read()), "
@@ -44,7 +44,7 @@ Result = TypeVar("Result")
 
 
 class TimedOut(Exception):
-    """The time was up; the message says what the limit is and how it is raised."""
+    """The time is up; the message states the limit and how to raise it."""
 
     def __init__(self) -> None:
         super().__init__(
@@ -73,22 +73,22 @@ def run_within_limits(
     records_gradients = torch.is_grad_enabled()
 
     def work() -> None:
+        """Call the code, and store its result or its error."""
         try:
             with torch.set_grad_enabled(records_gradients):
                 outcome.set_result(call())
         except BaseException as error:
             outcome.set_exception(error)
 
-    # a daemon: the process does not wait for it at its end
+    # A daemon, so that the process does not wait for the thread at its end.
     thread = threading.Thread(target=work, daemon=True)
     thread.start()
     thread.join(scale_limit(LONGEST))
     if thread.is_alive():
         if stop is not None:
             stop()
-            thread.join(
-                GRACE
-            )  # so that it ends before we go on; its result is not used
+            # The thread gets some time to end; its result is not used.
+            thread.join(GRACE)
         raise TimedOut
     return outcome.result()
 
@@ -96,9 +96,9 @@ def run_within_limits(
 def try_torchscript(archive: io.BytesIO) -> str:
     """Load TorchScript in another process, and return what is wrong; "" for nothing.
 
-    In this process loading could not be stopped, since torch does not let Python run
-    meanwhile. Only a crash and a timeout are reported. An error that torch raises is
-    not, since loading the archive in this process raises it again.
+    In this process loading could not be stopped, since torch blocks Python while it
+    loads. Only a crash and a timeout are reported. An error of torch is not, since
+    loading the archive in this process raises it again.
 
     Args:
         archive: the TorchScript file, in memory.
@@ -121,9 +121,15 @@ def try_torchscript(archive: io.BytesIO) -> str:
 
 @dataclass(frozen=True)
 class Switches:
-    """The state of torch's switches: dtype and device of new tensors, whether this
-    thread records gradients, whether operations that are not deterministic warn (1) or
-    raise (2), and whether NaN in a derivative does.
+    """The state of torch's switches.
+
+    Attributes:
+        dtype: dtype of new tensors.
+        device: device of new tensors.
+        gradients: whether this thread records gradients.
+        deterministic: whether operations that are not deterministic warn (1), raise an
+            error (2), or neither (0).
+        anomalies: whether NaN in a derivative raises an error.
     """
 
     dtype: torch.dtype = torch.float32
@@ -134,7 +140,7 @@ class Switches:
 
     @classmethod
     def read_current(cls) -> Switches:
-        """Return the switches as torch has them now."""
+        """Return the current state of torch's switches."""
         return cls(
             dtype=torch.get_default_dtype(),
             device=torch.get_default_device(),
@@ -144,14 +150,14 @@ class Switches:
         )
 
     def apply(self) -> None:
-        """Turn all of them."""
+        """Set all of torch's switches to this state."""
         self.apply_to_new_tensors()
         torch.set_grad_enabled(self.gradients)
         torch.set_deterministic_debug_mode(self.deterministic)
         torch.autograd.set_detect_anomaly(self.anomalies)
 
     def apply_to_new_tensors(self) -> None:
-        """Turn those for new tensors."""
+        """Set only the switches for new tensors, dtype and device."""
         torch.set_default_dtype(self.dtype)
         if torch.get_default_device() != self.device:
             torch.set_default_device(None if self.device.type == "cpu" else self.device)
@@ -159,15 +165,17 @@ class Switches:
 
 PLAIN = Switches()
 
-_outside: list[Switches] = []  # as `use_plain_switches` found them, the outermost first
+# states of the switches before each `use_plain_switches` block, the outermost first
+_outside: list[Switches] = []
 
 
 @contextmanager
 def use_plain_switches() -> Iterator[None]:
     """Set torch's global switches to their defaults (`PLAIN`) inside the block.
 
-    `torch.inference_mode` is left too. All are restored afterwards. So neither the
-    caller's switches nor those that foreign code sets change our own computations.
+    `torch.inference_mode` is switched off, too. All are restored afterwards. So our own
+    computations depend neither on the caller's switches nor on those that foreign code
+    sets.
     """
     leaves_inference_mode: AbstractContextManager[Any] = nullcontext()
     if torch.is_inference_mode_enabled():
@@ -187,14 +195,14 @@ def use_plain_switches() -> Iterator[None]:
 
 
 def find_code_switches() -> Switches:
-    """Return torch's switches that the code of a network expects, and set `PLAIN` again.
+    """Return the switches that the code of a network expects, and set `PLAIN` again.
 
     Call it inside `use_plain_switches`, after the code was loaded. If loading the code
     has set switches, such as the default dtype, the network expects these. Otherwise it
     expects those from before the outermost `use_plain_switches`.
     """
     current = Switches.read_current()
-    if current == PLAIN:  # loading the code has set none
+    if current == PLAIN:  # loading the code has set no switches
         return _outside[0] if _outside else PLAIN
     PLAIN.apply()
     return current
@@ -208,14 +216,16 @@ def call_with_switches(module: nn.Module, switches: Switches) -> None:
     """
     if (switches.dtype, switches.device) == (PLAIN.dtype, PLAIN.device):
         return
-    # The switches of the callers. They are a stack, since a module may call itself.
+    # A stack of the callers' switches, since a module may call itself.
     before: list[Switches] = []
 
     def enter(*_: Any) -> None:
+        """Set the switches of the module before a call."""
         before.append(Switches.read_current())
         switches.apply_to_new_tensors()
 
     def leave(*_: Any) -> None:
+        """Restore the switches of the caller after a call."""
         before.pop().apply_to_new_tensors()
 
     module.register_forward_pre_hook(enter)
@@ -223,8 +233,10 @@ def call_with_switches(module: nn.Module, switches: Switches) -> None:
 
 
 def get_first_line(error: BaseException) -> str:
-    """Return an error of foreign code as one short line: its type, and the first line
-    of its message with hidden characters escaped.
+    """Return an error of foreign code as one short line.
+
+    It has the type of the error, and the first line of its message with hidden
+    characters escaped.
     """
     text = type(error).__name__
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
@@ -233,7 +245,7 @@ def get_first_line(error: BaseException) -> str:
             sign if sign.isprintable() else repr(sign)[1:-1] for sign in lines[0]
         )
         text = f"{text}: {first_line}"
-    # 300 characters with the dots
+    # at most 300 characters, including the dots
     return text if len(text) <= 300 else text[:297] + "..."
 
 
@@ -246,8 +258,8 @@ def translate_errors(
     Errors of advsearch itself pass unchanged.
 
     Args:
-        what: beginning of the message, which says what failed; the foreign error
-            follows in brackets.
+        what: beginning of the message, which states what failed; the foreign error
+            follows in parentheses.
         kind: class of the new error.
     """
     try:

@@ -1,9 +1,9 @@
-"""Files that a file names: only those in its own folder and below are read, after links
-are followed.
+"""Read the files that a file names only if they are in its own folder or below.
 
-The threat: a mesh, a scene, a layer or a summary may come from anywhere, so it may name
-anything on this machine, which would be read into a picture, a page or an export. Of
-all that a mesh names no more is read than one file may have.
+This is checked after links are followed. The threat: a mesh, a scene, a layer or a
+summary of somebody else may name any file on this machine, which would then be part of
+an image, a page or an export. All files that a mesh names may have together no more
+bytes than a single file.
 
 Used by the importers of meshes and scenes (`scene/importing/`,
 `scene/mitsuba_backend/xml_files.py`), for the mesh and the maps of a place
@@ -27,14 +27,12 @@ _NO_SUCH_NAME = (errno.ENOENT, errno.ENOTDIR, errno.ENAMETOOLONG, errno.EINVAL)
 
 
 def normalize_name(name: str) -> str:
-    """Return a file name as it is written on this system: no quotes, no percent signs,
-    forward slashes.
-    """
+    """Return a file name without quotes and percent encoding, with forward slashes."""
     return unquote(name.strip().strip('"')).replace("\\", "/")
 
 
 def is_inside(path: Path | str, folder: Path | str) -> bool:
-    """Whether a path leads into a folder or below, after links are followed."""
+    """Return whether a path is in a folder or below, after links are followed."""
     return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
 
 
@@ -55,8 +53,11 @@ def _list_spellings(name: str) -> list[str]:
 
 
 class References:
-    """Finds the files that a mesh file names. `refused` are those that it could not
-    get, as `normalize_name` gives them, and why: `MISSING`, `OUTSIDE` or another clause.
+    """Read the files that a mesh file names.
+
+    Attributes:
+        refused: files that were not read, by their normalized name (`normalize_name`),
+            and the reason: `MISSING`, `OUTSIDE` or another clause.
     """
 
     def __init__(self, path: Path) -> None:

@@ -1,12 +1,11 @@
-"""What goes to another machine and comes from one: no secret in an address, none sent
-unencrypted or sent on.
+"""Protect keys in connections to other machines, and restrict connections.
 
-The threat: an address is stored with the run, shown and shared, and whoever listens on
-the way, or is named by a redirect, would have the key to a model. So the key comes from
-the environment alone, goes over HTTPS or stays on this machine, and follows no
-redirect; and what is served beyond this machine is served over HTTPS.
+The threat: an address is stored with the run, displayed and shared. And whoever listens
+to the connection, or is the target of a redirect, would get the key to a model. So the
+key comes only from the environment, is sent only over HTTPS or to this machine, and is
+not sent to the target of a redirect. Pages for other machines are served over HTTPS.
 
-A library connects to nobody for what only a file names.
+A library may not make connections for a model that only a file names.
 
 Used by models behind addresses (`models/address.py`), libraries
 (`models/zoo/library.py`) and the server of the dashboard (`viewer/server.py`).
@@ -47,7 +46,7 @@ def check_address(spec: str) -> SplitResult:
     try:
         address = urlsplit(spec)
         host = address.hostname
-        # read only to check it: a wrong port raises ValueError
+        # Only for the check: an invalid port raises ValueError.
         _ = address.port
     except ValueError as error:
         raise InputError(
@@ -90,7 +89,7 @@ def _check_no_secret(address: SplitResult) -> None:
 
 
 def is_local(host: str) -> bool:
-    """Whether a host is this machine."""
+    """Return whether a host is this machine."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -104,7 +103,7 @@ def read_key() -> str:
         InputError: the key is not printable ASCII.
     """
     key = os.environ.get(KEY, "").strip()
-    # Checked here, since http.client would print the key in its error.
+    # It is checked here because http.client would print the key in its error.
     if not (key.isascii() and key.isprintable()):
         raise InputError(
             f"{KEY}: expected a key of printable ASCII characters, got others"
@@ -113,13 +112,14 @@ def read_key() -> str:
 
 
 class NoRedirect(urllib.request.HTTPRedirectHandler):
-    """Follows no redirect: what is sent has a key in it."""
+    """Follow no redirect, since requests have a key."""
 
     def redirect_request(self, *_: Any) -> None:
+        """Return None, so that urllib raises an HTTPError."""
         return None
 
 
-DAYS = 7  # for which a certificate is good
+DAYS = 7  # validity of a certificate
 
 
 def make_https_context(hosts: Sequence[str]) -> tuple[ssl.SSLContext, str]:
@@ -184,14 +184,14 @@ def _write_certificate(hosts: Sequence[str], key: Path, certificate: Path) -> No
         ) from None
     except (OSError, subprocess.SubprocessError) as error:
         output: bytes = getattr(error, "stderr", None) or b""
-        text = output.decode(errors="replace")[-300:]  # the end says what went wrong
+        text = output.decode(errors="replace")[-300:]  # the end has the reason
         raise InputError(
             f"https: openssl made no certificate: {text or error}"
         ) from None
 
 
 def is_address(host: str) -> bool:
-    """Whether a host is a number and no name."""
+    """Return whether a host is a numeric address and no name."""
     try:
         ipaddress.ip_address(host)
     except ValueError:
@@ -201,25 +201,28 @@ def is_address(host: str) -> bool:
 
 @contextlib.contextmanager
 def restrict_connections(allowed: bool, tries: list[object]) -> Iterator[None]:
-    """Refuse every connection that this thread makes inside the block.
+    """Reject every connection that this thread makes inside the block.
 
-    It is used while a model of a library is loaded because a file names it: a file from
-    somebody else must not make us download anything. Other threads connect as usual.
+    It is used while a model of a library is loaded that only a file names: a file of
+    somebody else must not cause a download. Other threads connect as usual.
 
     Args:
         allowed: whether connections are allowed; then nothing changes.
-        tries: list to which the address of each refused connection is appended.
+        tries: list to which the address of each rejected connection is appended.
     """
     if allowed:
         yield
         return
-    # The methods of sockets are replaced, as libraries connect in many ways.
+    # Methods of sockets are replaced, since all libraries use them to connect.
     names = ("connect", "connect_ex")
     thread = threading.get_ident()
     before = {name: getattr(socket.socket, name) for name in names}
 
-    def make_refusing(name: str) -> Callable[[socket.socket, Any], Any]:
+    def make_rejecting(name: str) -> Callable[[socket.socket, Any], Any]:
+        """Return a replacement of a method that rejects this thread's connections."""
+
         def connect(self: socket.socket, address: Any) -> Any:
+            """Connect as usual in other threads, and raise an error in this one."""
             if threading.get_ident() != thread:
                 return before[name](self, address)
             tries.append(address)
@@ -228,7 +231,7 @@ def restrict_connections(allowed: bool, tries: list[object]) -> Iterator[None]:
         return connect
 
     for name in names:
-        setattr(socket.socket, name, make_refusing(name))
+        setattr(socket.socket, name, make_rejecting(name))
     try:
         yield
     finally:

@@ -1,11 +1,11 @@
-"""Pages that a server of ours sends: to whom, and what they may do in a browser.
+"""Check requests to our server, and restrict what its pages may do in a browser.
 
-The threat: another site in the same browser asks this server, under a name that leads
-here (DNS rebinding) or from its own pages; somebody else on the network asks it; or a
-page in the folder of a run, which may be somebody else's, runs scripts that read other
-runs or send them away. So a request is for this server's own address, from no other
-origin, and beyond this machine it has the token; and a page runs no script but those of
-this package.
+The threat: another site in the same browser sends requests to this server, under a name
+that resolves to this machine (DNS rebinding) or from its own pages; somebody else on
+the network sends requests; or a page in the folder of a run of somebody else runs
+scripts that read other runs or send them elsewhere. So a request must have the address
+of this server, must come from no other origin, and must have the token if it comes from
+another machine. A page runs only scripts of this package.
 
 Used by the dashboard's server (`viewer/server.py`), by the frame of every page
 (`viewer/document.py`) and for photographs (`questions/photographs/result.py`).
@@ -25,8 +25,8 @@ from urllib.parse import parse_qs, urlsplit
 from advsearch.trust.network import is_address
 
 LOOPBACK = "127.0.0.1"
-LONGEST = 4096  # characters of an address
-COOKIE = "advsearch"
+LONGEST = 4096  # maximum number of characters of an address
+COOKIE = "advsearch"  # beginning of the name of the cookie with the token
 
 CLOSED = {
     "X-Content-Type-Options": "nosniff",
@@ -35,11 +35,16 @@ CLOSED = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Permissions-Policy": "camera=(self), microphone=(), geolocation=()",
 }
-"""Headers of every answer, beside its `Content-Security-Policy`."""
+"""Headers of every response, in addition to its `Content-Security-Policy`."""
 
 
 class RequestRejected(Exception):
-    """A request that is not answered as asked."""
+    """A request that is rejected.
+
+    Args:
+        status: HTTP status of the response.
+        text: reason, for the response.
+    """
 
     def __init__(self, status: HTTPStatus, text: str) -> None:
         super().__init__(text)
@@ -82,20 +87,23 @@ def check_request(
     if not _is_server_address(host, named, port, token):
         raise RequestRejected(
             HTTPStatus.FORBIDDEN,
-            "this server is not called so; open the address that it printed",
+            "this is not the address of the server; open the address that it printed",
         )
     origin = headers.get("Origin")
     if origin is not None and origin != f"{scheme}://{host}":
         raise RequestRejected(
             HTTPStatus.FORBIDDEN,
-            "a page of another origin asks; open the address that was printed",
+            "the request is from a page of another origin; open the address that was "
+            "printed",
         )
     is_same_origin = headers.get("Sec-Fetch-Site", "none") in ("none", "same-origin")
     # Another site may link to a page here, which the user then sees. It cannot read
-    # that page, and a POST from it is refused, since that could change something.
+    # that page, and a POST from it is rejected, since that could change something.
     follows_link = headers.get("Sec-Fetch-Mode") == "navigate" and command != "POST"
     if not is_same_origin and not follows_link:
-        raise RequestRejected(HTTPStatus.FORBIDDEN, "a page of another site asks")
+        raise RequestRejected(
+            HTTPStatus.FORBIDDEN, "the request is from a page of another site"
+        )
     if token is not None and not _has_token(path, headers, port, token):
         raise RequestRejected(
             HTTPStatus.UNAUTHORIZED,
@@ -126,9 +134,9 @@ def _has_token(path: str, headers: Message, port: int, token: str) -> bool:
 def _is_server_address(host: str, named: str, port: int, token: str | None) -> bool:
     """Return whether the Host of a request is an address of this server.
 
-    Any other name is refused, since a foreign site could make its own name resolve to
-    this machine (DNS rebinding). A numeric address is accepted: no name server can
-    redirect it.
+    Any other name is rejected, since a foreign site could make its own name resolve to
+    this machine (DNS rebinding). A numeric address is accepted, since no name server
+    can redirect it.
 
     Args:
         host: the header Host of the request, NAME:PORT.
@@ -147,14 +155,16 @@ def _is_server_address(host: str, named: str, port: int, token: str | None) -> b
 
 
 def make_token_cookie(port: int, token: str) -> str:
-    """Return what a browser keeps so that links need no token. It is lax: a link on the
-    page of a run, which has an origin of its own, leads back to the list.
+    """Return the cookie with the token, which a browser stores so that links need none.
+
+    It is lax, because the page of a run has another origin, and links on it lead back
+    to the list.
     """
     return f"{COOKIE}-{port}={token}; HttpOnly; Secure; SameSite=Lax; Path=/"
 
 
 def compute_script_digest(code: bytes) -> str:
-    """Return a script's SHA-256 as a policy names it."""
+    """Return the SHA-256 of a script in base64, as in a Content-Security-Policy."""
     return base64.b64encode(hashlib.sha256(code).digest()).decode()
 
 

@@ -1,8 +1,7 @@
-"""Other programs that read files of others: each in a folder of its own, for a limited
-time, with nothing to ask.
+"""Run other programs: in a separate folder, with a time limit and without input.
 
-The threat: a file makes a program hang, wait for somebody to type, or find settings and
-modules of the user's.
+The threat: a file makes a program hang or wait for input, or the program uses settings
+and modules of the user.
 
 Used for OpenUSD (`scene/importing/usd`) and Blender (`scene/importing/blender.py`).
 """
@@ -50,7 +49,7 @@ def run_converter(
             command,
             cwd=folder,
             env=env,
-            stdin=subprocess.DEVNULL,  # a program that asks gets no answer
+            stdin=subprocess.DEVNULL,  # a program that waits for input gets none
             capture_output=True,
             errors="replace",
             timeout=longest,
@@ -64,8 +63,9 @@ def run_converter(
 
 
 def make_environment(folder: str) -> dict[str, str]:
-    """Return the environment variables of a process whose home is `folder`; of the
-    variables of this process it gets those of search paths only.
+    """Return the environment variables of a process whose home directory is `folder`.
+
+    Of the variables of this process, only those with search paths are passed on.
     """
     variables = {
         name: os.environ[name]
@@ -76,8 +76,8 @@ def make_environment(folder: str) -> dict[str, str]:
 
 
 BLENDER = "ADVSEARCH_BLENDER"
-"""Variable of the environment: a Blender, or a Python that has `bpy`, in the place of
-those that are looked for.
+"""Environment variable with the program Blender, or a Python that has the package
+`bpy`. Without it, both are searched.
 """
 
 
@@ -88,8 +88,8 @@ def find_blender(who: str, otherwise: str) -> list[str]:
     with the package `bpy`.
 
     Args:
-        who: beginning of the error's message, which says what needs Blender.
-        otherwise: end of the message, which says what else the user can do.
+        who: beginning of the error's message, which states what needs Blender.
+        otherwise: end of the message, which states what else the user can do.
 
     Raises:
         FileFormatError: there is no Blender.
@@ -111,9 +111,9 @@ def find_blender(who: str, otherwise: str) -> list[str]:
     program = os.path.abspath(executable)
     is_python = Path(program).name.startswith("python")  # one with the package bpy
     if is_python:
-        return [program, "-I"]  # without the user's own modules
-    # Without a window, and with neither the user's settings nor scripts of the file. A
-    # script that fails makes the exit status 1.
+        return [program, "-I"]  # isolated from modules of the user
+    # Without a window, without settings of the user, and without scripts in the file.
+    # If the script fails, the exit status is 1.
     return [
         program,
         "--background",

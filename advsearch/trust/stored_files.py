@@ -1,10 +1,9 @@
-"""What is read: only ordinary files, never more of them than a limit, JSON no deeper
-than one.
+"""Read only ordinary files of limited size, and JSON of limited depth.
 
-The threat: a file, or what it names, is a device or a pipe, which may never end or wait
-for ever; or it is made so that it fills the memory. A device, a pipe or a socket is
-refused before a byte of it is read, and each reader says its limit, which a person
-raises by the environment (`FACTOR`).
+The threat: a file, or a file that it names, is a device or a pipe, which may never end
+or block forever; or its content would fill the memory. A device, a pipe or a socket is
+rejected before any of it is read. Each reader has a limit, which users raise by an
+environment variable (`FACTOR`).
 
 Used for every file that a user names, and for every file that such a file names, by
 every reader of the package.
@@ -24,12 +23,12 @@ from typing import Any, BinaryIO
 
 from advsearch.errors import FileFormatError, InputError
 
-# environment variable with a number that all limits on the size of input are multiplied
-# by
+# environment variable with the factor on all limits on the size of input
 FACTOR = "ADVSEARCH_LIMITS"
-DEPTH = 100  # deepest nesting of JSON, in lists and objects
-DEEPEST = 16  # lists and mappings inside one another that a setting may have
-# most digits of a whole number; more than these have no floating-point form
+DEPTH = 100  # maximum number of nested levels of JSON, including that of the scalars
+DEEPEST = 16  # maximum number of nested lists and mappings in a setting
+# maximum digits of an integer; longer ones cannot be converted to floating-point
+# numbers
 DIGITS = 300
 _KINDS = (
     (stat.S_ISDIR, "a directory; name a file inside it"),
@@ -46,10 +45,10 @@ _OPENED: dict[str, dict[str, None]] = {}
 
 @contextmanager
 def track_opened_files(path: Path | str) -> Iterator[None]:
-    """Inside the block, note each file that is opened as a part of the file `path`;
-    `list_opened_files` lists them.
+    """Record each file that is opened inside the block as a part of the file `path`.
 
-    Within another such block, files stay parts of the outer one's file.
+    `list_opened_files` lists these files. Inside another such block, they are recorded
+    as parts of the file of the outer block.
     """
     token = _ROOT.set(_ROOT.get() or os.path.abspath(path))
     try:
@@ -59,14 +58,15 @@ def track_opened_files(path: Path | str) -> Iterator[None]:
 
 
 def record_opened(path: Path | str) -> None:
-    """Remember that a file was read; `open_regular` does it itself."""
+    """Record that a file was read; `open_regular` does so by itself."""
     absolute_path = os.path.abspath(path)
     _OPENED.setdefault(_ROOT.get() or absolute_path, {})[absolute_path] = None
 
 
 def list_opened_files(path: Path | str) -> list[str]:
-    """Return the files that this process has read for a file: itself, and what it
-    names, in order, by full path.
+    """Return the paths of the files that this process has read for a file, in order.
+
+    These are the file itself, and the files that it names.
     """
     return list(_OPENED.get(os.path.abspath(path), {}))
 
@@ -75,7 +75,7 @@ def scale_limit(limit: int) -> int:
     """Multiply a limit by the environment variable `ADVSEARCH_LIMITS`.
 
     The limits are on the size of input (bytes, pixels, faces) and on seconds. The
-    variable is 1 by default; users who trust their input set it higher.
+    variable is 1 by default. Users who trust their input may increase it.
 
     Raises:
         InputError: the variable is not a number greater than 0.
@@ -84,7 +84,7 @@ def scale_limit(limit: int) -> int:
     try:
         factor = float(text)
     except ValueError:
-        factor = math.nan  # refused below
+        factor = math.nan  # rejected below
     if not 0 < factor < math.inf:
         raise InputError(
             f"{FACTOR}: expected a number greater than 0, by which limits "
@@ -94,7 +94,7 @@ def scale_limit(limit: int) -> int:
 
 
 def make_size_error(path: Path | str, expected: str, size: str) -> FileFormatError:
-    """Return the error for input that is over a limit; it says how to raise the limit.
+    """Return the error for input that exceeds a limit, with advice to raise the limit.
 
     Args:
         path: path of the input.
@@ -127,7 +127,7 @@ def open_regular(path: Path, expected: str, limit: int) -> BinaryIO:
     # The check comes before opening, since opening a device or a pipe may change it. It
     # is repeated below, since another file may have taken its place meanwhile.
     _check(path, os.stat(path), expected, limit)
-    # without blocking: a pipe that has taken its place would wait for a writer
+    # O_NONBLOCK: opening a pipe that has taken its place would wait for a writer.
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)
     try:
         _check(path, os.fstat(descriptor), expected, limit)
@@ -156,7 +156,7 @@ def read_bytes(path: Path, expected: str, limit: int) -> bytes:
         # One byte more than allowed is read, to notice a file that is too large after
         # all: it may have grown, and files in /proc state no size.
         data = file.read(max_bytes + 1)
-    if data is None:  # nothing to read yet, as in the kernel's log
+    if data is None:  # no data is available yet, as in the kernel's log
         raise FileFormatError(
             f"{path}: expected {expected}, got a file that waits for something; name "
             "an ordinary file"
@@ -189,8 +189,15 @@ def read_text(path: Path, expected: str, limit: int) -> str:
 
 
 def read_existing_bytes(path: Path, expected: str, limit: int) -> bytes:
-    """Return what `read_bytes` returns, and raise FileFormatError where it raises
-    OSError, too.
+    """Return the content of an ordinary file, which has to exist.
+
+    Args:
+        path: path of the file.
+        expected: what it should be, for errors, such as "a label file".
+        limit: maximum number of bytes, before `scale_limit`.
+
+    Raises:
+        FileFormatError: it is missing, not an ordinary file, or too large.
     """
     try:
         return read_bytes(path, expected, limit)
@@ -263,7 +270,9 @@ def parse_json(text: str | bytes, *, finite: bool = False) -> Any:
         )
     except RecursionError:
         raise JsonBoundsError(f"lists or objects nested deeper than {DEPTH}") from None
-    # Python's own recursion limit varies, so that the depth is checked as well.
+    # Python's own recursion limit varies, so that the depth is checked as well. The
+    # scalars are one of the `DEPTH` levels, so that one less is left for lists and
+    # objects.
     if not is_shallow(value, DEPTH - 1):
         raise JsonBoundsError(f"lists or objects nested deeper than {DEPTH}")
     return value
@@ -272,7 +281,8 @@ def parse_json(text: str | bytes, *, finite: bool = False) -> Any:
 def is_shallow(value: Any, levels: int = DEEPEST) -> bool:
     """Return whether lists and mappings in a value are nested at most `levels` deep.
 
-    A value that is none has level 0, a list of such values level 1.
+    A value that is neither a list nor a mapping has 0 levels, a list of such values has
+    1 level.
     """
     if levels < 0:
         return False
@@ -285,12 +295,14 @@ def is_shallow(value: Any, levels: int = DEEPEST) -> bool:
 
 
 def _parse_integer(text: str) -> int:
+    """Return an integer of JSON; raise JsonBoundsError if it has too many digits."""
     if len(text) > DIGITS:
         raise JsonBoundsError(f"a whole number of {len(text)} digits")
     return int(text)
 
 
 def _parse_finite(text: str) -> float:
+    """Return a number of JSON; raise ValueError if it is NaN or infinite."""
     if not math.isfinite(number := float(text)):
         raise ValueError(f"the number {text[:40]}")
     return number
@@ -312,7 +324,7 @@ def _check(path: Path, status: os.stat_result, expected: str, limit: int) -> Non
         )
 
 
-# bytes that a mesh, a texture or an environment may have, before `scale_limit`
+# maximum bytes of a mesh, a texture or an environment, before `scale_limit`
 LARGEST_FILE = 1 << 29
 
 
@@ -323,8 +335,8 @@ def check_most(
 
     Args:
         path: path of the file.
-        count: how much it has.
-        limit: how much it may have, before `scale_limit`.
+        count: number of these things in the file.
+        limit: maximum number, before `scale_limit`.
         expected: text for the error, with {} for the limit, such as "at most {} faces".
         got: text for the error about what it has instead; None for `count`.
 

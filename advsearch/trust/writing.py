@@ -1,10 +1,9 @@
-"""What is written: whole or not at all, by one process at a time, through no link, and
-where nothing else is lost.
+"""Write files atomically, by one process at a time, and never through links.
 
 The threat: a process is killed or the disk is full while it writes; two processes write
-into one run; a run's folder is removed or renamed meanwhile; or somebody else made the
-folder, and has put a link there to a file that would be shown, copied or overwritten. A
-lock is dropped by the kernel when its process ends.
+into the same run; a run's folder is removed or renamed meanwhile; or somebody else has
+made the folder, with a link to a file that would be displayed, copied or overwritten.
+The kernel releases a lock when its process ends.
 
 Used by all that writes: runs (`runs/directory.py`, `runs/files.py`, `runs/store.py`),
 exports, pages and studies.
@@ -24,7 +23,7 @@ from typing import NamedTuple
 
 from advsearch.errors import FileFormatError, InputError, StorageError
 
-# prefix of a file that is still being written; what a killed process may leave behind
+# prefix of a file that is being written; a killed process may leave such a file
 PART = ".part-"
 _ADVICE = {
     errno.ENOSPC: "the disk is full; free some space or choose another place with `run`",
@@ -52,14 +51,14 @@ _SQLITE_ADVICE = {
 def storage_errors(path: Path) -> Iterator[None]:
     """Turn errors of writing inside the block into a `StorageError` that names `path`.
 
-    These are errors of the operating system and of SQLite. The message says what the
-    user can do, for instance about a full disk.
+    These are errors of the operating system and of SQLite. The message states what the
+    user can do, for example about a full disk.
     """
     try:
         yield
     except (OSError, sqlite3.OperationalError) as error:
-        # If the folder of the run was moved, this raises another error: the move
-        # explains whatever failed.
+        # Raises another error if the folder of the run was moved, since that is the
+        # reason of all other errors.
         check_not_moved(path)
         advice = _find_advice(error)
         if advice is None:
@@ -80,9 +79,7 @@ def _find_advice(error: OSError | sqlite3.OperationalError) -> str | None:
 
 @contextmanager
 def name_setting_in_errors(setting: str) -> Iterator[None]:
-    """Make a `StorageError` inside the block advise to change this setting, instead of
-    `run`.
-    """
+    """Replace `run` by another setting in the advice of a `StorageError`."""
     try:
         yield
     except StorageError as error:
@@ -124,7 +121,7 @@ def replace_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
 def check_free_folder(out: Path, setting: str) -> None:
     """Check that a folder to be written does not exist yet or is empty.
 
-    A link is refused: the finished folder could not replace it, and it may lead to
+    A link is rejected: the finished folder could not replace it, and it may lead to
     files of somebody else.
 
     Args:
@@ -146,8 +143,12 @@ def check_free_folder(out: Path, setting: str) -> None:
 
 
 def write_bytes(path: Path, data: bytes, *, durable: bool = False) -> Path:
-    """Write `data` to `path`, whole or not at all, and return the path; `durable` as
-    for `replace_file`.
+    """Write data to a path atomically, and return the path.
+
+    Args:
+        path: path of the file.
+        data: content of the file.
+        durable: as for `replace_file`.
     """
     with replace_file(path, durable=durable) as part:
         part.write_bytes(data)
@@ -155,8 +156,12 @@ def write_bytes(path: Path, data: bytes, *, durable: bool = False) -> Path:
 
 
 def write_text(path: Path, text: str, *, durable: bool = True) -> Path:
-    """Write `text` in UTF-8 to `path`, whole or not at all, and return the path;
-    `durable` as for `replace_file`.
+    """Write a text in UTF-8 to a path atomically, and return the path.
+
+    Args:
+        path: path of the file.
+        text: content of the file.
+        durable: as for `replace_file`.
     """
     return write_bytes(path, text.encode("utf-8"), durable=durable)
 
@@ -171,8 +176,11 @@ def _flush(path: Path) -> None:
 
 
 class _OpenResults(NamedTuple):
-    """The results of a run that this process writes: path, and device and inode of the
-    file, which a new file of that name does not have.
+    """The file with the results of a run that this process writes.
+
+    Attributes:
+        path: path of the file.
+        file_id: its device and inode. A new file of the same name has another inode.
     """
 
     path: Path
@@ -204,7 +212,8 @@ def note_open(results: Path) -> Callable[[], None]:
     _open[folder] = entry
 
     def note_closed() -> None:
-        # the run may have been opened again since
+        """Register that the results are closed."""
+        # The run may have been opened again since.
         if _open.get(folder) is entry:
             del _open[folder]
 
@@ -273,7 +282,7 @@ class RunLock:
             InputError: another process holds the lock; the message names it.
             StorageError: the file system has no locks, or the file cannot be
                 written.
-            FileFormatError: something that is no ordinary file stands in its place.
+            FileFormatError: the lock is no ordinary file.
         """
         self._path = folder / LOCK
         with storage_errors(self._path):
@@ -299,6 +308,7 @@ class RunLock:
             raise _make_lock_error(folder, error, pid) from None
 
     def release(self) -> None:
+        """Release the lock, if it is held."""
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1
@@ -321,7 +331,7 @@ def is_held(folder: Path) -> bool:
 
 
 def check_no_links(run: Path, contents: Collection[str], unchecked_suffix: str) -> None:
-    """Check that the folder of a run holds files and folders only, and no links.
+    """Check that the folder of a run has only files and folders, and no links.
 
     In a run that somebody else made, a link may lead to any file, which would then be
     displayed, copied or overwritten. The run folder itself may be a link, since the
@@ -331,8 +341,8 @@ def check_no_links(run: Path, contents: Collection[str], unchecked_suffix: str) 
         run: the folder of the run.
         contents: names in this folder that are checked, in addition to the lock; other
             names are ignored.
-        unchecked_suffix: end of a path. If the path of a folder ends so, its subfolders
-            are not checked.
+        unchecked_suffix: end of a path. If the path of a folder has this end, its
+            subfolders are not checked.
 
     Raises:
         FileFormatError: there is a link, a pipe or another special file.
@@ -363,6 +373,7 @@ def check_no_links(run: Path, contents: Collection[str], unchecked_suffix: str) 
             if entry.is_dir(follow_symlinks=False):
                 if not folder.endswith(unchecked_suffix):
                     folders.append(entry.path)  # its contents are checked, too
+            # `RunLock` checks the lock itself when it opens it.
             elif not entry.is_file(follow_symlinks=False) and entry.name != LOCK:
                 raise FileFormatError(
                     f"{entry.path}: expected a file of this run, got a "

@@ -1,9 +1,8 @@
-"""YAML as settings are written in it: text, numbers, truth values, lists and mappings,
-of limited size.
+"""Read YAML of settings: text, numbers, booleans, lists and mappings, of limited size.
 
-Read by PyYAML's safe loader, less what does not belong in settings: numbers to the base
-of 60 (0:360:24 is text), dates (2026-11-22 is text), tags, and structures that are
-small in the file and endless in memory.
+PyYAML's safe loader reads it, without features that settings do not need: numbers to
+base 60 (0:360:24 is text), dates (2026-11-22 is text), tags, and short texts that stand
+for huge structures (nested aliases).
 """
 
 from __future__ import annotations
@@ -15,22 +14,21 @@ import yaml
 
 from advsearch.trust.stored_files import DEPTH, DIGITS, scale_limit
 
-MAX_YAML_BYTES = 1 << 17  # most bytes of a YAML file
-# most values of a YAML text, those that an alias repeats counted again
+MAX_YAML_BYTES = 1 << 17  # maximum size of a YAML file
+# maximum number of values of a YAML text; values that an alias repeats count again
 MAX_VALUES = 100_000
 _PLAIN = frozenset(
     f"tag:yaml.org,2002:{kind}"
     for kind in "str int float bool null seq map merge".split()
 )
-_UNFINISHED = 0  # in the place of a node's count, which is 1 at least
+_UNFINISHED = 0  # value for a node that is being counted; a count is at least 1
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc, unused-ignore]
-    """The safe loader with our numbers, which checks a text before it makes anything of
-    it.
-    """
+    """The safe loader with our forms of numbers, and with checks of the document."""
 
     def get_single_data(self) -> Any:
+        """Check the document, and return its value; None if it is empty."""
         node = self.get_single_node()
         if node is None:
             return None
@@ -38,11 +36,15 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc, unused-ignore]
         return self.construct_document(node)
 
     def construct_yaml_int(self, node: yaml.Node) -> int:
-        if (
-            len(node.value) > 4 * DIGITS
-            or abs(number := int(super().construct_yaml_int(node))) >= 10**DIGITS
-        ):
-            raise _problem(node, f"a number of more than {DIGITS} digits")
+        """Return an integer; raise a YAMLError if it has too many digits."""
+        error = _problem(node, f"a number of more than {DIGITS} digits")
+        # In binary, a number has up to 3.3 times as many digits as in decimal. The
+        # length is checked first because converting a long text takes long.
+        if len(node.value) > 4 * DIGITS:
+            raise error
+        number = int(super().construct_yaml_int(node))
+        if abs(number) >= 10**DIGITS:
+            raise error
         return number
 
 
@@ -156,10 +158,10 @@ def _count_checked(node: yaml.Node, depth: int, counts: dict[int, int]) -> int:
 
 
 def _check_names(node: yaml.MappingNode) -> None:
-    """Check that no name stands twice in a mapping.
+    """Check that a mapping has no name twice.
 
     Raises:
-        yaml.YAMLError: one does.
+        yaml.YAMLError: it has a name twice.
     """
     names = set[str]()
     for name, _ in node.value:

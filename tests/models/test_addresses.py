@@ -168,7 +168,7 @@ def test_a_busy_server_is_asked_again(server: Server, status: int) -> None:
     [
         ((500, {}, b"out of order"), "status 500 .*out of order", 5),
         ((400, {}, b"no \x1b[2J such model"), r"status 400 .*no \[2J such model", 1),
-        ((307, {"Location": "http://elsewhere.invalid/"}, b""), "sends on to http://elsewhere.invalid/", 1),
+        ((307, {"Location": "http://elsewhere.invalid/"}, b""), "redirects to http://elsewhere.invalid/", 1),
         ((200, {}, b"[" * 100_000), "expected JSON", 1),
         ((200, {}, b'{"scores": {"mug": NaN}}'), "expected JSON", 1),
         ((200, {}, b'{"text": "' + b"a" * (2 << 20)), "an answer of at most 1,048,576 bytes, got a longer one", 1),

@@ -27,7 +27,7 @@ READS = {
     "eos_token_id": 3,
     "attention_dropout": 0.5,
 }
-SIGLIP = pytest.mark.filterwarnings("ignore:.*judges each name by itself")
+SIGLIP = pytest.mark.filterwarnings("ignore:.*scores each name independently")
 pytestmark = SIGLIP
 
 

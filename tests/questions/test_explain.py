@@ -117,7 +117,7 @@ def test_of_predictions_without_a_law_it_is_said_that_nothing_decides_and_how_ma
     asked = ["explain", str(faint), "--confirm", "0", "--pairs", "0", "--clusters", "0", "--run", str(tmp_path / "run")]
     assert main(asked) == 0
     said = capsys.readouterr().out
-    assert "No rule is told from chance in 600 rows, of which one half chooses and the other counts" in said
+    assert "No rule is significant in 600 rows, of which one half chooses and the other counts" in said
     assert "No parameter is shown to decide anything" in said
     kept = read_result(tmp_path / "run")
     assert isinstance(kept, ExplainResult) and kept.rules == []
@@ -125,7 +125,7 @@ def test_of_predictions_without_a_law_it_is_said_that_nothing_decides_and_how_ma
     assert rule is not None and rule.chance > rule.p_value_limit == 0.01
     assert f"right in {rule.right} of {rule.total}" in said
     assert rule.rows is None or (
-        rule.rows > 600 and f"About {rule.rows:,} rows with these shares would tell it" in said
+        rule.rows > 600 and f"About {rule.rows:,} rows with these fractions would make it significant" in said
     )
     assert all(one.interval[0] == 0.0 < one.interval[1] < 0.05 for one in kept.importance)
 

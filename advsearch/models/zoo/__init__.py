@@ -1,9 +1,9 @@
-"""Networks by the name that a library gives them: ``torchvision:resnet50``,
-``timm:resnet50``, ``hf:OWNER/REPOSITORY``.
+"""Load networks of libraries by name: ``torchvision:resnet50``, ``timm:resnet50``,
+``hf:OWNER/REPOSITORY``.
 
-Each library is imported when one of its networks is asked for, and not before. It
-brings the weights, as it does for anybody: from its cache on this machine, else from
-where it publishes them. They are read without unpickling.
+A library is imported only if one of its networks is requested. It loads the weights
+from its cache on this machine, or else downloads them from where it publishes them.
+They are read without unpickling.
 """
 
 from __future__ import annotations

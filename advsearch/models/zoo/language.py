@@ -1,6 +1,6 @@
-"""Networks that read a picture and a text and go on in words, as LLaVA and Qwen-VL do.
+"""Networks that continue an image and a text with text, such as LLaVA and Qwen-VL.
 
-They are classifiers of names that are given, or answer freely.
+They choose one of the names that the user states, or answer freely.
 """
 
 from __future__ import annotations
@@ -29,20 +29,21 @@ from advsearch.models.zoo.library import (
 )
 from advsearch.models.zoo.zero_shot import get_spoken_names
 
-LEVELS = 0.05
-"""What values of pixels may be off from the processor's for 8-bit pictures, as a share
-of the largest: it rounds.
+PIXEL_TOLERANCE = 0.05
+"""Maximum difference of pixel values from those that the processor computes for an
+8-bit image, relative to the largest of these: the processor rounds.
 """
 
 # Continuation by which a network that answers freely is checked.
 CHECK_TEXT = "a coffee mug"
-# Minimum number of weights for a remark on them and on the time of an answer.
+# Minimum number of weights for a warning about memory and time.
 MIN_LARGE_WEIGHTS = 500_000_000
 
 
 def generates_text(architecture: str, network: Any) -> bool:
-    """Whether a network of transformers, by its architecture, continues images and
-    texts with text.
+    """Return whether an architecture of transformers continues images and texts.
+
+    Only its name is used.
     """
     transformers: Any = sys.modules["transformers"]
     names = transformers.models.auto.modeling_auto.MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING_NAMES
@@ -50,17 +51,17 @@ def generates_text(architecture: str, network: Any) -> bool:
 
 
 def make_language_source(loaded: LoadedNetwork) -> models.Source:
-    """Return the source of a network that reads an image and goes on in words.
+    """Return the source of a network that continues an image and a text with text.
 
-    It chooses one of the names that the user gave, or answers freely.
+    It chooses one of the names that the user states, or answers freely.
 
     Raises:
         ModelError: the network is an encoder-decoder, its processor cannot be loaded,
             or its own likelihoods differ from those computed here.
-        InputError: fewer than two names, or prompt and name are too long.
+        InputError: there are fewer than two names, or prompt and name are too long.
     """
     if getattr(loaded.network.config, "is_encoder_decoder", False):
-        raise _make_unsupported_error(loaded, "reads from an encoder of its own")
+        raise _make_unsupported_error(loaded, "has a separate encoder")
     processor = _load_processor(loaded)
     purpose = loaded.purpose
     name = loaded.name
@@ -70,11 +71,11 @@ def make_language_source(loaded: LoadedNetwork) -> models.Source:
         _check_has_choice(names, name)
     kind = type(loaded.network).__name__
     with models.translate_errors(
-        f"model {loaded.spec}: is a {kind}, which can't be asked about "
-        "a picture as LLaVA can"
+        f"model {loaded.spec}: is a {kind}, which cannot be questioned about "
+        "an image as LLaVA can"
     ):
         reader = _LanguageModel(loaded, processor, question or models.QUESTION)
-        # Likelihoods are checked by any text if there are no names.
+        # Without names, likelihoods are checked with another text.
         tokens = reader.tokenize_names(names or (CHECK_TEXT,))
         max_new_tokens = max(purpose.tokens if is_free else 0, *map(len, tokens))
         _check_length(loaded, reader, max_new_tokens)
@@ -99,7 +100,7 @@ def make_language_source(loaded: LoadedNetwork) -> models.Source:
 
 
 def _check_has_choice(names: Sequence[str] | None, model_name: str) -> None:
-    """Raise InputError for fewer than two names, of which none could be chosen."""
+    """Raise InputError if there are fewer than two names to choose from."""
     if names is None or len(names) < 2:
         raise InputError(
             "labels: expected two names at least, such as mug,cup,bowl, of which "
@@ -110,8 +111,11 @@ def _check_has_choice(names: Sequence[str] | None, model_name: str) -> None:
 
 
 def _load_processor(loaded: LoadedNetwork) -> Any:
-    """Load the processor of images and texts; the error names torchvision if it may be
-    missing for it.
+    """Load the processor of images and texts.
+
+    Raises:
+        ModelError: it cannot be loaded. Most processors need torchvision: the message
+            names it if it is not installed.
     """
     try:
         return loaded.load_part("AutoProcessor")
@@ -140,9 +144,8 @@ def _check_length(
     """
     config = loaded.network.config.get_text_config()
     max_tokens = getattr(config, "max_position_embeddings", None)
-    n_tokens = (
-        reader.get_prompt(reader.image_size)["input_ids"].shape[1] + max_new_tokens
-    )
+    prompt = reader.get_prompt(reader.image_size)
+    n_tokens = prompt["input_ids"].shape[1] + max_new_tokens
     if isinstance(max_tokens, int) and n_tokens > max_tokens:
         raise InputError(
             f"prompt: expected picture, prompt and name to have at most {max_tokens} "
@@ -172,7 +175,7 @@ def _warn_of_prefixes(
             models.warn(
                 f"model {model_name} reads {names[first]!r} (#{first}) as the "
                 f"beginning of {names[second]!r} "
-                f"(#{second}): whoever says the second has said the first"
+                f"(#{second}): an answer with the second begins with the first"
             )
             return
 
@@ -183,16 +186,22 @@ def _warn_of_prefixes(
 class _LanguageModel(nn.Module):
     """A network that reads an image and a question, and continues with text.
 
-    `preprocessing` is its `Preprocessing`. A processor that is an affine map is
-    measured and left to that; one that cuts an image into patches or tiles is called
-    itself, which is differentiable with torchvision.
+    If its image processor is an affine map of pixel values, the map is measured and
+    `Preprocessing` applies it. A processor that cuts an image into patches or tiles is
+    called itself, which is differentiable with torchvision.
+
+    Attributes:
+        preprocessing: fields of `Preprocessing`.
+        cache_name: name of the cache of keys and values, among the network's arguments
+            and in its output.
+        is_affine: whether the image processor is an affine map.
     """
 
     def __init__(self, loaded: LoadedNetwork, processor: Any, question: str) -> None:
         """Prepare prompt and preprocessing for a network.
 
         Args:
-            loaded: the network, with what belongs to it.
+            loaded: the network, with its name and its repository.
             processor: processor of images and texts.
             question: question about each image.
 
@@ -204,7 +213,7 @@ class _LanguageModel(nn.Module):
         self.processor = processor
         parameters = inspect.signature(loaded.network.forward).parameters
         # `past_key_values` is the older name.
-        self.cache = "cache" if "cache" in parameters else "past_key_values"
+        self.cache_name = "cache" if "cache" in parameters else "past_key_values"
         # by image size, see `get_prompt`
         self._prompts: dict[tuple[int, int], dict[str, Tensor]] = {}
         self.text = _make_prompt_text(processor, question)
@@ -220,17 +229,16 @@ class _LanguageModel(nn.Module):
         self._check_pixels(loaded.spec)
 
     def _check_pixels(self, spec: str) -> None:
-        """Check that a floating-point image gives the same input as the image in 8
-        bits.
+        """Check that a floating-point image gives the same pixel values as in 8 bits.
 
         Raises:
             ModelError: the processor treats them differently.
         """
         height, width = self.image_size
+        # A test image (3, H, W) from 0 to 255, with a different ramp in each channel.
         vertical = torch.linspace(0, 200, height)[:, None].expand(height, width)
         horizontal = torch.linspace(0, 200, width).expand(height, width)
-        # A different gradient in each channel, (3, H, W).
-        diagonal = (vertical + horizontal) / 4 + 100
+        diagonal = (vertical + horizontal) / 4 + 100  # from 100 to 200
         levels = torch.stack([vertical, horizontal, diagonal]).round()
         image_8bit = np.ascontiguousarray(levels.byte().permute(1, 2, 0).numpy())
         expected = self._process(image_8bit)["pixel_values"]
@@ -245,19 +253,21 @@ class _LanguageModel(nn.Module):
         max_error = float("inf")
         if pixels.shape == expected.shape:
             max_error = float((pixels - expected).abs().max())
-        if not max_error <= LEVELS * float(expected.abs().max()):
+        is_accurate = max_error <= PIXEL_TOLERANCE * float(expected.abs().max())
+        if not is_accurate:  # also if the error is NaN
             raise errors.ModelError(
-                f"model {spec}: its processor {type(self.processor).__name__} does "
-                "something else to numbers than to 8-bit pictures. Wrap network and "
-                "processing in an nn.Module of yours, and give that from Python"
+                f"model {spec}: its processor {type(self.processor).__name__} treats "
+                "floating-point images differently from 8-bit images. Wrap network and "
+                "processor in an nn.Module, and pass that from Python"
             )
 
     def _process(self, image: Any, text: str = "", **options: Any) -> dict[str, Tensor]:
-        """Return the network's inputs for an image and a text, by default the question.
+        """Return the network's inputs for an image and a text.
 
-        Inputs for training are left out.
+        The default text is the question. Inputs for training are left out.
         """
-        with warnings.catch_warnings():  # of how the library reads arrays
+        # The library may warn about the way in which it reads arrays.
+        with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             processed = self.processor(
                 images=[image],
@@ -280,20 +290,24 @@ class _LanguageModel(nn.Module):
     def tokenize_names(self, names: Sequence[str]) -> list[list[int]]:
         """Return the tokens of each name as they follow the prompt.
 
-        They are the tokens of prompt and name minus those of the prompt. If the text
-        does not begin with the prompt's tokens, as a processor may end a text with a
-        newline, they are those of the name alone.
+        In general, prompt and name are tokenized together, and the tokens of the prompt
+        are removed from the beginning. Where the result does not begin with these, such
+        as for a processor that ends each text with a newline, the name is tokenized
+        alone.
 
         Raises:
             InputError: the network has no token for a name.
         """
         words = get_spoken_names(names)
-        gap = self._find_gap()
-        can_extend_prompt = self._keeps_prompt(f"{gap}{words[0]}")
+        separator = self._find_separator()
+        # The processor adds the same tokens at the end of each text, if any: the first
+        # word is enough to find out.
+        processor_keeps_prompt = self._keeps_prompt(f"{separator}{words[0]}")
         tokens_of_names: list[list[int]] = []
         for word in words:
-            tokens = self._tokenize_after_prompt(f"{gap}{word}")
-            if tokens is None or not can_extend_prompt:
+            # None if the tokenizer joins the end of the prompt with this word.
+            tokens = self._tokenize_after_prompt(f"{separator}{word}")
+            if tokens is None or not processor_keeps_prompt:
                 tokens = self.processor.tokenizer(word, add_special_tokens=False)[
                     "input_ids"
                 ]
@@ -305,9 +319,10 @@ class _LanguageModel(nn.Module):
             tokens_of_names.append(tokens)
         return tokens_of_names
 
-    def _find_gap(self) -> str:
-        """Return what separates the prompt from a name: a space, or nothing if the
-        prompt ends with white space or with a special token.
+    def _find_separator(self) -> str:
+        """Return the text between the prompt and a name.
+
+        It is a space, or "" if the prompt ends with white space or a special token.
         """
         prompt_tokens = self._get_prompt_tokens()
         ends_with_special = (
@@ -316,15 +331,16 @@ class _LanguageModel(nn.Module):
         return "" if self.text[-1:].isspace() or ends_with_special else " "
 
     def _keeps_prompt(self, text: str) -> bool:
-        """Return whether the processor's tokens for prompt and text begin with those
-        for the prompt: it may add tokens at the end.
+        """Return whether tokens of prompt and text begin with the tokens of the prompt.
+
+        They do not if the processor adds a token at the end of each text.
         """
         prompt_tokens = self._get_prompt_tokens()
         inputs = self._process(_make_gray_image(self.image_size), f"{self.text}{text}")
         return inputs["input_ids"][0].tolist()[: len(prompt_tokens)] == prompt_tokens
 
     def _get_prompt_tokens(self) -> list[int]:
-        """Return the tokens of the prompt, those of an image included."""
+        """Return the tokens of the prompt, including those of an image."""
         tokens: list[int] = self.get_prompt(self.image_size)["input_ids"][0].tolist()
         return tokens
 
@@ -343,8 +359,10 @@ class _LanguageModel(nn.Module):
         return all_tokens[len(prompt_tokens) :]
 
     def get_prompt(self, image_size: tuple[int, int]) -> dict[str, Tensor]:
-        """Return the network's inputs for a gray image of (height, width) pixels and
-        the question.
+        """Return the network's inputs for a gray image and the question.
+
+        Args:
+            image_size: (height, width) in pixels.
         """
         if image_size not in self._prompts:
             self._prompts[image_size] = self._process(_make_gray_image(image_size))
@@ -373,44 +391,53 @@ class _LanguageModel(nn.Module):
         """Run the network on an image and the prompt.
 
         Returns:
-            The logits (tokens,) float32 of the next token, and the cache of keys and
-            values.
+            The logits (vocabulary,), float32, of the next token; and the cache of keys
+            and values, which `continue_with` takes.
 
         Raises:
             ValueError: the network returns no cache.
         """
         returned = self.network(**self.make_inputs(image), use_cache=True)
-        past = returned.get(self.cache)
+        past = returned.get(self.cache_name)
         if past is None:
-            raise ValueError("it keeps no keys and values of what it has read")
+            raise ValueError("it returns no cache of keys and values")
         return returned.logits[0, -1].float(), past
 
     def continue_with(self, tokens: Tensor, past: Any) -> Tensor:
-        """Return the logits (N, L, tokens) float32 of the token after each of N x L
-        tokens.
+        """Continue the text after an image with N alternatives of L tokens each.
 
-        `past` is the cache of one image.
+        The cache is changed: afterwards it has N rows, which include these tokens.
+
+        Args:
+            tokens: (N, L) tokens.
+            past: cache of keys and values of one image and the text so far.
+
+        Returns:
+            The logits (N, L, vocabulary), float32, of the token after each token.
         """
-        # one copy of the cache for each row of tokens
+        # one row of the cache for each alternative, in place
         past.batch_repeat_interleave(len(tokens))
         logits: Tensor = self.network(
-            input_ids=tokens, use_cache=True, **{self.cache: past}
+            input_ids=tokens, use_cache=True, **{self.cache_name: past}
         ).logits.float()
         return logits
 
 
 class _NameClassifier(nn.Module):
-    """Compute logits (N, names): the log-likelihood of each name after image and
-    prompt.
+    """Compute logits (N, names): the log-likelihood of each name after the prompt.
 
-    It is summed over the tokens of the name. Image and prompt are read once. The stem
-    of a name (all of its tokens but the last) is read after them, once for all names
-    that begin with it, and all stems in one batch: names of one token need no further
-    step.
+    The log-likelihood of a name is the sum over its tokens. Image and prompt are read
+    once. Then the stem of each name, all of its tokens but the last, is read: once for
+    all names that begin with it, and all stems in one batch. If all names have a single
+    token, this second step is left out.
     """
 
     def __init__(self, reader: _LanguageModel, tokens: Sequence[Sequence[int]]) -> None:
-        """Prepare the tables of tokens that `forward` reads likelihoods by.
+        """Prepare stems, and the indices of the likelihoods of each name.
+
+        `forward` computes a table of log-likelihoods of the next token. It has a column
+        for each token of the vocabulary. Its first row follows the prompt. After it,
+        each token of each stem has a row; all stems are padded to the same length.
 
         Args:
             reader: the network.
@@ -421,38 +448,45 @@ class _NameClassifier(nn.Module):
         self.tokens = [list(name_tokens) for name_tokens in tokens]
         stems = _find_stems(self.tokens)
         stem_length = max(map(len, stems), default=0)
-        # `forward` makes a table of log-likelihoods: a column for each token of the
-        # vocabulary; row 0 is after the prompt, and each token of each stem has a row.
-        # For each token of each name, (names, longest name): its row and column there,
-        # and 1, or 0 where a name is shorter.
-        rows = torch.zeros((len(tokens), max(map(len, tokens))), dtype=torch.long)
+        longest_name = max(map(len, tokens))
+        # For each token of each name: its row and column in the table, and 1. Shorter
+        # names are padded with 0.
+        rows = torch.zeros((len(tokens), longest_name), dtype=torch.long)
         columns = torch.zeros_like(rows)
         is_token = torch.zeros_like(rows)
         for index, name_tokens in enumerate(self.tokens):
-            first_stem_row = 1 + _find_stem(stems, name_tokens[:-1]) * stem_length
+            stem_index = _find_stem(stems, name_tokens[:-1])
+            first_stem_row = 1 + stem_index * stem_length
             for position, token in enumerate(name_tokens):
-                # the first token follows the prompt, any other the token before it
+                # The first token follows the prompt (row 0). Any other token follows
+                # the token before it, which is in the stem.
                 if position > 0:
                     rows[index, position] = first_stem_row + position - 1
                 columns[index, position] = token
                 is_token[index, position] = 1
-        padded_stems = torch.tensor(
-            [[*stem, *[0] * (stem_length - len(stem))] for stem in stems]
-        ).long()
-        self._token_tables = padded_stems, rows, columns, is_token
+        padded_stems = [[*stem, *[0] * (stem_length - len(stem))] for stem in stems]
+        # (stems, stem length), and three times (names, longest name); see `forward`
+        self._stems = torch.tensor(padded_stems).long()
+        self._rows = rows
+        self._columns = columns
+        self._is_token = is_token
 
     def forward(self, images: Tensor) -> Tensor:
         """Return the log-likelihoods (N, names) for images (N, 3, H, W)."""
-        stems, rows, columns, is_token = (
-            tensor.to(images.device) for tensor in self._token_tables
-        )
+        stems = self._stems.to(images.device)
+        # Row and column of each token of each name in the table below, and whether
+        # there is a token: shorter names are padded.
+        rows = self._rows.to(images.device)
+        columns = self._columns.to(images.device)
+        is_token = self._is_token.to(images.device)
         scores = []
         for image in images:
             logits, past = self.reader.read_prompt(image)
-            # (1 + stems * stem length, tokens) log-likelihoods of the next token, after
-            # the prompt and after each token of each stem
+            # Table (1 + stems * stem length, vocabulary) of log-likelihoods of the next
+            # token: after the prompt, and after each token of each stem.
             likelihoods = logits.log_softmax(dim=-1)[None]
             if len(stems):
+                # `past` is used only once, so that it may be changed.
                 stem_logits = self.reader.continue_with(stems, past)
                 stem_likelihoods = stem_logits.log_softmax(dim=-1).flatten(0, 1)
                 likelihoods = torch.cat([likelihoods, stem_likelihoods])
@@ -461,8 +495,9 @@ class _NameClassifier(nn.Module):
 
 
 def _make_prompt_text(processor: Any, question: str) -> str:
-    """Return the question with a placeholder for the image, in the form of a chat if
-    the network was trained on chats.
+    """Return the question with a placeholder for the image.
+
+    It has the form of a chat if the network was trained on chats.
     """
     if getattr(processor, "chat_template", None):
         content = [{"type": "image"}, {"type": "text", "text": question}]
@@ -473,7 +508,7 @@ def _make_prompt_text(processor: Any, question: str) -> str:
 
 
 def _read_image_size(config: Any) -> tuple[int, int]:
-    """Return (height, width) of images, of a network's ``config`` or the default."""
+    """Return the image size (height, width) of a network's ``config``, or a default."""
     vision_config = getattr(config, "vision_config", None)
     size = getattr(vision_config, "image_size", None) or models.DEFAULT_SIZE
     height, width = size if isinstance(size, (list, tuple)) else (size, size)
@@ -485,7 +520,7 @@ def _measure_affine_processor(
 ) -> Processing | None:
     """Return size, mean and standard deviation of a processor of images and texts.
 
-    None if it does more to an image than a gain and an offset.
+    None if it does more to an image than to apply a gain and an offset.
     """
     with suppress(errors.ModelError):
         processing = measure_processor(
@@ -497,9 +532,7 @@ def _measure_affine_processor(
 
 
 def _check_torchvision_installed(spec: str) -> None:
-    """Raise ModelError if the processor of a network needs torchvision, which is not
-    installed.
-    """
+    """Raise ModelError if torchvision is not installed, which a processor needs."""
     if importlib.util.find_spec("torchvision") is None:
         raise errors.ModelError(
             f"model {spec}: its processor cuts pictures into patches or tiles, and "
@@ -509,14 +542,14 @@ def _check_torchvision_installed(spec: str) -> None:
 
 
 def _make_gray_image(size: tuple[int, int]) -> npt.NDArray[np.uint8]:
-    """Return a gray image (height, width, 3), for which any image may be put in."""
+    """Return a gray image (height, width, 3), as a placeholder for any other image."""
     return np.full((*size, 3), 128, np.uint8)
 
 
 def _find_stem(stems: Sequence[Sequence[int]], prefix: Sequence[int]) -> int:
     """Return the index of the first stem (tokens) that begins with a prefix.
 
-    0 if there is none, as for a name of one token without any stems.
+    0 if there is none: then the name has one token, and the result is not used.
     """
     for index, stem in enumerate(stems):
         if list(stem[: len(prefix)]) == list(prefix):
@@ -525,8 +558,9 @@ def _find_stem(stems: Sequence[Sequence[int]], prefix: Sequence[int]) -> int:
 
 
 def _find_stems(tokens: Sequence[Sequence[int]]) -> list[tuple[int, ...]]:
-    """Return the stems of names, all of their tokens but the last, sorted, without
-    those that are a prefix of another stem.
+    """Return the stems of names (all of their tokens but the last), sorted.
+
+    Stems that are a prefix of another stem are left out.
     """
     stems = {tuple(name_tokens[:-1]) for name_tokens in tokens if len(name_tokens) > 1}
     return sorted(
@@ -537,9 +571,10 @@ def _find_stems(tokens: Sequence[Sequence[int]]) -> list[tuple[int, ...]]:
 
 
 class _FreeAnswerer(nn.Module):
-    """Answer freely about each image, by greedy decoding: always the likeliest token.
+    """Answer freely about each image, by greedy decoding.
 
-    The outputs are `advsearch.tasks.answers.AnswerWithLogits`.
+    Each next token is the most likely one. The outputs are
+    `advsearch.tasks.answers.AnswerWithLogits`.
     """
 
     def __init__(self, reader: _LanguageModel, max_tokens: int) -> None:
@@ -553,7 +588,7 @@ class _FreeAnswerer(nn.Module):
         self.reader = reader
         self.tokenizer = reader.processor.tokenizer
         self.max_tokens = max_tokens
-        # a token, several, or None
+        # one token, a list of tokens, or None
         end_tokens = reader.network.generation_config.eos_token_id
         if not isinstance(end_tokens, (list, tuple)):
             end_tokens = [end_tokens]
@@ -562,9 +597,10 @@ class _FreeAnswerer(nn.Module):
     def forward(self, images: Tensor) -> list[dict[str, Any]]:
         """Return the answer about each of images (N, 3, H, W).
 
-        Each has its text; the logits (n, tokens) that its n tokens were chosen by; and
-        a function from a word to the tokens that it may begin with. It ends after an
-        end token, or after `max_tokens`.
+        An answer of n tokens is a mapping with its "text"; the "logits" (n, vocabulary)
+        from which the tokens were chosen; and under "begins" a function from a word to
+        the tokens that may begin it. An answer ends with an end token, or after
+        `max_tokens`.
         """
         answers = []
         for image in images:
@@ -572,7 +608,9 @@ class _FreeAnswerer(nn.Module):
             logits_of_steps = [next_logits]
             tokens = [int(next_logits.argmax())]
             while tokens[-1] not in self.end_tokens and len(tokens) < self.max_tokens:
-                last_token = next_logits.new_tensor([tokens[-1:]], dtype=torch.long)
+                # one alternative of one token, (1, 1)
+                last_token = next_logits.new_tensor([[tokens[-1]]], dtype=torch.long)
+                # This also adds the token to the cache `past`.
                 next_logits = self.reader.continue_with(last_token, past)[0, -1]
                 logits_of_steps.append(next_logits)
                 tokens.append(int(next_logits.argmax()))
@@ -587,8 +625,9 @@ class _FreeAnswerer(nn.Module):
         return answers
 
     def find_first_tokens(self, word: str) -> list[int]:
-        """Return the tokens that may begin a word, in lower case or capitalized, with
-        or without a space before it.
+        """Return the tokens that may begin a word.
+
+        The word may be as it is or capitalized, with or without a space before it.
         """
         first_tokens: set[int] = set()
         for form in {word, word.capitalize(), f" {word}", f" {word.capitalize()}"}:
@@ -605,17 +644,19 @@ class _FreeAnswerer(nn.Module):
 def _append_tokens(prompt: Mapping[str, Tensor], tokens: Tensor) -> dict[str, Tensor]:
     """Return the inputs of a network for a prompt that tokens (n,) follow.
 
-    Masks and types, which the prompt has for each of its tokens, are extended.
+    Masks and types, which the prompt has for each of its tokens, are extended: all new
+    tokens are attended to, and have the type of text.
     """
     inputs = dict(prompt)
     inputs["input_ids"] = torch.cat([prompt["input_ids"], tokens[None]], dim=1)
     for key in ("attention_mask", "mm_token_type_ids", "token_type_ids"):
         if key in prompt:
-            # In most networks type 1 is the image, but in PaliGemma, which marks
-            # nothing before, it is the answer.
-            is_answer = key == "token_type_ids" and not prompt[key].any()
-            is_attended = key == "attention_mask"
-            value = 1 if is_attended or is_answer else 0
+            # In most networks type 1 means image, and 0 means text. PaliGemma is an
+            # exception: all tokens of its prompt, the image too, have type 0 in
+            # `token_type_ids`, and type 1 means answer.
+            marks_answer = key == "token_type_ids" and not prompt[key].any()
+            is_mask = key == "attention_mask"
+            value = 1 if is_mask or marks_answer else 0
             extension = torch.full_like(tokens, value)[None]
             inputs[key] = torch.cat([prompt[key], extension], dim=1)
     return inputs
@@ -624,8 +665,8 @@ def _append_tokens(prompt: Mapping[str, Tensor], tokens: Tensor) -> dict[str, Te
 def _check_likelihood(loaded: LoadedNetwork, module: _NameClassifier) -> None:
     """Compare the likelihood of the longest name with that of the network itself.
 
-    The latter reads image, prompt and name at once, where `_NameClassifier` reads them
-    in parts and keeps what it has read.
+    The network itself reads image, prompt and name at once. `_NameClassifier` reads
+    them in two steps, with a cache.
 
     Raises:
         ModelError: they differ.
@@ -642,7 +683,8 @@ def _check_likelihood(loaded: LoadedNetwork, module: _NameClassifier) -> None:
         raise _make_unsupported_error(
             loaded, "returns logits of another length than the text has"
         )
-    # the logits at a position are those of the next token
+    # The logits at a position are those of the next token: so the logits for the name
+    # begin one position before it.
     likelihoods = logits[0, -len(name_tokens) - 1 : -1].float().log_softmax(dim=-1)
     expected = likelihoods.gather(1, name_tokens[:, None]).sum().double()
     computed = module(image[None])[0, index].double()
@@ -650,15 +692,20 @@ def _check_likelihood(loaded: LoadedNetwork, module: _NameClassifier) -> None:
     if not are_nearly_equal(expected, computed, size, loaded.network.dtype):
         raise _make_unsupported_error(
             loaded,
-            "goes on otherwise after what it has kept "
+            "computes another likelihood with its cache than without "
             f"({computed:.6g} for {expected:.6g})",
         )
 
 
 def _make_unsupported_error(loaded: LoadedNetwork, what: str) -> errors.ModelError:
-    """Return the error for a network that is none of those read here."""
+    """Return the error for a network that cannot be used here.
+
+    Args:
+        loaded: the network.
+        what: what it does, such as "has a separate encoder".
+    """
     return errors.ModelError(
         f"model {loaded.spec}: is a {type(loaded.network).__name__}, which {what}; "
-        "expected one that goes on with the text it is given, such as "
+        "expected one that continues its input text, such as "
         "LlavaForConditionalGeneration or Qwen2_5_VLForConditionalGeneration"
     )

@@ -1,9 +1,8 @@
-"""What the libraries of networks have in common: they may be absent, and their weights
-may be out of reach.
+"""What the sources of library networks share: errors, and the preprocessing of images.
 
-What an image processor of transformers does to a picture is measured, because its class
-may overrule what its files say. One that no size, mean and standard deviation stand for
-is called, inside the differentiable function.
+The effect of an image processor of transformers is measured, because its class may
+override what its files state. A processor that cannot be replaced by a size, a mean and
+a standard deviation is called as a part of the differentiable function.
 """
 
 from __future__ import annotations
@@ -29,13 +28,14 @@ from advsearch.extend import errors, models
 def report_library_errors(spec: str, advice: str) -> Iterator[None]:
     """Turn what a library raises while it loads a model's weights into a ModelError.
 
-    Its message has `advice` on what else the user may give. Nothing is unpickled, and
-    nothing is fetched for a model that only a file names.
+    The message ends with `advice` on what the user may set instead. Nothing is
+    unpickled, and nothing is fetched for a model that only a file names.
     """
     disabled_before = logging.root.manager.disable
-    # Failed tries to connect are logged: an error is raised in the end anyway.
+    # Libraries log failed connections. This is not needed: an error is raised in the
+    # end.
     logging.disable(logging.WARNING)
-    # connections that were not allowed, and made none
+    # connections that were not allowed, and therefore not made
     rejected_connections: list[object] = []
     try:
         with (
@@ -49,7 +49,7 @@ def report_library_errors(spec: str, advice: str) -> Iterator[None]:
             yield
     except errors.ModelError:
         raise
-    # a library raises nearly anything for what is not there or damaged
+    # Libraries raise many types of errors for missing and corrupt files.
     except Exception as error:
         if rejected_connections:
             raise models.CodeNotAllowedError(
@@ -69,14 +69,18 @@ def report_library_errors(spec: str, advice: str) -> Iterator[None]:
 Array = npt.NDArray[np.float64]
 Color = tuple[int, int, int]  # red, green, blue, from 0 to 255
 
-PROBE_SIZES = (96, 160)  # in pixels, of the square pictures that a processor is shown
-# of the range of a processor's outputs: what it may be off from an affine map
+# Sizes in pixels of the square images with which a processor is measured.
+PROBE_SIZES = (96, 160)
+# Maximum difference of a processor's output from that of an affine map, relative to its
+# range.
 TOLERANCE = 1e-3
-# maximum difference of a network's scores and those computed from its parts, relative
-ROUNDING = 1e-4
-# likewise, in units of the network's rounding (eps), for less than single precision
-ROUNDING_UNITS = 8.0
-# where a repository keeps its processor
+# Maximum relative difference between a network's scores and those that are computed
+# from its parts.
+SCORE_TOLERANCE = 1e-4
+# Likewise, in units of the machine epsilon of the network's dtype. It is the larger one
+# in half precision.
+SCORE_TOLERANCE_IN_EPS = 8.0
+# Files of a repository that describe its processor.
 FILES = ("preprocessor_config.json", "processor_config.json")
 
 
@@ -114,7 +118,7 @@ def find_cached_file(
     Args:
         transformers: the package.
         name: name of the repository or directory.
-        file: its name there.
+        file: name of the file in it.
         hub_options: arguments of `cached_file`, such as a revision.
     """
     path: str | None = transformers.utils.cached_file(
@@ -124,13 +128,14 @@ def find_cached_file(
 
 
 def measure_processor(processor: Any, spec: str) -> Processing:
-    """Measure size, mean, standard deviation and channel order of a transformers
-    processor.
+    """Measure the preprocessing of a transformers processor.
 
-    Images of a single color show gain and offset of each channel, whatever is resized
-    or cropped: with x in [0, 1], ``gain x + offset = (x - mean) / std``. The size is
-    that of the output for a square image. A processor that changes pixels otherwise is
-    returned, to be called, if a gradient goes through it.
+    The result has size, mean, standard deviation and channel order, if the processor is
+    an affine map of colors. These follow from images of a single color, which are the
+    same after resizing and cropping: with x in [0, 1],
+    ``gain x + offset = (x - mean) / std``. The size is that of the output for a square
+    image. The result for any other processor is a function that calls it, if it is
+    differentiable.
 
     Raises:
         ModelError: no gradient goes through it, or it pads images or cuts them into
@@ -145,12 +150,12 @@ def measure_processor(processor: Any, spec: str) -> Processing:
 
     black = process_color((0, 0, 0))
     processing = Processing()
-    # An output that is always as large as the input has no size of its own.
+    # If the size of the output depends on that of the input, there is no fixed size.
     if black.shape == process_color((0, 0, 0), PROBE_SIZES[1]).shape:
         processing["input_size"] = (black.shape[1], black.shape[2])
     offset = black.mean(axis=(1, 2))
     primaries = ((255, 0, 0), (0, 255, 0), (0, 0, 255))
-    # Rows are output channels, columns input channels.
+    # gains (3, 3): rows are output channels, columns input channels
     gains: Array = np.stack(
         [process_color(color).mean(axis=(1, 2)) - offset for color in primaries],
         axis=1,
@@ -173,8 +178,13 @@ def _predicts_grays(
     offset: Array,
     tolerance: float,
 ) -> bool:
-    """Return whether gains (3, 3) and offset (3,) predict the output for gray images,
-    everywhere in the image.
+    """Return whether an affine map predicts the output for gray images at every pixel.
+
+    Args:
+        process_color: returns the output (3, h, w) for an image of one color.
+        gains: (3, 3) gains of input channels (columns) in output channels (rows).
+        offset: (3,) output for black.
+        tolerance: maximum absolute error.
     """
     for level in (51, 128, 255):
         expected = offset + gains.sum(axis=1) * (level / 255.0)
@@ -187,11 +197,15 @@ def _predicts_grays(
 def _find_normalization(
     gains: Array, offset: Array, tolerance: float
 ) -> Processing | None:
-    """Return mean, standard deviation and channel order for gains (3, 3) of input
-    channels in output channels, and offsets (3,).
+    """Return the mean, standard deviation and channel order of an affine map of colors.
 
     None unless each output channel depends on one input channel only, in the order RGB
     or BGR, and grows with it.
+
+    Args:
+        gains: (3, 3) gains of input channels (columns) in output channels (rows).
+        offset: (3,) output for black.
+        tolerance: gains up to this one count as 0.
     """
     gain_of_order = {
         channels: np.diag(matrix)
@@ -227,8 +241,9 @@ def _run_processor(processor: Any, picture: Any, spec: str) -> Array:
 
 
 def _disable_resizing(processor: Any) -> Callable[..., Any]:
-    """Return a function that calls a processor with its resizing and cropping turned
-    off, for images of the right size.
+    """Return a function that calls a processor without resizing and cropping.
+
+    It is for images of the right size.
     """
     switches = ("do_resize", "do_center_crop")
     disabled = {name: False for name in switches if getattr(processor, name, None)}
@@ -238,16 +253,17 @@ def _disable_resizing(processor: Any) -> Callable[..., Any]:
 def _wrap_processor(
     processor: Any, spec: str, processing: Processing, what: str
 ) -> Processing:
-    """Return the processing that calls a processor on images of its size.
+    """Return the preprocessing that calls a processor on images of its size.
 
     Args:
-        processor: processor that is more than a gain and an offset.
+        processor: processor that does more than apply a gain and an offset.
         spec: specification of the model, for messages.
-        processing: processing with the size, if it is fixed.
+        processing: preprocessing with the size, if it is fixed.
         what: what the processor does, for messages.
 
     Raises:
-        ModelError: it ignores pixels, or no gradient goes through it.
+        ModelError: it ignores pixels, is not differentiable, or treats floating-point
+            images differently.
     """
     _check_reads_all_pixels(processor, spec)
     process = _disable_resizing(processor)
@@ -266,7 +282,7 @@ def _wrap_processor(
     image = torch.from_numpy(levels).float() / 255.0
     try:
         output, has_gradient = _call_with_gradient(call, image.movedim(2, 0)[None])
-    except Exception as error:  # a processor with numpy raises nearly anything
+    except Exception as error:  # a processor with numpy raises errors of many types
         advice = ""
         if getattr(processor, "backend", None) == "pil":
             advice = "; with torchvision installed, transformers takes one that may"
@@ -279,7 +295,7 @@ def _wrap_processor(
     max_error = np.inf
     if output.shape == (1, *expected.shape):
         max_error = np.abs(output.detach().double().numpy() - expected).max()
-    is_accurate = max_error <= TOLERANCE * np.ptp(expected)  # not if it is NaN
+    is_accurate = max_error <= TOLERANCE * np.ptp(expected)  # False for NaN
     if not has_gradient or not is_accurate:
         raise _make_processor_error(
             spec,
@@ -292,7 +308,7 @@ def _wrap_processor(
 def _call_with_gradient(
     call: Callable[[Tensor], Tensor], images: Tensor
 ) -> tuple[Tensor, bool]:
-    """Return the output for images, and whether it has a gradient that is not zero."""
+    """Return the output for images, and whether its gradient is not zero everywhere."""
     variable_images = images.requires_grad_()
     with torch.enable_grad():
         output = call(variable_images)
@@ -317,13 +333,19 @@ def _check_reads_all_pixels(processor: Any, spec: str) -> None:
 
 
 def _round_triple(numbers: Array) -> models.Triple:
-    """Round to what eight digits hold: a processor computes in float32."""
+    """Round to seven significant digits, since a processor computes in float32."""
     red, green, blue = (float(f"{number:.7g}") + 0.0 for number in numbers)
     return red, green, blue
 
 
 def _make_processor_error(spec: str, processor: Any, what: str) -> errors.ModelError:
-    """Return the error for a processor that cannot be used, with what it does."""
+    """Return the error for a processor that cannot be used.
+
+    Args:
+        spec: specification of the model.
+        processor: the processor.
+        what: what it does, as a clause.
+    """
     return errors.ModelError(
         f"model {spec}: its processor {type(processor).__name__} {what}, which no "
         "size, mean and std stand for. Wrap network and processing in an nn.Module of "
@@ -336,12 +358,12 @@ RunNetwork = Callable[[Any, Tensor], Any]
 
 
 class AdaptedNetwork(nn.Module):
-    """A network of a library, called as that library calls it.
+    """Call a network of a library on images (N, 3, H, W).
 
     Args:
         network: network of the library.
-        run_network: calls it on images (N, 3, H, W).
-        boxes: whether what it returns are boxes as corners in pixels.
+        run_network: calls the network as its library requires.
+        boxes: whether the output has boxes as corners in pixels.
     """
 
     def __init__(
@@ -358,15 +380,16 @@ class AdaptedNetwork(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class LoadedNetwork:
-    """A network of transformers, with what belongs to it.
+    """A network of transformers, with its processor and the purpose of loading it.
 
     Attributes:
         network: a `PreTrainedModel`.
         name: name of the model.
         spec: what the user wrote, for messages.
-        processor: processor of images; None if it has none.
-        load_part: loads another part by its class, such as "AutoTokenizer".
-        purpose: purpose of the network.
+        processor: processor of images; None if the network has none.
+        load_part: loads another part of the repository by its class, such as
+            "AutoTokenizer".
+        purpose: what the network is loaded for.
     """
 
     network: Any
@@ -380,36 +403,44 @@ class LoadedNetwork:
     def preprocessing(self) -> Processing:
         """The preprocessing of images.
 
-        Raises ModelError as `measure_processor`; warns if there is no image processor.
+        Raises ModelError like `measure_processor`; warns if there is no image
+        processor.
         """
         if self.processor is None:
             models.warn(
-                f"model {self.spec} comes without an image processor: pictures are "
-                "given as they are, RGB in [0, 1]. Say `mean`, `std` and `input_size` "
-                "of load_model if it wants them otherwise"
+                f"model {self.spec} comes without an image processor: images are not "
+                "changed, RGB in [0, 1]. Set `mean`, `std` and `input_size` of "
+                "load_model if it needs others"
             )
             return Processing()
         return measure_processor(self.processor, self.spec)
 
     @property
     def class_names(self) -> tuple[str, ...]:
-        """The names of its classes in its ``config``; none if transformers only numbers
-        them.
+        """The names of classes in the network's ``config``.
+
+        Empty if they are only numbers ("LABEL_0").
         """
         labels = getattr(self.network.config, "id2label", None) or {}
         names = tuple(str(labels[key]) for key in sorted(labels, key=int))
         return () if all(re.fullmatch(r"LABEL_\d+", name) for name in names) else names
 
     def get_sized_preprocessing(self, config: Any) -> Processing:
-        """Return the preprocessing, with the size in a part of the network's ``config``
-        if it has none.
+        """Return the preprocessing with an image size.
+
+        If the measured preprocessing has no size, it is that in the network's config.
+
+        Args:
+            config: ``config`` of the network, or a part of it such as
+                ``config.vision_config``; None if there is none.
         """
         size = getattr(config, "image_size", None)
         input_size = (size, size) if isinstance(size, int) else tuple(size or ())
-        processing = Processing()
+        default = Processing()
         if input_size:
-            processing["input_size"] = input_size
-        return Processing(**{**processing, **self.preprocessing})
+            default["input_size"] = input_size
+        # the later one takes precedence
+        return Processing(**{**default, **self.preprocessing})
 
     def make_source(
         self, run_network: RunNetwork, *, boxes: bool = False, **fields: Any
@@ -418,8 +449,9 @@ class LoadedNetwork:
 
         Args:
             run_network: calls the network on images (N, 3, H, W).
-            boxes: whether what it returns are boxes as corners in pixels.
-            **fields: fields of `Source`; they overrule the measured preprocessing.
+            boxes: whether the output has boxes as corners in pixels.
+            **fields: fields of `Source`; they take precedence over the measured
+                preprocessing.
         """
         return models.make_source(
             AdaptedNetwork(self.network, run_network, boxes=boxes),
@@ -430,7 +462,13 @@ class LoadedNetwork:
     def make_text_source(
         self, module: nn.Module, names: tuple[str, ...], dtype: torch.dtype
     ) -> models.Source:
-        """Return the source of a module made of the network and texts for names."""
+        """Return the source of a module that compares images with texts.
+
+        Args:
+            module: module that consists of the network and of texts for names.
+            names: names of classes.
+            dtype: dtype of the images.
+        """
         vision_config = getattr(self.network.config, "vision_config", None)
         return models.make_source(
             module,
@@ -445,26 +483,32 @@ class LoadedNetwork:
 def are_nearly_equal(
     expected: Tensor, computed: Tensor, size: float, dtype: torch.dtype
 ) -> bool:
-    """Return whether a network's scores and those computed from its parts are equal up
-    to rounding.
+    """Return whether two ways to compute a network's scores agree up to rounding.
 
     Args:
         expected: scores of the network itself.
-        computed: scores from its parts.
-        size: size of the numbers that are summed, which errors are relative to.
+        computed: scores that are computed from its parts.
+        size: magnitude of the numbers that are summed; errors are relative to it.
         dtype: dtype of the network.
     """
-    return bool(
-        (expected - computed).abs().max()
-        <= max(ROUNDING, ROUNDING_UNITS * torch.finfo(dtype).eps) * size
+    relative_tolerance = max(
+        SCORE_TOLERANCE, SCORE_TOLERANCE_IN_EPS * torch.finfo(dtype).eps
     )
+    max_difference = (expected - computed).abs().max()
+    return bool(max_difference <= relative_tolerance * size)
 
 
 def to_pixel_corners(boxes: Tensor, images: Tensor) -> Tensor:
-    """Convert boxes (N, K, 4), center and size as fractions of images (N, 3, H, W), to
-    corners x0, y0, x1, y1 in pixels.
+    """Convert boxes from center and size to corners in pixels.
+
+    Args:
+        boxes: (N, K, 4) center x, y, width and height, as fractions of the image.
+        images: (N, 3, H, W).
+
+    Returns:
+        (N, K, 4) corners x0, y0, x1, y1 in pixels.
     """
     height, width = images.shape[2:]
-    middle, size = boxes.split(2, dim=-1)
-    corners = torch.cat([middle - size / 2, middle + size / 2], dim=-1)
+    center, size = boxes.split(2, dim=-1)
+    corners = torch.cat([center - size / 2, center + size / 2], dim=-1)
     return corners * corners.new_tensor([width, height, width, height])

@@ -1,8 +1,8 @@
-"""Networks of transformers that return features (DINOv2, ViT, the half of CLIP that
-sees pictures) or by pixel.
+"""Networks of timm and torchvision, and networks of transformers with special outputs.
 
-For every pixel some say how far it is, as Depth Anything does, others masks and their
-classes: these, as Mask2Former, become segmenters by the class of each pixel.
+The latter return features (DINOv2, ViT, the image encoder of CLIP), depth (Depth
+Anything), or masks and their classes (Mask2Former), which are converted to scores of
+classes for each pixel.
 """
 
 from __future__ import annotations
@@ -28,26 +28,28 @@ from advsearch.models.zoo.library import (
 )
 
 TASK = "similarity"  # the task that compares features
-ENDINGS = ("Model", "ModelWithProjection")
+# Suffixes of the names of transformers' architectures without a head.
+HEADLESS_SUFFIXES = ("Model", "ModelWithProjection")
 # Names of the weights of a first token that stands for the full image.
 CLASS_TOKEN_NAMES = ("cls_token", "class_embedding", "class_token")
 
 
 def gives_features(architecture: str, network: Any) -> bool:
-    """Return whether a network of transformers gives features of an image, and has no
-    head.
+    """Return whether a network of transformers returns features of images.
+
+    Such a network has no head. Detectors without a head do not count.
 
     Args:
-        architecture: its name, such as Dinov2Model or CLIPVisionModelWithProjection.
+        architecture: name such as "Dinov2Model" or "CLIPVisionModelWithProjection".
         network: the network or its class; None for one that transformers does not have.
     """
     if (
         network is None
-        or not architecture.endswith(ENDINGS)
+        or not architecture.endswith(HEADLESS_SUFFIXES)
         or zero_shot.encodes_images_and_texts(network)
     ):
         return False
-    # Its decoder, which finds objects, may be given the output of its encoder.
+    # A network that can take `encoder_outputs` has a decoder, which finds objects.
     is_detector = (
         "encoder_outputs" in inspect.signature(network.forward).parameters
         or "Detr" in architecture
@@ -57,8 +59,13 @@ def gives_features(architecture: str, network: Any) -> bool:
 
 
 def make_no_classes_error(name: str, what: str) -> errors.ModelError:
-    """Return the error for a classifier that has features only; `what` it is: "is a
-    Dinov2Model".
+    """Return the error for a network without classes in a task that needs them.
+
+    The message advises the task `similarity`.
+
+    Args:
+        name: name of the model.
+        what: what the network is, such as "is a Dinov2Model".
     """
     return errors.ModelError(
         f"model {name}: {what}, which returns features and has no classes: use "
@@ -74,10 +81,12 @@ def make_feature_source(
 
     Args:
         loaded: the network.
-        plain: returns the source for other tasks; None if it has features only.
+        plain: makes the source for any other task; None if the network has only
+            features.
 
     Raises:
-        ModelError: it has no classes, or no features.
+        ModelError: the network has no classes, or no features.
+        InputError: there are prompts, which this task does not use.
     """
     if loaded.purpose.task != TASK:
         if plain is None:
@@ -104,8 +113,9 @@ def make_feature_source(
     )
 
     def compute_features(network: Any, images: Tensor) -> Any:
-        """Return the features (N, D) of images (N, 3, H, W), or else what the network
-        returns.
+        """Return the features (N, D) of images (N, 3, H, W).
+
+        If there are none, the network's own return value is returned.
         """
         reads_texts = zero_shot.encodes_images_and_texts(network)
         encode = network.get_image_features if reads_texts else network
@@ -125,7 +135,7 @@ def _find_backbone(network: Any, spec: str) -> Any:
     Raises ModelError if it has none.
     """
     backbone = network.base_model
-    # `base_model` is the network itself where transformers states no part.
+    # `base_model` is the network itself if transformers does not know its parts.
     if backbone is network:
         backbone = getattr(network, "vision_model", None)
     if backbone is None:
@@ -137,7 +147,7 @@ def _find_backbone(network: Any, spec: str) -> Any:
 
 DISPARITY = "relative disparity"
 METRIC = "metric depth"
-"""Kinds of values, of `advsearch.tasks.depth.KINDS`."""
+"""Kinds of depth values, as in `advsearch.tasks.depth.KINDS`."""
 
 BY_FAMILY = {
     "dpt": DISPARITY,
@@ -145,14 +155,16 @@ BY_FAMILY = {
     "zoedepth": METRIC,
     "glpn": METRIC,
 }
-"""The kind of a network whose ``config`` does not state it, by family: that of the
-first published weights.
+"""The kind of values of networks whose ``config`` does not state it, by family. It is
+that of the weights that were published first.
 """
 
 
 def make_depth_source(loaded: LoadedNetwork) -> models.Source:
-    """Return the source of a network that predicts depth: a mapping with values
-    (N, h, w) under their kind.
+    """Return the source of a network that predicts depth.
+
+    Its output is a mapping from the kind of values, such as "metric depth", to the
+    values (N, h, w).
     """
     config = loaded.network.config
     kind_of_type = {"relative": DISPARITY, "metric": METRIC}
@@ -166,8 +178,9 @@ def make_depth_source(loaded: LoadedNetwork) -> models.Source:
         """Return the values (N, h, w) under their kind for images (N, 3, H, W)."""
         if not is_padded:
             return {kind: network(pixel_values=images).predicted_depth}
-        # ZoeDepth takes images with a mirrored border, which its processor adds and its
-        # post-processing removes.
+        # ZoeDepth was trained on images with a mirrored border. Its processor in
+        # transformers adds a border of this size and resizes the result to the input
+        # size, and its post-processing cuts the border off.
         height, width = images.shape[2:]
         top = int(math.sqrt(height / 2.0) * 3.0)
         left = int(math.sqrt(width / 2.0) * 3.0)
@@ -196,16 +209,16 @@ SENTENCE = "the task is semantic"  # the text input of OneFormer
 def make_mask_source(loaded: LoadedNetwork) -> models.Source:
     """Return the source of a network that returns masks and their classes.
 
-    Its output is the logarithm of a score (N, classes, H, W) of each class at each
-    pixel of the input. The network has queries, each with a mask and with probabilities
-    of classes. The score of a class is a sum over queries: the probability that the
-    query is of that class, times the probability that the pixel is in its mask (Cheng
-    et al. 2021, arXiv 2107.06278, section 3.4, "semantic inference"). Masks are resized
-    where `post_process_semantic_segmentation` of each family does it: before or after
-    that sum.
+    The network has queries, each with a mask and with probabilities of classes. The
+    output of the source is the logarithm of a score (N, classes, H, W) of each class at
+    each pixel of the input. The score of a class is a sum over queries: the probability
+    that the query is of that class, times the probability that the pixel is in its mask
+    (Cheng et al. 2021, arXiv 2107.06278, section 3.4, "semantic inference"). Masks are
+    resized before or after that sum, as `post_process_semantic_segmentation` of each
+    family does it.
 
     Warns:
-        ModelWarning: what the scores are.
+        ModelWarning: always; it describes the scores, which are no logits.
     """
     models.warn(
         f"model {loaded.name} gives a pixel a score of each class, summed over its "
@@ -216,9 +229,7 @@ def make_mask_source(loaded: LoadedNetwork) -> models.Source:
     sentence = _tokenize_sentence(loaded) if family == "oneformer" else None
 
     def run_network(network: Any, images: Tensor) -> Tensor:
-        """Return the logarithms of scores (N, classes, H, W) for images (N, 3, H,
-        W).
-        """
+        """Return logarithms of scores (N, classes, H, W) for images (N, 3, H, W)."""
         size = (images.shape[2], images.shape[3])
         task_inputs = {}
         if sentence is not None:
@@ -240,7 +251,7 @@ def make_mask_source(loaded: LoadedNetwork) -> models.Source:
 
 
 def _tokenize_sentence(loaded: LoadedNetwork) -> Tensor:
-    """Return the tokens (1, L) of the text that OneFormer reads, filled up with 0."""
+    """Return the tokens (1, L) of the text that OneFormer reads, padded with 0."""
     tokens = loaded.load_part("AutoTokenizer")(
         [SENTENCE],
         return_tensors="pt",
@@ -255,14 +266,14 @@ def _tokenize_sentence(loaded: LoadedNetwork) -> Tensor:
 
 
 def load_timm(spec: str, purpose: models.Purpose) -> models.Source:
-    """Load ``timm:NAME[@weights.safetensors]``, by default with timm's pretrained
-    weights.
+    """Load ``timm:NAME[@weights.safetensors]``.
 
-    Size, normalization and labels are those of its pretrained weights.
+    By default it has timm's pretrained weights. Size, normalization and labels are
+    those of the pretrained weights in any case.
 
     Raises:
-        ModelError: timm is missing, its weights cannot be loaded, or the given ones do
-            not fit.
+        ModelError: timm is missing, its weights cannot be loaded, or the user's weights
+            do not fit.
         UnknownNameError: timm has no network of that name.
     """
     name, weights = models.split_weights(spec.partition(":")[2])
@@ -283,9 +294,14 @@ def load_timm_repository(
 ) -> models.Source:
     """Load the network of a repository, or of a directory, that timm has saved.
 
+    Args:
+        spec: what the user wrote, for messages.
+        name: name of the repository, or path of the directory.
+        revision: revision of the repository; "" for the newest.
+        purpose: what the network is loaded for.
+
     Raises:
-        ModelError: timm is missing, or the network cannot be loaded; `spec` is for
-            messages.
+        ModelError: timm is missing, or the network cannot be loaded.
     """
     timm = models.import_library("timm", spec, "timm")
     if Path(name).is_dir():
@@ -310,11 +326,11 @@ def find_timm_source(
 
 
 def make_wrapped_timm_source(loaded: LoadedNetwork) -> models.Source:
-    """Return the source of a network of timm inside a
-    `TimmWrapperForImageClassification` of transformers.
+    """Return the source of a network of timm that transformers has wrapped.
 
-    Preprocessing and names of classes are those in the ``config`` of transformers: they
-    may differ from timm's own. There are no labels if transformers only numbers them.
+    The wrapper is a `TimmWrapperForImageClassification`. Preprocessing and names of
+    classes are those in the ``config`` of transformers, which may differ from timm's.
+    There are no labels if they are only numbers there.
     """
     timm = models.import_library("timm", loaded.spec, "timm")
     network: Any = loaded.network
@@ -342,9 +358,9 @@ def _make_timm_source(
         timm: the library.
         module: the network.
         name: name of the model.
-        purpose: purpose of the network.
-        pretrained_config: replaces its ``pretrained_cfg``.
-        labels: names of classes, which replace timm's.
+        purpose: what the network is loaded for.
+        pretrained_config: replacement of its ``pretrained_cfg``.
+        labels: names of classes that take precedence over timm's.
     """
     needs_features = purpose.task == TASK
     has_head = module.num_classes > 0
@@ -358,6 +374,7 @@ def _make_timm_source(
     config = timm.data.resolve_model_data_config(module, **options)
 
     def compute_features(network: Any, images: Tensor) -> Any:
+        """Return the features (N, D) that the head turns into logits."""
         return network.forward_head(network.forward_features(images), pre_logits=True)
 
     network = module
@@ -375,8 +392,9 @@ def _make_timm_source(
 
 
 def _find_timm_names(timm: Any, module: Any) -> Sequence[str]:
-    """Return the names of the classes of a network of timm; empty if they are not known
-    or not as many as its classes.
+    """Return the names of the classes of a network of timm.
+
+    Empty if they are not known, or if their count is not that of the classes.
     """
     names = module.pretrained_cfg.get("label_names")
     if not names:
@@ -388,21 +406,20 @@ def _find_timm_names(timm: Any, module: Any) -> Sequence[str]:
 
 
 MAX_DETECTOR_BATCH = 4
-"""Maximum batch size of a detector: at 800 x 800 each image takes a gigabyte or two
-with its derivative.
+"""Maximum batch size of a detector: at 800 x 800 pixels, an image with its derivative
+takes one or two gigabytes.
 """
 
 
 def load_torchvision(spec: str) -> models.Source:
-    """Load ``torchvision:NAME[@weights.safetensors]``, by default with torchvision's
-    default weights.
+    """Load ``torchvision:NAME[@weights.safetensors]``.
 
-    Size, normalization and labels are those of the default weights, if torchvision has
-    them.
+    By default it has torchvision's default weights. Size, normalization and labels are
+    those of the default weights in any case, if torchvision has them.
 
     Raises:
         ModelError: torchvision is missing or broken, its weights cannot be loaded, the
-            given ones do not fit, or it is quantized or for videos.
+            user's weights do not fit, or the network is quantized or for videos.
         UnknownNameError: torchvision has no such network.
     """
     name, weights = models.split_weights(spec.partition(":")[2])
@@ -417,7 +434,8 @@ def load_torchvision(spec: str) -> models.Source:
             "torchvision network", name, models.find_near_names(name, known_names)
         )
     default = getattr(zoo.get_model_weights(name), "DEFAULT", None)
-    # Otherwise torchvision would fetch weights of the backbone, to be replaced.
+    # Without this option torchvision would fetch weights of the backbone, which are
+    # replaced afterwards. Classifiers have no such option.
     options = {} if name in classifiers else {"weights_backbone": None}
     with report_library_errors(spec, f"Give 'torchvision:{name}@weights.safetensors'"):
         module: nn.Module = zoo.get_model(
@@ -438,11 +456,15 @@ def load_torchvision(spec: str) -> models.Source:
 def _make_detector_source(
     module: nn.Module, name: str, default_fields: Mapping[str, Any]
 ) -> models.Source:
-    """Return the source of a detector of torchvision, which normalizes and resizes
-    images by itself.
+    """Return the source of a detector of torchvision.
 
-    Its size is the one to which it would resize a square image. `default_fields` are
-    those that its default weights state.
+    Such a detector normalizes and resizes images by itself. The input size is the one
+    to which it would resize a square image.
+
+    Args:
+        module: the detector.
+        name: name of the model.
+        default_fields: fields of the source that its default weights state.
     """
     fields = {
         **default_fields,
@@ -459,18 +481,19 @@ def _make_detector_source(
 
 
 def _find_detector_size(module: nn.Module) -> tuple[int, int] | None:
-    """Return the (height, width) to which a detector's transform resizes a square
-    image.
+    """Return the (height, width) to which a detector resizes a square image.
 
-    None if it does not state it.
+    None if its transform does not state the size.
     """
     transform = getattr(module, "transform", None)
     fixed_size = getattr(transform, "fixed_size", None)
     if fixed_size:
-        return int(fixed_size[1]), int(fixed_size[0])
+        width, height = fixed_size
+        return int(height), int(width)
     min_size = getattr(transform, "min_size", None)
     if not min_size:
         return None
+    # Of multiple sizes, torchvision uses the last one outside of training.
     size = int(min_size if isinstance(min_size, int) else min_size[-1])
     return size, size
 
@@ -485,17 +508,16 @@ def _check_reads_images(zoo: Any, name: str, spec: str) -> None:
 
 
 NOT_FOR_PICTURES = {
-    "video": "is made for videos, and pictures are what is given here; name a network "
-    "for pictures, or wrap it in an "
-    "nn.Module that makes a video of each picture and give that from Python",
-    "optical_flow": "compares two pictures of a video, and one at a time is given "
-    "here; name a network for one picture",
-    "quantization": "is quantised: it rounds as it runs, and no gradient goes through "
-    "it; name {plain}, which it was "
-    "made of, or give it from Python and search with a policy without gradients, such "
-    "as nes",
+    "video": "is made for videos, but gets images here; name a network for images, or "
+    "wrap it in an nn.Module that makes a video of each image, and pass that from "
+    "Python",
+    "optical_flow": "compares two images of a video, but gets one at a time here; "
+    "name a network for single images",
+    "quantization": "is quantized: it rounds, and no gradient goes through it; name "
+    "{plain}, of which it was made, or pass it from Python and search with a policy "
+    "without gradients, such as nes",
 }
-"""What torchvision's other networks are, by its module, and what to do about them."""
+"""Descriptions of torchvision's other networks by module, with advice, for messages."""
 
 
 def _run_detector(network: Any, images: Tensor) -> Any:
@@ -515,8 +537,8 @@ def _get_default_fields(
 
     Args:
         default: the weights; None if there are none.
-        classifier: network whose last layer the labels have to fit, or are left out;
-            None for a network that is no classifier.
+        classifier: network whose last layer the labels have to fit (they are left out
+            otherwise); None for a network that is no classifier.
     """
     mean, std = models.PRESETS["imagenet"]
     fields: dict[str, Any] = {"input_size": (224, 224), "mean": mean, "std": std}

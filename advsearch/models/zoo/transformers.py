@@ -1,5 +1,6 @@
-"""``hf:REPOSITORY``: networks of transformers, from the Hugging Face hub or a folder,
-in safetensors only.
+"""``hf:REPOSITORY``: networks of transformers, from the Hugging Face hub or a folder.
+
+Weights are read from safetensors only.
 """
 
 from __future__ import annotations
@@ -35,12 +36,13 @@ class Family(NamedTuple):
     """Networks of transformers that are loaded and called alike.
 
     Attributes:
-        matches: tells whether an architecture is of the family: a pattern in its name
-            (``DeiTForImageClassificationWithTeacher``), or a function of its name and
+        matches: which architectures belong to the family: a regular expression that is
+            found in their name ("ForImageClassification" in
+            "DeiTForImageClassificationWithTeacher"); or a function of the name and of
             the network or its class.
-        loader: suffix to AutoModel of the class that loads the network; None if that is
-            the class of the architecture.
-        source: makes the source of a model.
+        loader: suffix of the class that loads the network, "ForImageClassification" for
+            AutoModelForImageClassification; None for the class of the architecture.
+        source: makes the source of a network of the family.
     """
 
     matches: str | Callable[[str, Any], bool]
@@ -49,8 +51,8 @@ class Family(NamedTuple):
 
 
 HUB_TIMEOUT = 5.0
-"""Timeout in seconds of the hub's first response. Its client would retry each file for
-half a minute.
+"""Timeout in seconds of the hub's first response. Without it, the hub's client would
+try to fetch each file for half a minute.
 """
 
 ADVICE = (
@@ -60,20 +62,19 @@ ADVICE = (
 
 
 def load(spec: str, purpose: models.Purpose) -> models.Source:
-    """Load ``hf:REPOSITORY[@REVISION]`` or ``hf:FOLDER``: a network of one of
-    `NETWORKS`.
+    """Load ``hf:REPOSITORY[@REVISION]`` or ``hf:FOLDER``.
 
-    One that reads texts gets its classes from the user (`zero_shot`, `language`).
-    Labels of others are those that they were published with. Size, channel order and
-    normalization are measured on the image processor (`library.measure_processor`); a
-    ModelWarning reports if there is none. Code in a repository is never run, and
-    weights are read from safetensors alone. A repository that timm has saved is loaded
-    by timm.
+    The network belongs to one of the families in `NETWORKS`. If it reads texts, its
+    classes are the names that the user states (`zero_shot`, `language`); otherwise its
+    labels are in its ``config``. Size, channel order and normalization are measured on
+    its image processor (`library.measure_processor`); there is a ModelWarning if it has
+    none. Code in a repository is never run, and weights are read from safetensors only.
+    A repository that timm has saved is loaded by timm.
 
     Raises:
-        ModelError: transformers is missing, the repository cannot be loaded or lacks
-            weights, its network is of another kind or larger than the memory, or its
-            processor does what `Preprocessing` cannot.
+        ModelError: transformers is missing; the repository cannot be loaded or lacks
+            weights; its network is of another kind or does not fit into the memory; or
+            its processor does more than `Preprocessing` can do.
     """
     name, _, revision = spec.partition(":")[2].strip().partition("@")
     transformers = models.import_library("transformers", spec, "hf")
@@ -83,12 +84,15 @@ def load(spec: str, purpose: models.Purpose) -> models.Source:
     # arguments of the functions of transformers that read from the hub
     hub_options: dict[str, Any] = {"revision": revision} if revision else {}
     with report_library_errors(spec, ADVICE):
-        # otherwise each file would be tried for half a minute
+        # If the hub does not respond, its client would try each file for half a minute.
         if not Path(name).is_dir() and _is_hub_unreachable(name):
             hub_options["local_files_only"] = True
         saved = _load_config(transformers, name, spec, hub_options)
-        is_from_timm = saved.get("model_type") == "timm_wrapper"
-        if is_from_timm and "architectures" not in saved:  # timm has saved it
+        # transformers reads the config of any network of timm as a "timm_wrapper". But
+        # only a config that transformers has saved states "architectures".
+        is_of_timm = saved.get("model_type") == "timm_wrapper"
+        is_saved_by_timm = is_of_timm and "architectures" not in saved
+        if is_saved_by_timm:
             return outputs.load_timm_repository(spec, name, revision, purpose)
         family, network = _load_network(transformers, name, hub_options, spec)
         processor = load_processor(transformers, name, hub_options)
@@ -106,7 +110,7 @@ def load(spec: str, purpose: models.Purpose) -> models.Source:
 def _resolve_name(name: str, spec: str) -> str:
     """Return the absolute path of a directory, or the name of a repository as it is.
 
-    Raises ModelError for a file, and for the path of a directory that is missing.
+    Raises ModelError for a file, and for a path of a directory that does not exist.
     """
     if Path(name).is_dir():
         return str(Path(name).resolve())
@@ -115,6 +119,7 @@ def _resolve_name(name: str, spec: str) -> str:
             f"model {spec}: is a file; give the folder in which it "
             "is with its config.json"
         )
+    # The name of a repository is OWNER/NAME, with at most one slash.
     is_path = name.startswith((".", "/", "~")) or name.count("/") > 1
     if is_path:
         raise errors.ModelError(
@@ -129,13 +134,20 @@ def _load_network(
 ) -> tuple[Family, Any]:
     """Load the network of a repository or a directory, with its family.
 
+    Args:
+        transformers: the package.
+        name: name of the repository or directory.
+        hub_options: arguments of the package, such as a revision.
+        spec: what the user wrote, for messages.
+
     Raises:
-        ModelError: it is of no family, larger than the memory, or lacks weights.
+        ModelError: it belongs to no family, does not fit into the memory, or lacks
+            weights.
     """
     config = transformers.AutoConfig.from_pretrained(
         name, trust_remote_code=False, **hub_options
     )
-    # "none" is no architecture of transformers, so that no family has it
+    # "none" is a name that no architecture has: `_find_family` rejects it.
     architecture = str((getattr(config, "architectures", None) or ["none"])[0])
     family = _find_family(architecture, getattr(transformers, architecture, None), spec)
     check_fits(transformers, name, hub_options, spec)
@@ -154,12 +166,11 @@ def _load_network(
 def find_transformers_source(
     network: nn.Module, purpose: models.Purpose
 ) -> models.Source | None:
-    """Return the source of an existing network of transformers; None for any other
-    network.
+    """Return the source of an existing network of transformers.
 
-    Names come from its ``config``, and the preprocessing from the repository or
-    directory that it was loaded from; a ModelWarning reports if that has no image
-    processor, or cannot be read any more.
+    None for any other network. Names of classes are in its ``config``. The
+    preprocessing comes from the repository or directory from which it was loaded; there
+    is a ModelWarning if that has no image processor, or cannot be read any more.
     """
     transformers: Any = sys.modules.get("transformers")
     if transformers is None or not isinstance(network, transformers.PreTrainedModel):
@@ -170,7 +181,7 @@ def find_transformers_source(
     hub_options = {"local_files_only": True}
     processor = None
     if origin:
-        # it may not be there any more
+        # The repository or directory may not exist any more.
         with suppress(errors.ModelError), report_library_errors(spec, ""):
             processor = load_processor(transformers, origin, hub_options)
     loaded = LoadedNetwork(
@@ -191,7 +202,7 @@ def _load_part(
     hub_options: Mapping[str, Any],
     loader: str,
 ) -> Any:
-    """Load what belongs to a network from its repository, such as its tokenizer.
+    """Load a part of the repository of a network, such as its tokenizer.
 
     Args:
         transformers: the package.
@@ -201,7 +212,7 @@ def _load_part(
         loader: class of the package that loads it, such as "AutoTokenizer".
     """
     with report_library_errors(
-        spec, "Give a repository, or a folder, in which it is beside the network"
+        spec, "Give a repository, or a folder, that also has this part"
     ):
         return getattr(transformers, loader).from_pretrained(
             name, trust_remote_code=False, **hub_options
@@ -212,12 +223,12 @@ def _find_family(architecture: str, network: Any, spec: str) -> Family:
     """Return the first of `NETWORKS` that an architecture belongs to.
 
     Args:
-        architecture: its name.
+        architecture: name of the architecture.
         network: network of this architecture, or its class.
         spec: specification of the model, for messages.
 
     Raises:
-        ModelError: it belongs to none.
+        ModelError: it belongs to no family.
     """
     for family in NETWORKS:
         if isinstance(family.matches, str):
@@ -230,10 +241,10 @@ def _find_family(architecture: str, network: Any, spec: str) -> Family:
         f"model {spec}: is a {architecture}; expected one whose name has "
         "ForImageClassification, ForVideoClassification, ForSemanticSegmentation, "
         "ForUniversalSegmentation, ForObjectDetection or ForDepthEstimation in it, "
-        "one that compares pictures with texts, as CLIPModel, one that goes on in "
-        "words, as LlavaForConditionalGeneration, or one that has features, as "
-        "Dinov2Model. Wrap another in an nn.Module whose output a task can judge, "
-        "your own too, and give that from Python"
+        "one that compares images with texts, such as CLIPModel, one that continues "
+        "a text, such as LlavaForConditionalGeneration, or one that has features, such "
+        "as Dinov2Model. Wrap any other in an nn.Module whose output a task can read, "
+        "and pass that from Python"
     )
 
 
@@ -275,28 +286,31 @@ def _load_config(
             f"model {spec}: {name} is no folder here{_suggest_folders(name)}, and no "
             "repository of that name is in the "
             f"cache{_format_suggestions(models.find_similar_names(name, cached))} or "
-            f"can be had ({models.get_first_line(error)}). Check the name and the "
-            "network, or give a folder"
+            f"can be downloaded ({models.get_first_line(error)}). Check the name and "
+            "the connection, or give a folder"
         ) from error
 
 
 def _is_hub_unreachable(name: str) -> bool:
-    """Whether the hub does not respond about a repository, not even that there is
-    none.
+    """Return whether the hub gives no response to a question about a repository.
+
+    An error such as "not found" is a response: then the hub can be reached.
     """
     hub = import_module("huggingface_hub")
     try:
         hub.get_hf_file_metadata(
             hub.hf_hub_url(name, "config.json"), timeout=HUB_TIMEOUT
         )
-    except Exception as error:  # its client's libraries have errors of their own
+    except Exception as error:  # the client uses libraries with errors of many types
+        # Errors of HTTP have the hub's response as an attribute.
         return getattr(error, "response", None) is None
     return False
 
 
 def _suggest_folders(name: str) -> str:
-    """Return the question whether a directory with a similar name is meant, "" if there
-    is none.
+    """Return a question that suggests directories with a similar name.
+
+    It is "" if there are none.
     """
     path = Path(name).expanduser()
     siblings = []
@@ -307,18 +321,21 @@ def _suggest_folders(name: str) -> str:
 
 
 def _format_suggestions(names: Sequence[str]) -> str:
-    """Return the question whether one of these directories or repositories is meant, ""
-    if there is none.
-    """
+    """Return a question that suggests directories or repositories, "" without names."""
     specs = [f"'hf:{name}'" for name in names[:3]]
     return f" (did you mean {' or '.join(specs)}?)" if specs else ""
 
 
 def _check_weights(network: Any, report: Any, spec: str) -> None:
-    """Check that all weights come from the files: others would be random.
+    """Check that all weights come from the files: missing ones would be random.
 
-    An untrained pooler is removed: it would read the first token, which is then used
-    directly.
+    Only the pooler may be missing, the layer after the first token. It is removed, so
+    that the first token itself has the features.
+
+    Args:
+        network: the network.
+        report: what `from_pretrained` reports: "missing_keys" and "mismatched_keys".
+        spec: what the user wrote, for the message.
 
     Raises:
         ModelError: weights are missing.
@@ -335,34 +352,34 @@ def _check_weights(network: Any, report: Any, spec: str) -> None:
     raise errors.ModelError(
         f"model {spec}: its files lack {len(missing)} of the network's weights "
         f"({examples}), which would be random. "
-        "Give a repository that was trained for this, not one of its beginnings"
+        "Give a repository that was trained for this task, not only pretrained"
     )
 
 
 def _run_classifier(network: Any, images: Tensor) -> Tensor:
-    """Return the logits of a network."""
+    """Return the logits of a network for images (N, 3, H, W)."""
     logits: Tensor = network(pixel_values=images).logits
     return logits
 
 
 def _run_segmenter(network: Any, images: Tensor) -> Tensor:
-    """Return the logits (N, classes, H, W) of a segmenter, at the size of the
-    images.
-    """
+    """Return the logits (N, classes, H, W) of a segmenter at the size of the images."""
     return interpolate(
         _run_classifier(network, images), size=images.shape[2:], mode="bilinear"
     )
 
 
 def _run_detector(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
-    """Return boxes (N, queries, 4) in pixels, x0, y0, x1, y1, and scores (N, queries,
-    classes) in [0, 1], without suppression.
+    """Return boxes and scores of a detector, without suppression of boxes.
 
-    Networks whose last class means no object choose one class for each box (Carion et
-    al. 2020); the others score each class independently.
+    Returns:
+        Boxes (N, queries, 4) in pixels, x0, y0, x1, y1; and scores (N, queries,
+        classes) in [0, 1].
     """
     returned = network(pixel_values=images)
     boxes = to_pixel_corners(returned.pred_boxes, images)
+    # In some networks the additional last class means no object. They choose one class
+    # for each box (Carion et al. 2020); others score each class independently.
     if returned.logits.shape[-1] > len(network.config.id2label):
         return boxes, returned.logits.softmax(dim=-1)[..., :-1]
     return boxes, returned.logits.sigmoid()
@@ -371,12 +388,13 @@ def _run_detector(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
 def _make_named_source(
     run_network: RunNetwork, *, boxes: bool = False
 ) -> Callable[[LoadedNetwork], models.Source]:
-    """Return the function that makes the source of a network with class names in its
-    ``config``.
+    """Return a function that makes the source of a network with class names.
+
+    The class names are in the network's ``config``.
 
     Args:
         run_network: calls the network on images (N, 3, H, W).
-        boxes: whether what it returns are boxes as corners in pixels.
+        boxes: whether the output has boxes as corners in pixels.
     """
     return lambda loaded: loaded.make_source(
         run_network, boxes=boxes, labels=loaded.class_names or None
@@ -384,7 +402,7 @@ def _make_named_source(
 
 
 class _FrameProcessor:
-    """A processor of videos that is called on one image, a video of one frame."""
+    """Call a processor of videos on one image, as a video of one frame."""
 
     def __init__(self, processor: Any) -> None:
         self.processor = processor
@@ -398,16 +416,18 @@ class _FrameProcessor:
         return getattr(self.processor, name)
 
 
-def _make_clip_source(loaded: LoadedNetwork) -> models.Source:
-    """Return the source of a network of videos (N, T, 3, H, W): the T frames are the
-    images of a rig, a camera that moves or several cameras.
+def _make_video_source(loaded: LoadedNetwork) -> models.Source:
+    """Return the source of a classifier of videos (N, T, 3, H, W).
+
+    The T frames of a video are rendered as the images of a rig: by a camera that moves,
+    or by several cameras.
     """
     config = loaded.network.config
     if loaded.processor is not None:
         loaded = replace(loaded, processor=_FrameProcessor(loaded.processor))
-    module = models.AllAtOnce(
-        AdaptedNetwork(loaded.network, _run_classifier), int(config.num_frames)
-    )
+    network = AdaptedNetwork(loaded.network, _run_classifier)
+    # All frames of a video are passed to the network in one call.
+    module = models.AllAtOnce(network, cameras=int(config.num_frames))
     return models.make_source(
         module,
         loaded.name,
@@ -417,7 +437,7 @@ def _make_clip_source(loaded: LoadedNetwork) -> models.Source:
 
 
 NETWORKS = (
-    Family("ForVideoClassification", "ForVideoClassification", _make_clip_source),
+    Family("ForVideoClassification", "ForVideoClassification", _make_video_source),
     Family(
         "TimmWrapperForImageClassification",
         "ForImageClassification",
@@ -455,7 +475,9 @@ NETWORKS = (
     ),
     Family(outputs.gives_features, None, outputs.make_feature_source),
 )
-"""All families that are read, the specific ones first."""
+"""All supported families. The first one that matches counts, so that the most specific
+ones come first.
+"""
 
 
 MEMORY_FILE = Path("/proc/meminfo")  # Linux's file of memory sizes
@@ -476,7 +498,7 @@ def check_fits(
         spec: what the user wrote, for messages.
 
     Raises:
-        ModelError: they are larger.
+        ModelError: the weights are larger than the free memory.
     """
     free = _read_free_memory()
     if free is None:
@@ -485,7 +507,7 @@ def check_fits(
     index = find_cached_file(
         transformers, name, "model.safetensors.index.json", hub_options
     )
-    if index:  # of several files
+    if index:  # the index of weights that are stored in several files
         metadata = json.loads(Path(index).read_text(encoding="utf-8"))
         size = int(metadata.get("metadata", {}).get("total_size", 0))
     else:
@@ -503,6 +525,7 @@ def check_fits(
 def _read_free_memory() -> int | None:
     """Return the free memory in bytes, swap included; None if it is unknown."""
     try:
+        # lines such as "MemAvailable:   16302192 kB"
         lines = MEMORY_FILE.read_text(encoding="ascii").splitlines()
         kilobytes = {
             line.partition(":")[0]: int(line.split()[1])

@@ -1,7 +1,7 @@
-"""Networks of given names: classifiers that compare pictures with texts, as CLIP and
-SigLIP do, and detectors.
+"""Networks whose classes are names that the user states.
 
-Detectors, as OWL-ViT and Grounding DINO are, find whatever they are told to by name.
+These are classifiers that compare images with texts, such as CLIP and SigLIP; and
+detectors that find objects by their names, such as OWL-ViT and Grounding DINO.
 """
 
 from __future__ import annotations
@@ -23,27 +23,28 @@ from advsearch.models.zoo.library import (
     to_pixel_corners,
 )
 
-TEXT_BATCH_SIZE = 64  # texts that are embedded at once
+TEXT_BATCH_SIZE = 64  # maximum number of texts that are embedded at once
 
 
 def encodes_images_and_texts(network: Any) -> bool:
-    """Whether a network of transformers, or its class, encodes both images and
-    texts.
+    """Return whether a network of transformers, or its class, has both encoders.
+
+    These encode images and texts.
     """
     return all(hasattr(network, f"get_{half}_features") for half in ("image", "text"))
 
 
 def make_zero_shot_source(loaded: LoadedNetwork) -> models.Source:
-    """Return the source of a classifier of the given names.
+    """Return the source of a classifier of the names that the user states.
 
     Raises:
         ModelError: the network takes patches instead of images, or its scores differ
             from those computed here.
-        InputError: fewer than two names, or prompts without a place for them.
+        InputError: there are fewer than two names, or a prompt has no ``{}``.
 
     Warns:
-        ModelWarning: two names are the same text to the network; or it scores each name
-            by itself, so that scores over all names are computed here.
+        ModelWarning: two names have the same tokens; or the network scores each name
+            independently, and the reported scores are a softmax over all names.
     """
     check_takes_pictures(loaded.network, loaded.spec)
     name = loaded.name
@@ -51,14 +52,14 @@ def make_zero_shot_source(loaded: LoadedNetwork) -> models.Source:
     prompts = models.get_patterns(loaded.purpose.prompts)
     tokenizer = loaded.load_part("AutoTokenizer")
     words = get_spoken_names(names)
-    # one text for each name, to check scores and to find names with equal texts: the
-    # first prompt is enough for both
+    # One text per name, by which scores are checked and equal names are found. The
+    # first prompt is enough for both.
     texts = [prompts[0].replace("{}", word) for word in words]
     with (
         models.translate_errors(f"model {name}: cannot embed the names of `labels`"),
         torch.no_grad(),
     ):
-        # a copy, so that the loaded network itself stays in its mode
+        # A copy is set to evaluation mode: the network may be the user's own.
         network: Any = models.copy_sharing_weights(loaded.network).eval()
         embeddings = embed_words(network, tokenizer, words, prompts)
         head = _make_head(network, embeddings)
@@ -69,9 +70,9 @@ def make_zero_shot_source(loaded: LoadedNetwork) -> models.Source:
     is_trained_with_sigmoid = hasattr(loaded.network, "logit_bias")
     if is_trained_with_sigmoid:
         models.warn(
-            f"model {name} judges each name by itself, with a sigmoid of its logit: "
-            f"the scores that are shown are a softmax over the {len(names)} names, and "
-            "margins are differences of logits"
+            f"model {name} scores each name independently, by a sigmoid of its logit: "
+            f"displayed scores are a softmax over the {len(names)} names, and margins "
+            "are differences of logits"
         )
     return source
 
@@ -80,7 +81,7 @@ def _require_several_names(loaded: LoadedNetwork) -> tuple[str, ...]:
     """Return the names that the user states for a network to choose from.
 
     Raises:
-        InputError: fewer than two.
+        InputError: there are fewer than two names.
     """
     names = loaded.purpose.require_names(
         loaded.name, "compares a picture with texts", "classification"
@@ -113,8 +114,11 @@ def _make_head(network: Any, embeddings: Tensor) -> nn.Linear:
 
 
 def check_takes_pictures(network: Any, spec: str) -> None:
-    """Raise ModelError for a network that takes patches instead of images; `spec` is
-    for the message.
+    """Raise ModelError for a network that takes patches instead of images.
+
+    Args:
+        network: network of transformers.
+        spec: what the user wrote, for the message.
     """
     if "spatial_shapes" in inspect.signature(network.get_image_features).parameters:
         raise errors.ModelError(
@@ -125,8 +129,10 @@ def check_takes_pictures(network: Any, spec: str) -> None:
 
 
 def get_spoken_names(names: Sequence[str]) -> list[str]:
-    """Return the text of each name: the first of its synonyms separated by commas, if
-    no other name has the same.
+    """Return the text for each name.
+
+    It is the first of the synonyms that commas separate: "tench" for "tench, Tinca
+    tinca". If several names have the same first synonym, it is the full name.
     """
     first_synonyms = [name.partition(",")[0].strip() or name for name in names]
     return [
@@ -138,8 +144,10 @@ def get_spoken_names(names: Sequence[str]) -> list[str]:
 def _tokenize(
     network: Any, tokenizer: Any, texts: Sequence[str]
 ) -> Mapping[str, Tensor]:
-    """Tokenize texts as the network was trained on them: SigLIP's are padded to the
-    maximum length, others to that of the longest.
+    """Tokenize texts in the form in which the network was trained.
+
+    SigLIP was trained on texts that are padded to the maximum length. Other texts are
+    padded to the length of the longest.
 
     Raises:
         InputError: a text is too long.
@@ -155,9 +163,10 @@ def _tokenize(
                 f"prompt: expected texts of at most {max_tokens} tokens, got "
                 f"{len(tokens)}: {text[:80]!r}"
             )
+    is_siglip = hasattr(network, "logit_bias")
     inputs = tokenizer(
         list(texts),
-        padding="max_length" if hasattr(network, "logit_bias") else True,
+        padding="max_length" if is_siglip else True,  # True: to the longest
         max_length=max_tokens,
         truncation=True,
         return_tensors="pt",
@@ -196,7 +205,7 @@ def embed_words(
 
 
 def _get_features(returned: Any) -> Tensor:
-    """Return the features (N, D), float32, in an output of an encoder."""
+    """Return the features (N, D), float32, in the return value of an encoder."""
     features: Tensor = getattr(returned, "pooler_output", returned)
     return features.float()
 
@@ -204,23 +213,26 @@ def _get_features(returned: Any) -> Tensor:
 class _CosineClassifier(nn.Module):
     """Compute logits (N, names): the scaled cosine of an image and each name.
 
-    The text encoder is left out.
+    The text encoder is removed, since the embeddings of names are the weights of
+    `head`.
     """
 
     def __init__(self, network: nn.Module, head: nn.Linear) -> None:
         super().__init__()
         self.network: Any = models.copy_sharing_weights(network)
-        for child in [name for name, _ in self.network.named_children()]:
-            if child.startswith("text"):
-                setattr(self.network, child, None)
+        child_names = [name for name, _ in self.network.named_children()]
+        for name in child_names:
+            if name.startswith("text"):
+                setattr(self.network, name, None)
         self.head = head
 
     def embed_images(self, images: Tensor) -> Tensor:
-        """Return the features (N, D) of length 1 of images."""
+        """Return the features (N, D) of images, which have length 1."""
         features = _get_features(self.network.get_image_features(pixel_values=images))
         return functional.normalize(features, dim=-1)
 
     def forward(self, images: Tensor) -> Tensor:
+        """Return the logits (N, names) of images (N, 3, H, W)."""
         scores: Tensor = self.head(self.embed_images(images))
         return scores
 
@@ -232,33 +244,37 @@ def _check_scores(
     text: str,
     source: models.Source,
 ) -> None:
-    """Check that a classifier gives noise and a text the same score as the network.
+    """Check that a classifier and its network compute the same score.
+
+    The score is that of an image of noise and a text.
 
     Args:
         network: network with its text encoder.
         classifier: classifier that is checked, with the same weights.
         tokenizer: tokenizer of the network.
-        text: text to compare with.
-        source: has the size of images.
+        text: the text.
+        source: states the size of images.
 
     Raises:
-        ModelError: they differ.
+        ModelError: the scores differ.
     """
     shape = (1, 3, *(source.input_size or (224, 224)))
     noise = torch.rand(shape, generator=torch.Generator().manual_seed(0))
     noise = noise.to(network.device, network.dtype)
     inputs = _tokenize(network, tokenizer, [text])
     expected = network(**inputs, pixel_values=noise).logits_per_image.float()
-    # rows of the head are embeddings of length 1 times the scale of cosines
+    # The rows of the head are embeddings of length 1, multiplied by the scale of
+    # cosines.
     scale = classifier.head.weight.norm(dim=-1).max()
-    # the prompt "{}" leaves the text as it is
+    # With the prompt "{}" the text is used as it is.
     embedding = scale * embed_words(network, tokenizer, [text], ["{}"])
-    bias = classifier.head.bias[0]  # equal for all names
+    bias = classifier.head.bias[0]  # the same for all names
     computed = classifier.embed_images(noise) @ embedding.T + bias
     size = max(float(scale), float(expected.abs().max()))
-    if expected.shape != computed.shape or not are_nearly_equal(
+    are_equal = expected.shape == computed.shape and are_nearly_equal(
         expected, computed, size, network.dtype
-    ):
+    )
+    if not are_equal:
         raise errors.ModelError(
             f"model {source.name}: is a {type(network).__name__}, whose scores are no "
             "scaled cosine of a picture and a "
@@ -269,8 +285,15 @@ def _check_scores(
 def warn_of_equal_texts(
     tokenizer: Any, texts: Sequence[str], names: Sequence[str], name: str
 ) -> None:
-    """Warn of the first two names with the same tokens: they differ in case, say, or
-    are words that the network does not know.
+    """Warn of the first two names with the same tokens.
+
+    For example, they differ only in case, or the network knows neither word.
+
+    Args:
+        tokenizer: tokenizer of the network.
+        texts: text of each name.
+        names: names of classes.
+        name: name of the model.
     """
     index_of_tokens: dict[tuple[int, ...], int] = {}
     tokens_of_texts = tokenizer(list(texts), verbose=False)["input_ids"]
@@ -279,24 +302,27 @@ def warn_of_equal_texts(
         if first != index:
             models.warn(
                 f"model {name} reads {names[first]!r} (#{first}) and {names[index]!r} "
-                f"(#{index}) as the same text: it cannot tell one from the other"
+                f"(#{index}) as the same text: it cannot distinguish them"
             )
             return
 
 
 BuildDetector = Callable[[LoadedNetwork, Any, Any, Sequence[str]], RunNetwork]
-"""Creates the function that runs a detector, from what was loaded, a copy of its
-network, its tokenizer and the text of each name. It returns boxes (N, K, 4) in pixels,
-x0, y0, x1, y1, and independent scores (N, K, names) in [0, 1].
+"""Creates the function that runs a detector.
+
+Its arguments are what was loaded, a copy of the network, its tokenizer, and the text of
+each name. The function that it creates returns boxes (N, K, 4) in pixels, x0, y0, x1,
+y1, and independent scores (N, K, names) in [0, 1].
 """
 
 
 def make_detector_source(loaded: LoadedNetwork) -> models.Source:
-    """Return the source of a detector of the given names, with a network of
-    `DETECTORS`.
+    """Return the source of a detector of the names that the user states.
+
+    Its network is one of `DETECTORS`.
     """
     names = loaded.purpose.require_names(
-        loaded.name, "finds what it is told to", "detection"
+        loaded.name, "finds objects by their names", "detection"
     )
     tokenizer = loaded.load_part("AutoTokenizer")
     words = get_spoken_names(names)
@@ -318,12 +344,12 @@ def make_detector_source(loaded: LoadedNetwork) -> models.Source:
 def _build_owl(
     loaded: LoadedNetwork, network: Any, tokenizer: Any, words: Sequence[str]
 ) -> RunNetwork:
-    """Return a function that compares each patch with the names' texts
-    (`BuildDetector`).
+    """Return the function that runs an OWL-ViT detector (`BuildDetector`).
 
-    A patch of the image has one box (Minderer et al. 2022, arXiv 2205.06230, section
-    3). The texts of a name are averaged as CLIP's are. The network's text encoder is
-    removed then.
+    Each patch of the image has one box, and its features are compared with those of the
+    names (Minderer et al. 2022, arXiv 2205.06230, section 3). The features of a name
+    are averaged over prompts, as in CLIP. After that the network's text encoder is
+    removed.
     """
     base_model = getattr(network, network.base_model_prefix)
     prompts = models.get_patterns(loaded.purpose.prompts)
@@ -332,6 +358,7 @@ def _build_owl(
     base_model.text_projection = None
 
     def run_network(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Return boxes and scores for images (N, 3, H, W)."""
         features = network.image_embedder(pixel_values=images)[0]
         patches = features.flatten(1, 2)
         queries = embeddings.to(patches).expand(len(images), -1, -1)
@@ -345,10 +372,11 @@ def _build_owl(
 def _build_grounding_dino(
     loaded: LoadedNetwork, network: Any, tokenizer: Any, words: Sequence[str]
 ) -> RunNetwork:
-    """Return a function that scores boxes by the tokens of one text (`BuildDetector`).
+    """Return the function that runs a Grounding DINO detector (`BuildDetector`).
 
-    The text has all names, ``mug. cup. bowl.`` (Liu et al. 2023, arXiv 2303.05499,
-    section 3). The score of a name is the largest of its tokens.
+    All names are in one text, ``mug. cup. bowl.``, and a box has a score for each token
+    (Liu et al. 2023, arXiv 2303.05499, section 3). The score of a name is the maximum
+    over its tokens.
 
     Raises:
         InputError: there are several prompts, the text is too long, or a name has a
@@ -371,6 +399,7 @@ def _build_grounding_dino(
             f"labels: model {name} reads a text of at most {max_tokens} tokens, and "
             f"the names take {len(tokens)}; give fewer"
         )
+    # (names, longest name): special tokens include the full stop between names
     token_index = _find_token_runs(tokens, network.model.special_tokens)
     if len(token_index) != len(words):
         raise InputError(
@@ -380,6 +409,7 @@ def _build_grounding_dino(
         )
 
     def run_network(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Return boxes and scores for images (N, 3, H, W)."""
         returned = network(
             pixel_values=images, input_ids=tokens.expand(len(images), -1)
         )
@@ -390,11 +420,17 @@ def _build_grounding_dino(
 
 
 def _find_token_runs(tokens: Tensor, separators: Any) -> Tensor:
-    """Return the indices of the tokens between separators, (runs, longest).
+    """Return the indices of the tokens between separators.
 
-    A shorter run is padded with its first index.
+    Args:
+        tokens: (L,) tokens of a text.
+        separators: the tokens that separate runs of other tokens.
+
+    Returns:
+        (runs, longest run) indices; a shorter run is padded with its first index.
     """
     is_separator = torch.isin(tokens, separators)
+    # The tokens of a run have the same number of separators before them.
     run_of_token = is_separator.cumsum(dim=0)[~is_separator]
     token_index = (~is_separator).nonzero().flatten()
     runs = [token_index[run_of_token == run] for run in run_of_token.unique()]
@@ -409,4 +445,4 @@ DETECTORS: dict[str, BuildDetector] = {
     "GroundingDinoForObjectDetection": _build_grounding_dino,
     "MMGroundingDinoForObjectDetection": _build_grounding_dino,
 }
-"""Builders of detectors by architecture."""
+"""Functions that build detectors, by architecture."""

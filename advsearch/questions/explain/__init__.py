@@ -1,6 +1,6 @@
 """Find rules under which a model is wrong, from the rows of sweeps.
 
-Fresh renders confirm them.
+Fresh renders confirm the rules.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 
 class ExplainConfig(Config):
-    """Settings of `explain`: which sweeps it reads, and how much it renders."""
+    """Settings of `explain`: the sweeps that it reads, and how much it renders."""
 
     command: ClassVar[str] = "explain"
     clashes: ClassVar[tuple[settings.Clash, ...]] = tuple(
@@ -48,29 +48,29 @@ class ExplainConfig(Config):
 
     # fmt: off
     sweeps: str = setting(
-        ..., "explain", "the sweeps whose rows are read together, separated by commas",
+        ..., "explain", "sweeps whose rows are read as one table, separated by commas",
         "names or folders of runs of sweep, or of recipes with sweeps",
     )
     confirm: int = setting(
-        100, "explain", "fresh configurations inside each rule that are rendered to "
-                        "confirm it; 0 for none",
+        100, "explain", "number of fresh configurations that are rendered inside each "
+                        "rule to confirm it; 0 for none",
         unit="renders", ge=0, le=100_000,
     )
     pairs: int = setting(
-        12, "explain", "failures for which the nearest right configuration is looked "
-                       "for; 0 for none",
+        12, "explain", "number of failures for which the nearest right configuration "
+                       "is searched; 0 for none",
         unit="failures", ge=0, le=100,
     )
     clusters: int = setting(
-        100, "explain", "failures that are rendered again and grouped by what the "
-                        "model decides by; 0 for none",
+        100, "explain", "number of failures that are rendered again and clustered by "
+                        "the model's features; 0 for none",
         unit="failures", ge=0, le=10_000,
     )
     # fmt: on
     accuracy: float = setting(
         0.95,
         "explain",
-        "accuracy that the envelope promises, at 95 % confidence",
+        "minimum accuracy inside the envelope, at 95 % confidence",
         gt=0.0,
         le=0.999,
     )
@@ -104,8 +104,8 @@ def explain(context: RunContext[ExplainConfig]) -> ExplainResult:
     """Find rules under which a model is wrong, and confirm them (docs/explain.md).
 
     Args:
-        sweeps: name or folder of a run of `sweep` that has ended, or several, whose
-            rows are read together; of a recipe, its sweeps.
+        sweeps: name or folder of a run of `sweep` that has ended; or several, whose
+            rows are read as one table. For a recipe, all of its sweeps are read.
     """
     # these import torch, scipy and pandas
     from advsearch.questions.explain import findings
@@ -135,7 +135,7 @@ def explain(context: RunContext[ExplainConfig]) -> ExplainResult:
         parameters=list(table.attrs["units"]),
         # the counts of all rows: right, total, interval, share and outcomes
         **vars(findings.count_right(table)),
-        # draws, where several rows share one
+        # the number of draws, if several rows share a draw; else None
         units=None if table["unit"].is_unique else table["unit"].nunique(),
         rules=rule_rows,
         rejected_rule=findings.make_rejected_rule(found_rules.best_rejected, len(table)),
@@ -172,7 +172,7 @@ def _analyze_rows(
     Args:
         table: the rows, with a column for each parameter that varies.
         config: the settings.
-        progress: reports the progress.
+        progress: the progress bar.
 
     Returns:
         The rules, the weights of the parameters, and the box (`find_envelope`).
@@ -208,14 +208,14 @@ def _confirm_rules(renders: Any, found_rules: Any) -> list[RuleRow]:
 def read_table(
     sweeps: Sequence[workbench.StoredSweep],
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return the rows of sweeps that have the object in view, as two frames.
+    """Return the rows of sweeps in which the object is in view, as two frames.
 
     Returns:
-        All columns of the rows; and a table of the parameters that vary in all of them,
-        whose names and units are its `attrs["units"]`.
+        The rows with all columns; and a table of the parameters that vary in all of
+        them. Its `attrs["units"]` maps the names of these parameters to their units.
 
     Raises:
-        InputError: there are too few rows, or nothing varies in all of them.
+        InputError: there are too few rows, or no parameter varies in all of them.
     """
     from advsearch.extend import rules  # imports pandas
     from advsearch.questions.explain.rows import read_predictions
@@ -230,8 +230,7 @@ def read_table(
     table = rules.make_table(rows, rows.attrs["units"])
     if not table.attrs["units"]:
         raise InputError(
-            "explain: expected rows in which something varies that all of "
-            "them have, got none"
+            "explain: expected a parameter that varies and that all rows have, got none"
         )
     return rows, table
 
@@ -239,7 +238,8 @@ def read_table(
 def find_sweeps(path: Path) -> list[Path]:
     """Return the directories of the sweeps of a run.
 
-    A recipe has those of its parts; a sweep is its own.
+    For a recipe, they are those of its parts. For a sweep, it is that of the run
+    itself.
     """
     result = read_result(path)
     if result.command != "recipe":

@@ -1,4 +1,4 @@
-"""Failures that look alike to the model: clusters of what it decides by."""
+"""Cluster failures by the model's features: those in a cluster look alike to it."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy.typing as npt
 from advsearch.extend import rules
 
 MAX_CLUSTERS = 6
-MIN_FAILURES = 8  # of which clusters are sought
+MIN_FAILURES = 8  # minimum number of failures that are clustered
 N_REFERENCES = 19
-"""Samples of as many points from one normal distribution like them: clusters in none of
-these may be as far apart.
+"""Number of random clouds without clusters, to which the clusters of failures are
+compared. They have as many points, of one normal distribution.
 """
-N_COMPONENTS = 8  # principal components that distances are measured in
+N_COMPONENTS = 8  # principal components in which distances are measured
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -26,10 +26,11 @@ class Clusters:
     """Clusters of failures.
 
     Attributes:
-        members: indices of the failures of each, the most typical first; the largest
-            cluster first.
-        silhouette: the mean; None where all are one cluster.
-        are_separated: whether clusters of a cloud without any are less far apart.
+        members: indices of the failures in each cluster, the most typical first. The
+            largest cluster comes first.
+        silhouette: mean silhouette; None if there is a single cluster.
+        are_separated: whether the clusters have a higher silhouette than those of
+            random clouds without clusters.
     """
 
     members: tuple[tuple[int, ...], ...]
@@ -41,7 +42,7 @@ def find_clusters(features: FloatArray, seed: int) -> Clusters:
     """Cluster failures by k-means over the directions of their features (n, F).
 
     The number of clusters is chosen by the mean silhouette (Rousseeuw 1987). The
-    clusters count as apart if their silhouette is larger than that of each of
+    clusters count as separated if their silhouette is larger than that of each of
     `N_REFERENCES` random clouds of points, which are clustered in the same way (after
     Tibshirani, Walther and Hastie 2001). Fewer failures than `MIN_FAILURES` are a
     single cluster.
@@ -54,7 +55,7 @@ def find_clusters(features: FloatArray, seed: int) -> Clusters:
         InputError: scikit-learn is missing.
     """
     lengths = np.linalg.norm(features, axis=1, keepdims=True)
-    directions = features / np.maximum(lengths, 1e-12)  # not divided by 0
+    directions = features / np.maximum(lengths, 1e-12)  # no division by 0
     if len(directions) < MIN_FAILURES:
         all_failures = tuple(range(len(directions)))
         return Clusters((all_failures,), silhouette=None, are_separated=False)
@@ -62,28 +63,29 @@ def find_clusters(features: FloatArray, seed: int) -> Clusters:
     n_components = min(N_COMPONENTS, *directions.shape)
     points = decomposition.PCA(n_components, random_state=0).fit_transform(directions)
 
-    silhouette, cluster = cluster_points(points)
-    is_apart = _is_clearer_than_noise(seed, points, silhouette)
+    silhouette, cluster_of_point = cluster_points(points)
+    are_separated = _is_clearer_than_noise(seed, points, silhouette)
 
+    n_clusters = int(cluster_of_point.max()) + 1
     members = [
-        sort_by_distance(points, np.flatnonzero(cluster == k))
-        for k in range(int(cluster.max()) + 1)
+        sort_by_distance(points, np.flatnonzero(cluster_of_point == index))
+        for index in range(n_clusters)
     ]
     members.sort(key=len, reverse=True)
-    if len(members) < 2:
+    if n_clusters < 2:
         return Clusters(tuple(members), silhouette=None, are_separated=False)
-    return Clusters(tuple(members), silhouette=silhouette, are_separated=is_apart)
+    return Clusters(tuple(members), silhouette, are_separated)
 
 
 def _is_clearer_than_noise(seed: int, points: FloatArray, silhouette: float) -> bool:
-    """Return whether points (n, d) cluster better than each of `N_REFERENCES` clouds
-    without clusters: by a higher silhouette.
+    """Return whether points have a higher silhouette than random clouds of points.
 
-    A cloud has as many points, normal with the same deviation in each dimension.
+    Each of `N_REFERENCES` clouds has as many points, from a normal distribution with
+    the same standard deviation in each dimension.
 
     Args:
-        seed: seed of the references.
-        points: points that were clustered.
+        seed: seed of the clouds.
+        points: (n, d) points that were clustered.
         silhouette: silhouette of their clusters.
     """
     generator = np.random.default_rng(seed)
@@ -95,7 +97,12 @@ def _is_clearer_than_noise(seed: int, points: FloatArray, silhouette: float) -> 
 
 
 def sort_by_distance(points: FloatArray, members: IntArray) -> tuple[int, ...]:
-    """Return members of a cluster by rising distance from its centre."""
+    """Return the members of a cluster, sorted by their distance from its center.
+
+    Args:
+        points: (n, d) all points.
+        members: indices of the points in the cluster.
+    """
     distance = np.linalg.norm(points[members] - points[members].mean(axis=0), axis=1)
     return tuple(members[np.argsort(distance, kind="stable")].tolist())
 
@@ -114,8 +121,8 @@ def cluster_points(points: FloatArray) -> tuple[float, IntArray]:
     best_silhouette = -1.0
     best_cluster = np.zeros(len(points), dtype=np.int64)
     # The silhouette needs fewer clusters than points, and k-means needs at least as
-    # many different points as clusters. Points that differ by rounding errors alone
-    # count as the same.
+    # many distinct points as clusters. Points that differ only by rounding errors are
+    # not distinct.
     n_distinct = len(np.unique(points.round(9), axis=0))
     max_clusters = min(MAX_CLUSTERS, n_distinct - 1)
     for k in range(2, max_clusters + 1):

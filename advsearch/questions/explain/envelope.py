@@ -1,9 +1,9 @@
-"""A box of values to rely on.
+"""Find a box of parameter values inside which the model can be relied on.
 
-The box is peeled (PRIM: Friedman and Fisher 1999, section 6): a thin slice of one
-factor, or one of its names, is taken off again and again where that raises the accuracy
-of the rest the most. One half of the rows chooses the box, and the other half, which
-has not chosen it, is asked once whether it holds what is promised.
+The box is peeled (PRIM: Friedman and Fisher 1999, section 6): in each step it loses a
+thin slice of the values of one factor, or one of its names; the slice is the one whose
+removal raises the accuracy inside the most. One half of the rows chooses the box. The
+other half tests once whether it has the required accuracy.
 """
 
 from __future__ import annotations
@@ -21,10 +21,12 @@ from advsearch.questions.explain.result import EnvelopeRow
 PEELED_FRACTION = 0.05
 """Fraction of the rows in the box that one peel removes at one bound."""
 MIN_BOX_UNITS = 60
-"""Fewer rows, or drives, than this cannot show an accuracy of 95 %."""
+"""Minimum number of independent rows, or drives, in a box: fewer cannot show an
+accuracy of 95 %.
+"""
 ACCURACY_RESERVE = 0.01
-"""Additional accuracy of the choosing rows, which are biased since they chose the
-box.
+"""Additional accuracy that is required of the rows that choose the box, because their
+estimate is biased.
 """
 
 
@@ -60,7 +62,7 @@ def find_envelope(
         box = smaller_box
         inside = choosing[rules.find_covered(box, choosing)]
     counts = count_right(counting[rules.find_covered(box, counting)])
-    conditions = [condition.row for condition in box]
+    conditions = [condition.row for condition in box]  # as a result stores them
     is_held = counts.interval[0] >= accuracy
     return EnvelopeRow(
         conditions=conditions, **vars(counts), accuracy=accuracy, confirmed=is_held
@@ -111,7 +113,7 @@ def list_peels(
             is_empty = smaller.low >= smaller.high
             if smaller != condition and not is_empty:
                 conditions = {**condition_of_factor, factor: smaller}
-                # conditions in the order of the factors, whichever came first
+                # in the order of the factors, and not in that of the peels
                 yield tuple(
                     conditions[name]
                     for name in inside.attrs["units"]
@@ -174,4 +176,5 @@ def _find_lower_high(values: rules.FloatArray) -> float | None:
 
 
 def _round_to_3_digits(value: float) -> float:
+    """Round to three significant digits."""
     return float(f"{value:.3g}")

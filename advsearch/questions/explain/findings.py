@@ -1,4 +1,4 @@
-"""Count right rows under rules, and find warnings about them."""
+"""Count the right predictions under rules, and find warnings about the rows."""
 
 from __future__ import annotations
 
@@ -17,7 +17,12 @@ from advsearch.questions.explain.result import (
 
 
 def count_right(rows: pd.DataFrame) -> RightCounts:
-    """Count right rows; the fraction is the mean over units, None without rows."""
+    """Count right predictions among rows, with the fraction of right ones.
+
+    A unit is an independent draw. If several rows belong to a unit, such as the frames
+    of a drive, they are not independent. So the fraction is the mean over units of the
+    fraction of each, and every unit has the same weight. None without rows.
+    """
     right_fraction = None if rows.empty else rules.estimate_rate(rows)
     return RightCounts(
         right=int(rows["correct"].sum()),
@@ -30,7 +35,9 @@ def count_right(rows: pd.DataFrame) -> RightCounts:
 
 def describe_rule(rule: rules.CountedRule) -> dict[str, Any]:
     """Return the fields of a rule: conditions, and counts inside and elsewhere."""
-    conditions = [condition.row for condition in rule.conditions]
+    conditions = [
+        condition.row for condition in rule.conditions
+    ]  # as results store them
     return {
         "conditions": conditions,
         **vars(count_right(rule.inside)),
@@ -48,7 +55,7 @@ def make_rejected_rule(
 
     Args:
         rule: the rule.
-        n_rows: number of rows in which it was sought.
+        n_rows: number of rows in which rules were searched.
     """
     if rule is None:
         return None
@@ -78,27 +85,26 @@ def find_row_warnings(
         table: the rows, with the columns `correct` and `unit` (the draw).
         importance: weights of the factors.
     """
-    cautions = []
+    warnings = []
     n_draws = table["unit"].nunique()
     if n_draws == 1:
-        cautions.append(
-            "The rows are of one draw: a single drive, or pictures that differ in "
-            "noise alone. The shares are of this "
-            "one, and nothing is shown of others."
+        warnings.append(
+            "The rows are of one draw: a single drive, or images that differ only in "
+            "noise. The fractions are those of this draw, and say nothing about others."
         )
     elif n_draws < rules.MIN_ROWS:
-        cautions.append(
-            f"The rows are of {n_draws} draws, each with several, which are not "
-            "independent: few show little."
+        warnings.append(
+            f"The rows are of {n_draws} draws. Rows of the same draw are not "
+            "independent, and so few draws show little."
         )
     if table["correct"].nunique() < 2:
         always = "right" if table["correct"].all() else "wrong"
-        cautions.append(
-            f"The model is {always} in every row: there is nothing to tell apart."
+        warnings.append(
+            f"The model is {always} in every row: there are no differences to explain."
         )
     elif all(weight.interval[0] <= 0.0 for weight in importance):
-        cautions.append(
+        warnings.append(
             "No parameter is shown to decide anything: the intervals of "
-            "all their shares begin at 0."
+            "all fractions begin at 0."
         )
-    return cautions
+    return warnings

@@ -1,21 +1,24 @@
-"""Which factors decide the predictions, and by how much.
+"""Estimate which factors decide the predictions, and how much.
 
-A factor's values are cut into groups that have equally many rows (a name is a group).
-The share of a factor is the variance of the accuracy between its groups, divided by the
-variance of the predictions (1 if right, 0 if wrong). It is the first-order Sobol index,
-estimated by groups (given-data estimators: Plischke, Borgonovo and Smith 2013).
-Differences inside a group are not counted, so that the index without groups is at least
-as large. The share of two factors is that of the groups of both at once.
+The values of a factor are divided into groups with equally many rows (each name is a
+group). The fraction of a factor is the variance of the accuracy between its groups,
+divided by the variance of the predictions (1 if right, 0 if wrong). It is the
+first-order Sobol index, estimated by groups (given-data estimators: Plischke, Borgonovo
+and Smith 2013). Differences inside a group are not counted, so that the index without
+groups is at least as large. The fraction of two factors is that of the groups that
+their values have together.
 
-Of n predictions and k groups, n times the estimated share is Pearson's chi-squared
-statistic of a table of k x 2, and the true share is its noncentrality over n (Cohen's w
-squared). The interval is that of the noncentrality (Smithson 2003, "Confidence
-Intervals"). Where predictions come in clusters (frames of drives), chance adds more to
-the statistic than with independent ones: it is divided by the design effect, which the
-deviations of clusters give, and is one of F, as that is known from few clusters (Rao
-and Scott 1981, their first-order correction; Thomas and Rao 1987).
-`benchmarks/explain.py` and `benchmarks/drives.py` print in how many of repeated samples
-it covers the truth.
+For n predictions and k groups, n times the estimated fraction is Pearson's chi-squared
+statistic of a table of k x 2. The true fraction is the noncentrality of that statistic,
+divided by n (Cohen's w squared). Its interval is that of the noncentrality (Smithson
+2003, "Confidence Intervals").
+
+Predictions may come in clusters (frames of drives). Then the statistic of a factor
+without effect is larger by the design effect, which is estimated from the residuals of
+clusters. The statistic is divided by it (Rao and Scott 1981, their first-order
+correction). Its distribution is then an F distribution, because the design effect is
+estimated from few clusters (Thomas and Rao 1987). `benchmarks/explain.py` and
+`benchmarks/drives.py` print how often the interval covers the truth.
 """
 
 from __future__ import annotations
@@ -35,11 +38,13 @@ from advsearch.extend import rules, statistics
 from advsearch.questions.explain.result import ParameterWeight
 
 MAX_GROUPS = 20
-"""Of one factor."""
+"""Maximum number of groups of a factor with numbers."""
 MIN_ROWS_PER_CELL = 25
-"""Average rows of a cell of two factors' groups, at least."""
+"""Minimum of the average number of rows in a cell: a group of one factor and a group of
+another.
+"""
 SIGNIFICANCE = 0.01
-"""Probability that any pair is reported if no factors interact (Bonferroni)."""
+"""Maximum probability that any pair is reported if no factors interact (Bonferroni)."""
 MIN_INFLATION = 0.1
 """Lower limit of the design effect of clusters."""
 
@@ -60,7 +65,7 @@ def find_importance(table: pd.DataFrame) -> list[ParameterWeight]:
             cluster) and a column for each factor, whose names are `attrs["units"]`.
 
     Returns:
-        The factors by falling share, from which the part that chance adds is
+        The factors by descending fraction, from which the part that chance adds is
         subtracted; then the pairs in the same way. Empty if all predictions are the
         same.
     """
@@ -69,9 +74,10 @@ def find_importance(table: pd.DataFrame) -> list[ParameterWeight]:
     table = rules.merge_repeats(table)
     sample = ClusteredPredictions(table)
     n_groups = round(sample.n_clusters ** (1.0 / 3.0))
+    factors = list(table.attrs["units"])
     single_weights = [
         sample.estimate_weight([factor], cut_into_groups(table[factor], n_groups))
-        for factor in table.attrs["units"]
+        for factor in factors
     ]
     pair_weights = _find_interacting_pairs(table, sample)
     return [*sort_by_fraction(single_weights), *sort_by_fraction(pair_weights)]
@@ -82,14 +88,15 @@ def _find_interacting_pairs(
 ) -> list[ParameterWeight]:
     """Return the weights of the pairs of factors that interact significantly.
 
-    Two factors interact if together they decide more than the sum of what each decides
-    alone.
+    Two factors interact if the fraction of both together exceeds the sum of their
+    single fractions.
 
     Args:
         table: the predictions, and a column of values for each factor.
         sample: the same predictions with their clusters.
     """
-    # so few groups of each factor that the cells of two have enough rows on average
+    # Each factor has few groups, so that the cells of two factors have enough rows on
+    # average.
     n_groups = max(2, math.isqrt(sample.n_clusters // MIN_ROWS_PER_CELL))
     group_of_factor = {
         factor: cut_into_groups(table[factor], n_groups)
@@ -128,7 +135,8 @@ def cut_into_groups(column: pd.Series, n_groups: int) -> IntArray:
         return np.asarray(column.cat.codes, dtype=np.int64)
     values = column.to_numpy()
     n_bins = min(max(2, n_groups), MAX_GROUPS)
-    # quantiles between the groups, each once: many rows may have the same value
+    # quantiles between the groups; equal ones are merged, as many rows may have the
+    # same value
     inner_edges = np.unique(
         np.quantile(values, np.linspace(0.0, 1.0, n_bins + 1)[1:-1])
     )
@@ -136,22 +144,22 @@ def cut_into_groups(column: pd.Series, n_groups: int) -> IntArray:
 
 
 def cross_groups(first: IntArray, second: IntArray) -> IntArray:
-    """Return the group of each row (n,) by both of two groupings at once.
+    """Return the joint group of each row (n,), from its groups by two factors.
 
-    Rows are in the same group if they are in both groupings.
+    Two rows are in the same joint group if they are in the same group by both factors.
     """
     return first * (int(second.max()) + 1) + second
 
 
 class ClusteredPredictions:
-    """Right and wrong predictions in clusters of equal weight.
+    """Right and wrong predictions in clusters, such as drives, of equal weight.
 
-    Clusters with many rows weigh no more than others.
+    A cluster with many rows has the same weight as any other.
 
     Attributes:
         correct: whether each prediction is right (n,).
-        cluster: the number of the cluster of each (n,): its drive, say.
-        n_clusters: how many there are.
+        cluster: index of the cluster of each prediction (n,).
+        n_clusters: number of clusters.
         is_independent: whether each prediction is a cluster by itself.
         weight: weight of each prediction (n,), 1 on average.
         mean: weighted fraction of right predictions.
@@ -159,33 +167,35 @@ class ClusteredPredictions:
     """
 
     def __init__(self, table: pd.DataFrame) -> None:
-        """Take the predictions of a table: its columns `correct`, and `unit`, the
-        cluster of each row.
+        """Read the predictions of a table.
+
+        Args:
+            table: has the columns `correct`, and `unit`, the cluster of each row.
         """
         self.correct: BoolArray = table["correct"].to_numpy()
         clusters, self.cluster = np.unique(table["unit"], return_inverse=True)
         self.n_clusters = len(clusters)
         self.is_independent = table["unit"].is_unique
-        # The weights of every cluster add up to rows / clusters, so that those of all
-        # add up to the rows.
+        # The sum of the weights in each cluster is rows / clusters, so that the sum of
+        # all weights is the number of rows.
         cluster_size = np.bincount(self.cluster)
         self.weight = len(self.correct) / self.n_clusters / cluster_size[self.cluster]
         self.mean = float(np.average(self.correct, weights=self.weight))
-        # of a number that is 1 or 0
+        # variance of a random number that is 1 or 0
         self.variance = self.mean * (1.0 - self.mean)
 
     def explained_fraction(self, group: IntArray) -> tuple[float, int]:
         """Return the fraction of the variance between groups, and the number of groups.
 
-        That is the weighted mean of (rate of the group - mean)^2 over the predictions,
-        over their variance.
+        The fraction is the weighted mean of (rate of the group - mean)^2 over the
+        predictions, divided by their variance.
 
         Args:
-            group: (n,) the group of each prediction; an index that no prediction has is
-                no group.
+            group: (n,) the group of each prediction. Indices without any prediction do
+                not count as groups.
         """
         group_weight = np.bincount(group, self.weight)
-        is_used = group_weight > 0  # indices without any prediction are left out
+        is_used = group_weight > 0
         used_weight = group_weight[is_used]
         group_rate = (
             np.bincount(group, self.weight * self.correct)[is_used] / used_weight
@@ -196,23 +206,25 @@ class ClusteredPredictions:
     def estimate_weight(self, factors: list[str], group: IntArray) -> ParameterWeight:
         """Estimate the fraction of the variance between groups with its 95 % interval.
 
-        Even the groups of a factor without effect differ by chance. What this adds to
-        the fraction on average is subtracted: for independent rows as in the adjusted R
-        squared, for clusters by `expected_statistic`. If that is not known, or there is
-        a single group, nothing is known of the factor: the fraction is 0, and its
-        interval 0 to 1.
+        Even the groups of a factor without effect differ by chance. The average of this
+        effect is subtracted from the fraction: as in the adjusted R squared if rows are
+        independent, and by `expected_statistic` if they are in clusters. If that is not
+        known, or if there is a single group, the fraction is 0 and its interval 0 to 1:
+        nothing is known.
 
-        Interval: with n rows, fraction s and design effect D, the statistic n s / D has
-        a noncentral chi-squared distribution (with clusters, a noncentral F). Its
-        noncentrality L stands for the true fraction L D / n.
+        The interval follows from the statistic n s / D, with n rows, fraction s and
+        design effect D. It has a noncentral chi-squared distribution (with clusters,
+        degrees times a noncentral F). Its noncentrality L = n * true fraction / D has
+        an interval, which is multiplied by D / n.
 
         Args:
-            factors: their names.
+            factors: names of the factors.
             group: (n,) the group of each prediction, by the values of the factors.
         """
         share, n_groups = self.explained_fraction(group)
         expected_statistic = self.expected_statistic(group)
-        if n_groups < 2 or math.isnan(expected_statistic):  # nothing is shown
+        is_known = n_groups >= 2 and not math.isnan(expected_statistic)
+        if not is_known:
             return ParameterWeight(
                 parameters=factors, share=0.0, interval=(0.0, 1.0), parts=n_groups
             )
@@ -226,7 +238,7 @@ class ClusteredPredictions:
             residual_degrees = max(n_rows - n_groups, 1)
             corrected_share = 1.0 - (1.0 - share) * (n_rows - 1) / residual_degrees
         else:
-            # how many times as large the statistic is as that of independent rows
+            # the expected statistic, divided by that of independent rows
             design_effect = expected_statistic / degrees
             error_degrees = float(self.n_clusters - n_groups)
             corrected_share = share - expected_statistic / n_rows
@@ -246,13 +258,16 @@ class ClusteredPredictions:
     def expected_statistic(self, group: IntArray) -> float:
         """Compute the expected chi-squared statistic of a factor without effect.
 
-        The statistic is the number of rows times `explained_fraction`. With independent
-        rows, its expectation is (groups - 1). With clusters, the expectation is (groups
-        - 1) times the design effect (Rao and Scott 1981, section 3). It is computed as
-        the variance of the rates of the groups, less that of the overall rate, divided
-        by the variance of a prediction; both are estimated from how the residuals of
-        clusters scatter. The result is at least `MIN_INFLATION` times (groups - 1), and
-        NaN if a group has fewer than two clusters.
+        The statistic is the number of rows times `explained_fraction`, that is the sum
+        over groups of weight * (rate of the group - overall rate)^2, divided by the
+        variance of a prediction. With independent rows, its expectation is (groups -
+        1). With clusters, it is (groups - 1) times the design effect (Rao and Scott
+        1981, section 3).
+
+        In that case the expectation of the sum is the sum of weight * variance of the
+        group's rate, minus rows * variance of the overall rate. Both are estimated from
+        the residuals of clusters. The result is at least `MIN_INFLATION` times (groups
+        - 1). It is NaN if a group has fewer than two clusters.
 
         Args:
             group: (n,) the group of each prediction.
@@ -263,28 +278,27 @@ class ClusteredPredictions:
         if self.is_independent:
             return float(n_groups - 1)
 
-        residual = self._weighted_residual(group, group_weight, is_used)
-
         # A cell is a cluster inside a group; `cell` (n,) is that of each prediction.
         cell_id, cell = np.unique(
             group * self.n_clusters + self.cluster, return_inverse=True
         )
         cell_group, cell_cluster = np.divmod(cell_id, self.n_clusters)  # (cells,) each
-        cell_residual = np.bincount(cell.reshape(-1), residual)
-        clusters_per_group = np.bincount(cell_group, minlength=len(group_weight))[
-            is_used
-        ]
-        # a variance inside each group needs two clusters there, and that of the overall
-        # rate more clusters than groups
+        clusters_per_group = np.bincount(cell_group, minlength=len(group_weight))
+        # The variance inside a group needs two clusters there, and that of the overall
+        # rate more clusters than groups.
         has_enough_clusters = self.n_clusters >= 2 and self.n_clusters > n_groups
-        if not has_enough_clusters or clusters_per_group.min() < 2:
+        if not has_enough_clusters or clusters_per_group[is_used].min() < 2:
             return math.nan
 
+        residual = self._weighted_residual(group, group_weight, is_used)
+        cell_residual = np.bincount(cell.reshape(-1), residual)
         squared_residual = np.bincount(
             cell_group, cell_residual**2, minlength=len(group_weight)
-        )[is_used]
+        )
         within_groups = within_group_variance(
-            squared_residual, clusters_per_group, group_weight[is_used]
+            squared_residual[is_used],
+            clusters_per_group[is_used],
+            group_weight[is_used],
         )
         between_clusters = self._between_cluster_variance(cell_cluster, cell_residual)
         return max(
@@ -303,7 +317,7 @@ class ClusteredPredictions:
         Args:
             group: (n,) the group of each prediction.
             group_weight: (groups,) sum of the weights.
-            is_used: (groups,) whether a group has any prediction; others have no rate.
+            is_used: (groups,) whether a group has any prediction, and so a rate.
         """
         n_correct = np.bincount(group, self.weight * self.correct)
         group_rate = np.divide(
@@ -315,9 +329,11 @@ class ClusteredPredictions:
     def _between_cluster_variance(
         self, cell_cluster: IntArray, cell_residual: npt.NDArray[Any]
     ) -> float:
-        """Return the variance of the overall rate, multiplied by the number of rows.
+        """Return the number of rows times the variance of the overall rate.
 
-        It is estimated from how the residuals of clusters scatter.
+        With K clusters, whose weighted residuals have the sums r, the variance of the
+        overall rate is sum(r^2) * K / (K - 1) / rows^2. The factor K / (K - 1) makes it
+        unbiased.
 
         Args:
             cell_cluster: (cells,) the cluster of each cell.
@@ -325,8 +341,8 @@ class ClusteredPredictions:
         """
         cluster_residual = np.bincount(cell_cluster, cell_residual)
         sum_of_squares = float((cluster_residual**2).sum())
+        # rows * variance: one of the two divisions by the rows cancels out
         return (
-            # n / (n - 1), as in an unbiased variance
             sum_of_squares * self.n_clusters / (self.n_clusters - 1) / len(self.correct)
         )
 
@@ -336,16 +352,16 @@ class ClusteredPredictions:
         """Return the p-value of the interaction of two factors.
 
         The statistic of a grouping is the number of rows times its explained fraction.
-        Without an interaction, the statistic of both factors together is the sum of
-        those of each. The excess over this sum is the test statistic. For independent
-        rows its distribution is chi-squared with (cells - first groups - second groups
-        + 1) degrees of freedom. With clusters it is divided by its expectation, and its
-        distribution is F. The p-value is 1 if there are too few clusters.
+        Without an interaction, the statistic of both factors together is the sum of the
+        statistics of each. The excess over this sum is the test statistic. If rows are
+        independent, its distribution is chi-squared with (cells - first groups - second
+        groups + 1) degrees of freedom. With clusters it is divided by its expectation,
+        and its distribution is F. The p-value is 1 if there are too few clusters.
 
         Args:
             joint_group: (n,) the group of each prediction by both factors.
-            first_group: (n,) by the first factor alone.
-            second_group: (n,) by the second factor alone.
+            first_group: (n,) its group by the first factor alone.
+            second_group: (n,) its group by the second factor alone.
         """
         joint_fraction, n_cells = self.explained_fraction(joint_group)
         first_fraction, n_first = self.explained_fraction(first_group)
@@ -360,7 +376,7 @@ class ClusteredPredictions:
         expected -= self.expected_statistic(first_group)
         expected -= self.expected_statistic(second_group)
         error_degrees = self.n_clusters - degrees - 1
-        is_known = expected > 0.0  # NaN is not
+        is_known = expected > 0.0  # False for NaN
         if not is_known or error_degrees < 1:
             return 1.0
         return float(f_distribution.sf(statistic / expected, degrees, error_degrees))
@@ -373,18 +389,20 @@ def within_group_variance(
 ) -> float:
     """Return the sum over groups of weight * variance of the group's rate.
 
-    Each variance is estimated from how the residuals of clusters scatter in the group.
+    In a group with K clusters, whose weighted residuals have the sums r, the variance
+    of the rate is sum(r^2) * K / (K - 1) / weight^2. The factor K / (K - 1) makes it
+    unbiased.
 
     Args:
-        squared_residual: (k,) sum of the squared residuals of the clusters.
-        clusters_per_group: (k,) at least 2 each.
-        group_weight: (k,) sum of the weights.
+        squared_residual: (k,) sum(r^2) of each group.
+        clusters_per_group: (k,) number of clusters of each group, at least 2.
+        group_weight: (k,) sum of the weights in each group.
     """
-    # n / (n - 1), as in an unbiased variance
-    variance_of_group = (
+    # weight * variance: one of the two divisions by the weight cancels out
+    weighted_variance = (
         squared_residual * clusters_per_group / (clusters_per_group - 1) / group_weight
     )
-    return float(variance_of_group.sum())
+    return float(weighted_variance.sum())
 
 
 def noncentrality_interval(
@@ -400,8 +418,8 @@ def noncentrality_interval(
         degrees: degrees of freedom.
         error_degrees: degrees of freedom of F's denominator; infinity for chi-squared.
     """
-    # By chance alone the statistic is expected to be its degrees of freedom. If it is
-    # smaller, the upper bound would be too small.
+    # The expected statistic of a factor without effect is its degrees of freedom. A
+    # smaller statistic would give an upper bound that is too small.
     upper_statistic = max(statistic, float(degrees))
     tail = (1.0 - statistics.intervals.CONFIDENCE) / 2.0
     lower = find_noncentrality(statistic, degrees, error_degrees, 1.0 - tail)
@@ -438,7 +456,7 @@ def find_noncentrality(
                 central if is_central else ncf(degrees, error_degrees, noncentrality)
             )
             cumulative = distribution.cdf(statistic / degrees)
-        # NaN: the noncentrality is too large for the distribution to be computed.
+        # scipy returns NaN for a noncentrality that is too large: P is then about 0.
         return float(np.nan_to_num(cumulative)) - probability
 
     if excess_probability(0.0) <= 0.0:

@@ -1,7 +1,7 @@
 """Render images that test what rows suggest.
 
-Fresh configurations inside rules, configurations along one factor from a failure, and
-failures once more.
+These are fresh configurations inside rules, configurations along one factor from a
+failure, and failures once more.
 """
 
 from __future__ import annotations
@@ -45,11 +45,12 @@ from advsearch.questions.explain.sweeps import (
 )
 
 MAX_ARCS = 2
-"""Arcs of a circle that a condition on an angle has, at most."""
+"""Maximum number of arcs of a condition on an angle."""
 MIN_UNCOVERED_FRACTION = 0.2
-"""Lower limit of the fraction of a rule that no earlier rule covers.
+"""Lower limit of the fraction of a rule's rows that no earlier rule covers.
 
-More configurations are rendered the smaller it is, so that enough are left.
+The number of configurations to render is divided by this fraction, so that enough of
+them are left.
 """
 
 
@@ -59,12 +60,13 @@ class Renders:
 
     Attributes:
         context: context of the experiment.
-        sweeps: whose rows are explained.
-        rows: rows of these.
-        table: what varies among the rows (`rules`).
-        n_renders: images that were rendered.
+        sweeps: sweeps whose rows are explained.
+        rows: their rows with all columns.
+        table: the same rows with the columns of the parameters that vary.
+            `attrs["units"]` maps these parameters, the factors, to their units.
+        n_renders: number of images that were rendered.
         interrupted: whether Ctrl-C has ended the renders.
-        warnings: sentences about renders that could not be made.
+        warnings: sentences about renders that failed.
     """
 
     context: RunContext[Any]
@@ -84,7 +86,7 @@ class Renders:
 
     @property
     def pairs_sought(self) -> int:
-        """Failures for which images were rendered to find a pair."""
+        """The number of failures for which images were rendered to find a pair."""
         return len(self._tried_failures)
 
     def render_rows(self, name: str, config: SweepConfig) -> pd.DataFrame | None:
@@ -106,7 +108,8 @@ class Renders:
         try:
             self.context.run_part(name, config)
         except InputError as error:
-            if str(error) not in self._errors:  # once for all pairs of a kind
+            # The same error, such as a missing scene, is reported only once.
+            if str(error) not in self._errors:
                 self._errors.add(str(error))
                 self.warnings.append(f"Nothing was rendered for {name}: {error}")
             return None
@@ -126,9 +129,8 @@ class Renders:
     ) -> Confirmation | None:
         """Confirm a rule by fresh configurations that no earlier rule covers.
 
-        They are rendered in the scene of each sweep. The rule is confirmed if it is
-        significant with the fresh rows as its inside, compared with the old rows
-        elsewhere.
+        They are rendered in the scene of each sweep. The rule is confirmed if the fresh
+        rows inside it are wrong significantly more often than the old rows elsewhere.
 
         Args:
             counted_rules: all rules, in their order.
@@ -142,20 +144,18 @@ class Renders:
         rule = counted_rules[index]
         earlier_conditions = [earlier.conditions for earlier in counted_rules[:index]]
         covered_rows = self.table[rules.find_covered(rule.conditions, self.table)]
-        # Renders that earlier rules cover are left out, too. So the smaller the
-        # fraction that stays, the more configurations are rendered.
-        uncovered_fraction = max(
-            float(is_outside(earlier_conditions, covered_rows).mean()),
-            MIN_UNCOVERED_FRACTION,
-        )
-
+        # Fresh rows that earlier rules cover are left out afterwards. The smaller the
+        # fraction of the others, the more configurations are rendered.
+        is_uncovered = is_outside(earlier_conditions, covered_rows)
+        uncovered_fraction = max(float(is_uncovered.mean()), MIN_UNCOVERED_FRACTION)
         fresh_frames = self._render_inside(
             index, rule, uncovered_fraction, earlier_conditions
         )
-
         fresh_rows = pd.concat(fresh_frames) if fresh_frames else self.rows[:0]
         if fresh_rows.empty:
             return None
+        # The indices of draws become texts, as they are in fresh rows ("12 of 3"): so
+        # old and fresh draws can be compared, and are distinct.
         elsewhere = rule.elsewhere.assign(unit=rule.elsewhere["unit"].astype(str))
         fresh_rule = rules.CountedRule(rule.conditions, fresh_rows, elsewhere)
         return Confirmation(**vars(count_right(fresh_rows)), confirmed=fresh_rule.holds)
@@ -169,8 +169,8 @@ class Renders:
     ) -> list[pd.DataFrame]:
         """Render fresh configurations inside a rule in the scene of each sweep.
 
-        A condition on an angle may be two arcs of the circle, such as 0 to 20 and 340
-        to 360 degrees. Then each arc has a sweep of its own.
+        A condition on an angle may have two opposite arcs of the circle, such as 10 to
+        30 and 190 to 210 degrees. Then there is a sweep for each arc.
 
         Args:
             index: index of the rule.
@@ -179,7 +179,8 @@ class Renders:
             earlier_conditions: conditions of the rules before it.
 
         Returns:
-            A frame for each sweep, whose units are distinct from those of others.
+            The rows of each sweep. Their draws (column `unit`) have texts as names,
+            which are distinct from those of other sweeps.
         """
         fresh_frames = []
         for sweep_index, sweep in enumerate(self.sweeps):
@@ -188,7 +189,7 @@ class Renders:
                 self.config.confirm / len(self.sweeps) / n_arcs / uncovered_fraction
             )
             for arc in range(n_arcs):
-                # distinct for each rule, sweep and arc
+                # a number that is distinct for each rule, sweep and arc
                 number = (index * len(self.sweeps) + sweep_index) * MAX_ARCS + arc
                 seed = seeds.stream(self.config.seed, "confirm", number)
                 self.progress.message(
@@ -205,7 +206,7 @@ class Renders:
                 if rows is None:
                     continue
                 inside = select_inside(rows, rule.conditions, earlier_conditions)
-                # draws of other sweeps may have the same numbers
+                # Draws of other sweeps may have the same indices.
                 unit = inside["unit"].astype(str) + f" of {number}"
                 fresh_frames.append(inside.assign(unit=unit))
         return fresh_frames
@@ -220,9 +221,9 @@ class Renders:
 
         That configuration differs from the failure in one parameter. First all
         parameters of the failure's rule are tried, and the one with the smallest
-        relative change is taken. If none of these makes the prediction right, the other
-        parameters are tried one by one, and the first that does is taken. If no single
-        parameter does, the failure has no pair.
+        relative change is used. If none of these makes the prediction right, the other
+        parameters are tried one by one, and the first one that does is used. If none
+        does, the failure has no pair.
 
         Args:
             counted_rules: all rules, in their order.
@@ -235,7 +236,7 @@ class Renders:
                 for factor in self.table.attrs["units"]
                 if factor not in rule_factors
             ]
-            # first all factors of the rule, then the others one by one
+            # groups to try: all factors of the rule, then each other factor by itself
             for factors in (rule_factors, *([factor] for factor in other_factors)):
                 attempts = [
                     self._find_nearest_right(f"pair-{number}", index, factor)
@@ -249,7 +250,7 @@ class Renders:
     def _relative_change(self, pair: NearestRight) -> float:
         """Return the difference of a pair as a fraction of the factor's range.
 
-        Names have no distance: any other name is a difference of 1.
+        Names have no distance: the difference of two names is 1.
         """
         column = self.table[pair.parameter]
         if column.dtype == "category":
@@ -338,15 +339,15 @@ class Renders:
     def _find_nearest_value(
         self, factor: str, is_right: rules.Mask, values: Sequence[Any], wrong_value: Any
     ) -> int:
-        """Return the index of the right value that is nearest to the wrong one.
+        """Return the index of the value that is predicted right and nearest to a value.
 
-        All names are equally near, so of names it is the first that is right.
+        Names have no distance: for names, it is the first one that is predicted right.
 
         Args:
             factor: factor that has the values.
-            is_right: whether each value is predicted right.
+            is_right: whether the prediction at each value is right.
             values: numbers or names.
-            wrong_value: one of them.
+            wrong_value: the value of the failure, which is among them.
         """
         right_indices = np.flatnonzero(is_right).tolist()
         if self.table[factor].dtype == "category":
@@ -358,7 +359,14 @@ class Renders:
         return nearest_index
 
     def _list_thumbnails(self, name: str, numbers: Sequence[int]) -> list[str]:
-        """Return the stored images of a part, as paths inside the run directory."""
+        """Return paths of stored images of a sweep, relative to the run directory.
+
+        Empty if the sweep was not rendered; images that were not stored are left out.
+
+        Args:
+            name: name of the sweep in the directory of this experiment.
+            numbers: indices of the images.
+        """
         sweep = self._rendered.get(name)
         if sweep is None:
             return []
@@ -375,17 +383,18 @@ class Renders:
     def find_clusters(self) -> FailureClusters | None:
         """Render failures of one model again, and cluster them by its features.
 
-        None if no clusters were requested, if there are no failures, or if they could
-        not be rendered; then a warning is added.
+        None if no clusters were requested, or if there are no failures. None, too, if
+        they could not be rendered; then a warning is added.
         """
         selected = self._select_sweeps()
         failing = self.rows[~self.rows["correct"] & self.rows["sweep"].isin(selected)]
+        # Without a selected sweep there are no failures.
         if self.interrupted or not self.config.clusters or failing.empty:
             return None
         self._warn_about_selection(selected)
         sampled = self._sample_failures(failing)
         self.progress.stage(
-            "rendering failures again", len(sampled), hint="`clusters` says how many"
+            "rendering failures again", len(sampled), hint="`clusters` sets how many"
         )
         rendered = self._render_failures(sampled)
         if rendered is None:
@@ -417,9 +426,9 @@ class Renders:
             sampled: their rows, sorted by sweep.
 
         Returns:
-            The images (n, H, W, 3) in the order of the rows, and what computes the
-            features of the model. None if it was interrupted, or they could not be
-            rendered, of which there is a warning.
+            The images (n, H, W, 3) in the order of the rows, and the function that
+            computes the model's features. None if the user has interrupted it, or if
+            an image could not be rendered; then a warning is added.
         """
         try:
             with self.context.until_interrupted():
@@ -435,16 +444,21 @@ class Renders:
             return None
         self.n_renders += len(sampled)
         images = torch.cat([batch_images for batch_images, _ in batches])
-        _, compute_features = batches[0]  # the same in all: there is one model
+        # All batches have the same function, since there is one model.
+        _, compute_features = batches[0]
         return images, compute_features
 
     def _warn_about_selection(self, selected: Sequence[int]) -> None:
-        """Add a warning if failures of one of several models are clustered."""
+        """Add a warning if not all sweeps have failures of the clustered model.
+
+        Args:
+            selected: indices of the sweeps with that model, at least one.
+        """
         if len(selected) < len(self.sweeps):
             name = self.sweeps[selected[0]].config.model
             self.warnings.append(
-                f"Kinds are of the failures of model {name} alone, "
-                "where it was swept by itself."
+                f"Only failures of model {name} were clustered, from sweeps of this "
+                "model alone."
             )
 
     def _sample_failures(self, failing: pd.DataFrame) -> pd.DataFrame:
@@ -456,7 +470,13 @@ class Renders:
     def _describe_cluster(
         self, number: int, rows: pd.DataFrame, image: torch.Tensor
     ) -> FailureCluster:
-        """Describe a cluster by its rows, and store its typical image (H, W, 3)."""
+        """Describe a cluster by its rows, and store its typical image.
+
+        Args:
+            number: number of the cluster, from 1.
+            rows: rows of its failures, the most typical first.
+            image: (H, W, 3) image of the most typical one.
+        """
         path = self.context.run.save_image(f"cluster-{number}", image)
         return FailureCluster(
             failures=len(rows),
@@ -468,13 +488,17 @@ class Renders:
     def _select_sweeps(self) -> list[int]:
         """Return the indices of the sweeps whose failures are clustered.
 
-        Features are those of one model: the first one that was swept by itself. Without
-        such a model no sweep is selected.
+        Features are those of one model: the first one that has a sweep with no other
+        model. If there is none, no sweep is selected.
         """
         models_of_sweeps = [sweep.config.models for sweep in self.sweeps]
-        single = next((names for names in models_of_sweeps if len(names) == 1), None)
+        single_model = next(
+            (names for names in models_of_sweeps if len(names) == 1), None
+        )
         return [
-            index for index, names in enumerate(models_of_sweeps) if names == single
+            index
+            for index, names in enumerate(models_of_sweeps)
+            if names == single_model
         ]
 
     def render_again(
@@ -484,14 +508,14 @@ class Renders:
 
         Args:
             sweep: the sweep.
-            numbers: numbers of the images.
+            numbers: indices of the images in the sweep.
 
         Returns:
-            The images (n, H, W, 3) as the model sees them, and what computes its
-            features.
+            The images (n, H, W, 3) as the model sees them, and the function that
+            computes its features.
 
         Raises:
-            InputError: the scene is no longer available, or the task is another than
+            InputError: the scene is no longer available, or the task is not
                 classification.
         """
         features = sweep.scenes.find_features()
@@ -505,9 +529,12 @@ class Renders:
 def count_arcs(config: SweepConfig, conditions: rules.RuleConditions) -> int:
     """Return the number of sweeps that cover the arcs of conditions on angles.
 
-    A condition on an angle may be two arcs of the circle, each of which needs a sweep;
-    conditions on other factors have no arcs, and need one sweep.
+    A condition on an angle may have two opposite arcs of the circle, each of which
+    needs a sweep. Conditions on other factors have no arcs, and need one sweep. If two
+    angles have two arcs each, two sweeps are used, too: `cut_controls` combines the
+    first arcs in one of them and the second arcs in the other.
     """
+    # The range of a factor that is not sampled is not cut to arcs.
     n_arcs = [
         len(condition.arcs)
         for condition in conditions
@@ -521,7 +548,10 @@ def select_inside(
     conditions: rules.RuleConditions,
     earlier_conditions: Sequence[rules.RuleConditions],
 ) -> pd.DataFrame:
-    """Return the rows in view that a rule covers and that no earlier rule covers."""
+    """Return the rows of a rule that no earlier rule covers.
+
+    Rows in which the object is out of view are left out.
+    """
     is_inside = rules.find_covered(conditions, rows) & is_outside(
         earlier_conditions, rows
     )
@@ -531,11 +561,11 @@ def select_inside(
 def is_outside(
     rule_conditions: Sequence[rules.RuleConditions], rows: pd.DataFrame
 ) -> rules.Mask:
-    """Return the mask (n,) of the rows that no rule covers."""
-    mask = np.ones(len(rows), np.bool_)
+    """Return whether each row is covered by no rule, (n,) bool."""
+    is_uncovered = np.ones(len(rows), np.bool_)
     for conditions in rule_conditions:
-        mask &= ~rules.find_covered(conditions, rows)
-    return mask
+        is_uncovered &= ~rules.find_covered(conditions, rows)
+    return is_uncovered
 
 
 def find_typical_failures(
@@ -543,21 +573,21 @@ def find_typical_failures(
 ) -> list[tuple[int, rules.RuleConditions]]:
     """Return the indices of failures, the most typical first, each with its rule.
 
-    A failure belongs to the first rule that covers it; failures that no rule covers
-    form a last group, without conditions. The most typical failure of a rule is the one
-    nearest to the mean of its failures, where parameters are replaced by their ranks.
-    The list has the most typical failure of each group, then the second one of each,
-    and so on.
+    A failure belongs to the group of the first rule that covers it. Failures that no
+    rule covers form a last group, without conditions. The most typical failure of a
+    group is the one nearest to the mean of the group, where the values of parameters
+    are replaced by their ranks. The list has the most typical failure of each group,
+    then the second one of each, and so on.
 
     Args:
         table: the rows.
         counted_rules: the rules.
-        limit: failures that are returned, at most.
+        limit: maximum number of failures that are returned.
     """
     ranks = _rank_rows(table)  # (n, parameters)
     is_unassigned: rules.Mask = ~table["correct"].to_numpy()
-    no_conditions: rules.RuleConditions = ()  # cover every row
-    # for each rule its failures, the most typical first
+    no_conditions: rules.RuleConditions = ()  # these cover every row
+    # the failures of each group, the most typical first
     queues = []
     for conditions in (*(rule.conditions for rule in counted_rules), no_conditions):
         indices = np.flatnonzero(is_unassigned & rules.find_covered(conditions, table))
@@ -569,14 +599,18 @@ def find_typical_failures(
         queues.append([(index, conditions) for index in most_typical_first])
     failures = []
     for turn in zip_longest(*queues):
-        # a rule whose queue has ended has None
+        # `zip_longest` yields None for a queue that has ended.
         failures += [failure for failure in turn if failure is not None]
     return failures[:limit]
 
 
 def _rank_rows(table: pd.DataFrame) -> rules.FloatArray:
-    """Return the rank of each row in each parameter, (n, parameters), as a fraction."""
-    columns = [table[name] for name in table.attrs["units"]]
+    """Return the rank of each row in each parameter, (n, parameters), as a fraction.
+
+    Rows with equal values have different ranks.
+    """
+    parameters = list(table.attrs["units"])
+    columns = [table[name] for name in parameters]
     values = [
         column.cat.codes if column.dtype == "category" else column for column in columns
     ]

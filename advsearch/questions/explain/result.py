@@ -13,24 +13,24 @@ from advsearch.extend import ResultPart, RunResult, ShownResult, results, views,
 class RightCounts(results.Fields):
     """Counts of right predictions with an interval."""
 
-    right: int = Field(description="right predictions")
-    total: int = Field(alias="of", description="how many")
-    interval: results.Interval = Field(description="of the share, 95 %")
+    right: int = Field(description="number of right predictions")
+    total: int = Field(alias="of", description="number of predictions")
+    interval: results.Interval = Field(description="95 % interval of the fraction")
     share: float | None = Field(
         default=None,
-        description="right ones of all; where rows share draws, the mean over draws of "
-        "the share of each",
+        description="fraction of right predictions; if rows share draws, the mean over "
+        "draws of the fraction of each; null without rows",
     )
     outcomes: results.Outcomes = results.optional_field(
-        f"{results.OUTCOME_TEXT} in the other ones; {results.ONLY_OF_BOXES}"
+        f"{results.OUTCOME_TEXT} in the other predictions; {results.ONLY_OF_BOXES}"
     )
 
     @property
     def text(self) -> str:
-        """The fraction with its interval and total: ``12 % (9 to 16) of 340``.
+        """The fraction with its interval and total, ``12 % (9 to 16) of 340``.
 
-        Of a detector also the outcomes of the others: ``... of 340 (250 missed, 49
-        loose)``.
+        For a detector it has the outcomes of the wrong predictions, too: ``... of 340
+        (250 missed, 49 loose)``.
         """
         share = wording.format_fraction_of(
             self.right, self.total, self.interval, self.share
@@ -39,7 +39,7 @@ class RightCounts(results.Fields):
         return f"{share} ({outcomes})" if outcomes else share
 
     def make_extent(self, counted_text: str) -> results.Extent:
-        """Return the counts for a claim; `counted_text` says what is counted."""
+        """Return the counts for a claim; `counted_text` states what is counted."""
         return results.Extent.from_count(
             counted_text,
             self.right,
@@ -51,42 +51,49 @@ class RightCounts(results.Fields):
 
 
 class Confirmation(RightCounts):
-    """Fresh renders inside a rule that no rule before it covers."""
+    """Counts of fresh renders inside a rule that no earlier rule covers."""
 
     confirmed: bool = Field(
         default=False,
-        description="whether they confirm it: they alone, beside the "
-        "rows elsewhere, tell the rule",
+        description="whether these renders confirm the rule: compared with the rows "
+        "elsewhere, they alone are significant",
     )
 
 
 class RuleRow(RightCounts):
     """A rule under which the model is wrong more often than elsewhere.
 
-    It is counted on rows that did not choose it.
+    Its counts are from rows that did not choose it.
     """
 
-    conditions: list[results.ConditionRow] = Field(description="all of which hold")
-    elsewhere: RightCounts = Field(description="rows under no rule so far")
+    conditions: list[results.ConditionRow] = Field(
+        description="conditions of the rule, all of which hold under it"
+    )
+    elsewhere: RightCounts = Field(
+        description="counts of the rows under neither this rule nor an earlier one"
+    )
     confirmed: Confirmation | None = Field(
-        description="fresh renders drawn inside the rule, and `confirmed`, whether they "
-        "tell it again; null where none were "
-        "asked for"
+        description="counts of fresh renders inside the rule, and whether they confirm "
+        "it; null if nothing was rendered"
     )
 
 
 class RejectedRule(RightCounts):
     """The best rule that is not significant, counted on rows that did not choose it."""
 
-    conditions: list[results.ConditionRow] = Field(description="all of which hold")
-    elsewhere: RightCounts = Field(description="rows under no rule so far")
-    chance: float = Field(
-        description="how likely so few right predictions are by chance"
+    conditions: list[results.ConditionRow] = Field(
+        description="conditions of the rule, all of which hold under it"
     )
-    p_value_limit: float = Field(description="how unlikely they would have to be")
+    elsewhere: RightCounts = Field(
+        description="counts of the rows under neither this rule nor an earlier one"
+    )
+    chance: float = Field(
+        description="p-value: probability of so few right predictions by chance"
+    )
+    p_value_limit: float = Field(description="maximum p-value of a significant rule")
     rows: int | None = Field(
-        description="of so many rows, with these shares, it would "
-        "be told; null where of none"
+        description="number of rows that would make the rule significant, with these "
+        "fractions; null if no number would"
     )
 
 
@@ -95,13 +102,14 @@ class ParameterWeight(results.Fields):
 
     parameters: list[str]
     share: results.JsonFloat = Field(
-        description="of the variance of the predictions, by which of its parts a value "
-        "lies in"
+        description="fraction of the variance of the predictions that is between parts "
+        "of the parameter's values"
     )
-    interval: results.Interval = Field(description="of the share, 95 %")
+    interval: results.Interval = Field(description="95 % interval of the fraction")
     parts: int = Field(
         default=0,
-        description="into how many its values were cut, of two all pairs of parts",
+        description="number of parts into which the values are divided; for two "
+        "parameters, the number of pairs of parts",
     )
 
 
@@ -109,58 +117,72 @@ class EnvelopeRow(RightCounts):
     """A box of values inside which the model has at least an accuracy."""
 
     conditions: list[results.ConditionRow] = Field(
-        description="all of which hold; empty for everything that was looked at"
+        description="conditions of the box, all of which hold inside it; empty if the "
+        "box has all rows"
     )
-    accuracy: float = Field(description="what was asked for")
+    accuracy: float = Field(description="required accuracy")
     confirmed: bool = Field(
-        description="whether the rows that did not choose the box show it"
+        description="whether the rows that did not choose the box have that accuracy, "
+        "at 95 % confidence"
     )
 
 
 class NearestRight(results.Fields):
     """A failure and the nearest right configuration that differs in one value."""
 
-    values: dict[str, str | float] = Field(description="of the failure")
-    parameter: str = Field(description="the one that differs")
-    unit: str
-    wrong_at: str | float
-    right_at: str | float
-    failure_label: str = Field(description="what the model says of the failure")
-    right_label: str = Field(description="what it says of the other")
+    values: dict[str, str | float] = Field(
+        description="values of the parameters of the failure"
+    )
+    parameter: str = Field(description="the parameter that differs")
+    unit: str = Field(description="unit of that parameter")
+    wrong_at: str | float = Field(description="its value in the failure")
+    right_at: str | float = Field(description="its value in the right configuration")
+    failure_label: str = Field(description="prediction for the failure")
+    right_label: str = Field(description="prediction for the right configuration")
     pictures: list[str] = Field(
-        description="files in the run's folder: of the failure, and of the other"
+        description="files in the run's folder: image of the failure, and of the right "
+        "configuration"
     )
 
 
 class FailureCluster(results.Fields):
     """Failures that look alike to the model."""
 
-    failures: int = Field(description="how many of those that were rendered again")
+    failures: int = Field(description="number of failures in the cluster")
     labels: dict[str, int] = Field(
-        description="what the model says of them, and how often"
+        description="predictions for these failures, with their counts"
     )
-    values: dict[str, str | float] = Field(description="of the most typical one")
-    picture: str = Field(description="of it: a file in the run's folder")
+    values: dict[str, str | float] = Field(
+        description="values of the parameters of the most typical failure"
+    )
+    picture: str = Field(
+        description="image of the most typical failure: a file in the run's folder"
+    )
 
 
 class FailureClusters(results.Fields):
-    """Failures, clustered by the features that the model decides by."""
+    """Failures, clustered by features of the model."""
 
-    features: str = Field(description="what these are")
-    failures: int = Field(description="failures that were rendered again")
+    features: str = Field(
+        description='description of the features, such as "the input of head (Linear), '
+        '192 numbers"'
+    )
+    failures: int = Field(description="number of failures that were rendered again")
     silhouette: float | None = Field(
-        description="how well they are apart, -1 to 1; null where all are one cluster"
+        description="mean silhouette, -1 to 1, which is larger for clusters that are "
+        "farther apart; null if there is a single cluster"
     )
     are_separated: bool = Field(
-        description="whether they are farther apart than groups of a cloud without any"
+        description="whether the silhouette is larger than that of random points "
+        "without clusters"
     )
-    listed: list[FailureCluster] = Field(description="the largest first")
+    listed: list[FailureCluster] = Field(description="clusters, the largest first")
 
 
 class ExplainResult(RunResult, RightCounts):
     """Rules, importance and clusters of a model's failures, from the rows of sweeps.
 
-    `right` and `of` are those of all rows.
+    `right`, `of`, `share` and `outcomes` are those of all rows.
     """
 
     command: ClassVar[str] = "explain"
@@ -170,29 +192,31 @@ class ExplainResult(RunResult, RightCounts):
     model: str
     units: int | None = Field(
         default=None,
-        description="draws that the rows are of, such as [drives](drives.md), where "
-        "some share one; absent where none "
-        "do",
+        description="number of independent draws, such as [drives](drives.md), if "
+        "several rows share a draw; absent if each row is a draw",
     )
-    parameters: list[str] = Field(description="what varies in all of the rows")
+    parameters: list[str] = Field(description="parameters that vary in all sweeps")
     rules: list[RuleRow]
     rejected_rule: RejectedRule | None = Field(
-        default=None, description="the next rule, which is not told; absent without"
+        default=None,
+        description="the next rule, which is not significant; absent if there is none",
     )
     importance: list[ParameterWeight] = Field(
-        description="empty where all predictions are the same"
+        description="empty if all predictions are right, or all are wrong"
     )
-    envelope: EnvelopeRow | None = Field(description="null where no box promises it")
+    envelope: EnvelopeRow | None = Field(
+        description="null if no box of enough rows has the required accuracy"
+    )
     pairs: list[NearestRight]
     pairs_sought: int = Field(
         default=0,
-        description="failures for which one was looked for by renders, the most "
-        "typical; others are left out",
+        description="number of failures, the most typical ones, for which a right "
+        "configuration was searched by renders",
     )
     clusters: FailureClusters | None = Field(
-        default=None, description="null where nothing was rendered for them"
+        default=None, description="null if no failures were rendered again"
     )
-    renders: int = Field(description="pictures that were rendered")
+    renders: int = Field(description="number of images that were rendered")
     warnings: list[str] = Field(description="sentences that a reader has to know")
 
     @property
@@ -201,16 +225,16 @@ class ExplainResult(RunResult, RightCounts):
 
 
 RULES_NOTE = (
-    "Chosen on one half of the rows and counted on the other, each beyond the rules "
-    "before it; 95 % intervals. Chance alone would tell any rule in one of a hundred "
-    "cases at most. The search of the sweep's page takes the words of a rule and shows "
-    "the pictures under it."
+    "Rules are chosen on one half of the rows and counted on the other half. Rows "
+    "under an earlier rule are left out. Intervals are 95 % intervals. If there were "
+    "no rules, chance would produce one in at most one of a hundred cases. The text of "
+    "a rule, entered in the search field of the sweep's page, shows its images."
 )
 IMPORTANCE_NOTE = (
-    "The share of the variance of the predictions, right or wrong, that is between "
+    "The fraction of the variance of the predictions, right or wrong, that is between "
     "parts of a parameter's values with equally many rows: its first-order Sobol "
-    "index, by parts. Two parameters stand together where they decide more than each "
-    "by itself. What differs inside a part is not counted."
+    "index, by parts. Two parameters are listed together if they decide more than the "
+    "sum of both. Differences inside a part are not counted."
 )
 WEIGHT_COLUMNS: Mapping[str, views.Column] = {
     "parameters": lambda weight: " with ".join(weight.parameters),
@@ -219,9 +243,9 @@ WEIGHT_COLUMNS: Mapping[str, views.Column] = {
     "by parts": lambda weight: str(weight.parts or ""),
 }
 MAX_WEIGHTS = 12
-"""Rows of the table of weights that a view has."""
+"""Maximum number of rows in the table of weights."""
 MAX_LABELS = 3
-"""Predictions of a cluster that a caption names."""
+"""Maximum number of predictions of a cluster in a caption."""
 
 
 def make_explain_view(result: ExplainResult) -> ShownResult:
@@ -234,11 +258,10 @@ def make_explain_view(result: ExplainResult) -> ShownResult:
         f"{number}. {describe_rule_row(number, rule)}"
         for number, rule in enumerate(result.rules, start=1)
     ]
+    rule_sentences.append(describe_rejected_rule(result))  # "" if there is none
     note = RULES_NOTE if result.rules else ""
     sections = [
-        ResultPart(
-            "Rules", [*rule_sentences, describe_rejected_rule(result)], note=note
-        ),
+        ResultPart("Rules", rule_sentences, note=note),
         ResultPart.make_table(
             result.importance[:MAX_WEIGHTS],
             WEIGHT_COLUMNS,
@@ -254,6 +277,7 @@ def make_explain_view(result: ExplainResult) -> ShownResult:
         sections.append(_cluster_section(result.clusters))
     draws = f", of {result.units:,} independent draws" if result.units else ""
     facts = {
+        # for example "right in 88 % (84 to 91) of 340, of 20 independent draws"
         "rows": f"right in {result.text}{draws}",
         "sweeps": ", ".join(result.sweeps),
         "parameters": ", ".join(result.parameters),
@@ -266,7 +290,7 @@ def _make_headline(result: ExplainResult) -> str:
     """Return the sentence that a reader sees first: how many rules there are."""
     if not result.rules:
         return (
-            f"No rule is told from chance in {result.total:,} rows, of which one half "
+            f"No rule is significant in {result.total:,} rows, of which one half "
             f"chooses and the other counts: the model is right in {result.text}."
         )
     return (
@@ -294,15 +318,19 @@ def _pair_section(pair: NearestRight) -> ResultPart:
 
 
 def _format_value(value: str | float) -> str:
+    """Format a number with four significant digits; return a name as it is."""
     return value if isinstance(value, str) else f"{value:.4g}"
 
 
 def describe_rule_row(number: int, rule: RuleRow) -> str:
     """Describe a rule with its counts and its confirmation in a sentence.
 
-    `number` counts from 1.
+    Args:
+        number: number of the rule, from 1.
+        rule: the rule. Its `text`, and that of other counts, is such as "12 % (9 to 16)
+            of 340".
     """
-    rest = "elsewhere" if number == 1 else "in what no rule before covers"
+    rest = "elsewhere" if number == 1 else "in rows under no earlier rule"
     text = (
         f"{wording.format_conditions(rule.conditions)}: right in {rule.text}; {rest} "
         f"{rule.elsewhere.text}."
@@ -323,43 +351,43 @@ def list_rule_triggers(result: ExplainResult) -> Iterator[str]:
 
 
 def describe_rejected_rule(result: ExplainResult) -> str:
-    """Describe the best rule that is not significant, and how many rows it would take.
+    """Describe the best rule that is not significant, and how many rows it needs.
 
-    Empty if there is none.
+    "" if there is none.
     """
     rule = result.rejected_rule
     if rule is None:
         return ""
     text = (
-        f"Not told{' either' if result.rules else ''}, but the best that one half of "
-        "the rows suggests: "
+        f"Not significant{' either' if result.rules else ''}, but the best rule that "
+        "one half of the rows suggests: "
         f"{wording.format_conditions(rule.conditions)}. In the other half the model is "
         f"right in {rule.right} of "
         f"{rule.total} under it and in {rule.elsewhere.right} of "
         f"{rule.elsewhere.total} elsewhere"
     )
     if rule.rows is None:
-        return f"{text}, which is no difference that more rows would tell."
+        return f"{text}. More rows would not make this difference significant."
     chance = (
-        f"chance does that with a probability of {rule.chance:.2g}, and at most "
-        f"{rule.p_value_limit:g} is asked"
+        f"its p-value is {rule.chance:.2g}, and a significant rule has at most "
+        f"{rule.p_value_limit:g}"
     )
     return (
-        f"{text}; {chance}. About {rule.rows:,} rows with these shares would tell "
-        "it: sweep more."
+        f"{text}; {chance}. About {rule.rows:,} rows with these fractions would make "
+        "it significant: sweep more."
     )
 
 
 def describe_envelope(result: ExplainResult) -> str:
-    """Return in a sentence where the model can be relied on."""
+    """Describe in a sentence where the model can be relied on."""
     box = result.envelope
     if box is None:
-        return "No box of enough rows promises the accuracy that was asked for."
+        return "No box of enough rows has the required accuracy."
     where = wording.format_conditions(box.conditions)
     if not box.confirmed:
         return (
-            f"Not shown: inside {where} the rows that did not choose it are right "
-            f"in {box.text}."
+            f"Not confirmed: inside {where} the rows that did not choose the box are "
+            f"right in {box.text}."
         )
     return (
         f"At least {100 * box.accuracy:g} % at 95 % confidence: {where}; right in "
@@ -372,26 +400,29 @@ def describe_pairs(result: ExplainResult) -> str:
     n_failures = result.total - result.right
     text = (
         f"Of the {result.pairs_sought} most typical of {n_failures} failures, "
-        f"{len(result.pairs)} are right once one "
-        "parameter is another."
+        f"{len(result.pairs)} become right if one parameter is changed."
     )
     n_untried = n_failures - result.pairs_sought
     if n_untried:
-        text += f" The other {n_untried} were not tried; `pairs` says how many are."
+        text += f" The other {n_untried} were not tried; `pairs` sets how many are."
     return text
 
 
 def _cluster_section(clusters: FailureClusters) -> ResultPart:
-    """Return the part of the page about the kinds of failures (their clusters): how
-    many there are, and the most typical image of each.
+    """Return the part of the page about the kinds of failures.
+
+    Kinds are clusters of failures. It states how many clusters there are, and has the
+    most typical image of each.
     """
     failures = f"the {clusters.failures} failures that were rendered again"
     text = f"One kind: {failures} are alike by {clusters.features}."
-    if clusters.silhouette is not None:
+    has_multiple_clusters = clusters.silhouette is not None
+    if has_multiple_clusters:
         reservation = ""
         if not clusters.are_separated:
             reservation = (
-                "; they shade into one another: groups of any cloud may be as far apart"
+                "; the kinds merge into each other: random points without clusters may "
+                "be separated as well"
             )
         text = (
             f"{len(clusters.listed)} kinds among {failures}, by {clusters.features} "
@@ -406,8 +437,9 @@ def _cluster_section(clusters: FailureClusters) -> ResultPart:
 
 
 def make_explain_claims(result: ExplainResult) -> Iterator[views.Claim]:
-    """Yield the claims that the rules and the envelope (a box of values inside which
-    the model has the accuracy that was asked for) support.
+    """Yield what is claimed of the rules and of the envelope.
+
+    The envelope is a box of values inside which the model has the required accuracy.
     """
     for number, rule in enumerate(result.rules, 1):
         yield _make_rule_claim(number, rule)
@@ -415,13 +447,13 @@ def make_explain_claims(result: ExplainResult) -> Iterator[views.Claim]:
     if box is not None and box.confirmed and box.total:
         yield _make_envelope_claim(box)
     elif not result.rules:
-        reason = "no box of values was shown to keep the accuracy that was asked for"
+        reason = "no box of values is confirmed to have the required accuracy"
         statement = f"Nothing is claimed: {reason}. {describe_envelope(result)}"
         yield views.Claim(kind="nothing claimed", statement=statement, extent=None)
 
 
 def _make_rule_claim(number: int, rule: RuleRow) -> views.Claim:
-    """Return what is claimed of a rule, by its number from 1.
+    """Return what is claimed of a rule.
 
     The counts are those of fresh renders if there are any; else those of the half of
     the rows that did not choose the rule.
@@ -454,6 +486,7 @@ def _make_envelope_claim(box: EnvelopeRow) -> views.Claim:
     where = wording.format_conditions(box.conditions)
     statement = (
         f"Inside {where} the model is right in {wording.format_extent(extent)} "
-        "configurations that did not choose this box; the sweeps drew no others."
+        "configurations that did not choose this box; only configurations that the "
+        "sweeps sampled were tested."
     )
     return views.Claim(kind="measured", statement=statement, extent=extent)

@@ -1,4 +1,8 @@
-"""Read the rows of several sweeps as one table."""
+"""Read the rows of several sweeps as one table.
+
+A row is one rendered image with its prediction. A draw is one random sample of the
+parameters; in a sweep of drives, all frames of a drive are rows of the same draw.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +14,11 @@ import pandas as pd
 from advsearch.extend import rules, wording, workbench
 
 SCENE_SETTINGS = ("object", "environment", "model")
-"""Settings of a sweep that its rows have as columns, whether they vary or not."""
+"""Settings of a sweep that become columns of its rows, whether they vary or not."""
 
 EXTENT_SETTINGS = ("samples", "keep_pictures", "surface", "trials", "verify_spp")
-"""Settings of a sweep that change neither the image with a number nor its
-prediction.
+"""Settings of a sweep that change neither an image nor its prediction, but only how
+many there are or what is stored.
 """
 
 
@@ -23,9 +27,9 @@ def read_predictions(sweeps: Sequence[workbench.StoredSweep]) -> pd.DataFrame:
 
     The column `sweep` has the index of the sweep, and `unit` the index of the draw:
     rows of the same draw are not independent. A longer sweep with the same seed repeats
-    the images of a shorter one; such repeats are left out. Object, environment and
-    model are shortened to the names that figures show. Parameters that a sweep does not
-    have are missing values (NaN).
+    the images of a shorter one; repeated images are left out. Object, environment and
+    model are shortened to the names in figures. Parameters that a sweep does not have
+    are missing values (NaN). `attrs["units"]` maps the parameters to their units.
     """
     frames = []
     for index, sweep in enumerate(sweeps):
@@ -33,7 +37,7 @@ def read_predictions(sweeps: Sequence[workbench.StoredSweep]) -> pd.DataFrame:
         for name in SCENE_SETTINGS:
             if name in rows:
                 full_names = rows[name].astype(object)
-            else:  # the same in all rows
+            else:  # rows have no such column if the setting is the same in all of them
                 full_names = pd.Series(getattr(sweep.summary, name), rows.index)
             rows[name] = full_names.map(wording.format_figure_value)
         rows["draw"] = name_draws(sweep, rows)
@@ -47,7 +51,7 @@ def read_predictions(sweeps: Sequence[workbench.StoredSweep]) -> pd.DataFrame:
     for name in units:
         if not pd.api.types.is_float_dtype(table[name]):
             table[name] = table[name].astype("category")
-    # the number of each distinct draw
+    # the index of the draw of each row
     table["unit"] = np.unique(table["draw"], return_inverse=True)[1]
     table = table.drop(columns=["draw", "image"])
     table["correct"] = (table["correct"] == 1) & rules.is_in_view(table)
@@ -58,7 +62,7 @@ def read_predictions(sweeps: Sequence[workbench.StoredSweep]) -> pd.DataFrame:
 def _collect_units(frames: Sequence[pd.DataFrame]) -> dict[str, str]:
     """Return the unit of each parameter that any of the frames has.
 
-    Object, environment and model are among them, without a unit.
+    Object, environment and model are included, with an empty unit.
     """
     units = dict[str, str]()
     for frame in frames:
@@ -69,40 +73,40 @@ def _collect_units(frames: Sequence[pd.DataFrame]) -> dict[str, str]:
 def name_draws(sweep: workbench.StoredSweep, rows: pd.DataFrame) -> list[str]:
     """Return a name of the draw of each row (n,): rows of the same draw are dependent.
 
-    Draw k of a seed is the same in all sweeps and all scenes, so that it is named by
-    seed and number. If nothing is drawn by chance, rows with the same values differ in
-    noise alone, and share a name, which consists of these values. The rows of a drive
-    are named by the values of its first frame.
+    Draw k of a seed is the same in all sweeps and all scenes. So it is named by the
+    seed and k. A sweep of a grid samples nothing: there, a draw is named by the values
+    of its parameters, because rows with the same values differ only in noise. For a
+    drive (frames along a path), these are the values of its first frame.
 
     Args:
         sweep: the sweep.
-        rows: its rows.
+        rows: its rows; the column `unit` has the index of the draw within the sweep.
     """
     is_sampled = sweep.summary.sampler is not None
     if is_sampled:
-        return [f"draw {sweep.config.seed} {unit}" for unit in rows["unit"]]
-    # all that decides an image, but not what is predicted of it
+        return [f"draw {sweep.config.seed} {draw}" for draw in rows["unit"]]
+    # The parameters of rows may include the model and its answer, which do not change
+    # the image.
     columns = [
         name
         for name in ("object", "environment", *rows.attrs["units"])
         if name not in ("model", "answer")
     ]
-    # a drive is named by the values of its first frame
+    distinct_columns = list(dict.fromkeys(columns))
+    # the first row of each draw: for a drive, its first frame
     first_rows = (
-        rows.drop_duplicates("unit")
-        .set_index("unit")[list(dict.fromkeys(columns))]
-        .astype(str)
+        rows.drop_duplicates("unit").set_index("unit")[distinct_columns].astype(str)
     )
-    values_of_unit = first_rows.agg(" ".join, axis=1)
-    return [f"values {values_of_unit[unit]}" for unit in rows["unit"]]
+    values_of_draw = first_rows.agg(" ".join, axis=1)
+    return [f"values {values_of_draw[draw]}" for draw in rows["unit"]]
 
 
 def name_images(sweep: workbench.StoredSweep, rows: pd.DataFrame) -> list[str]:
     """Return a name of each row (n,), equal for the same prediction of the same image.
 
-    The name consists of the settings that decide the image, the number of the row, the
-    values, and whether the prediction is right. `EXTENT_SETTINGS`, such as the number
-    of samples, are left out: they do not change an image.
+    The name consists of the settings that decide the image, the index of the row in its
+    sweep, the values, and whether the prediction is right. `EXTENT_SETTINGS`, such as
+    the number of samples, are left out: they do not change an image.
 
     Args:
         sweep: the sweep.
@@ -122,7 +126,12 @@ def name_images(sweep: workbench.StoredSweep, rows: pd.DataFrame) -> list[str]:
 
 
 def read_values(rows: pd.DataFrame, index: int) -> dict[str, float | str]:
-    """Return the values of the parameters that a row has, by name."""
+    """Return the values of the parameters of a row by name, without missing values.
+
+    Args:
+        rows: rows as `read_predictions` returns them.
+        index: index of the row.
+    """
     values = rows.loc[index, list(rows.attrs["units"])].dropna().items()
     return {
         name: value if isinstance(value, str) else float(value)

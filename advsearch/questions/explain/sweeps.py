@@ -1,4 +1,8 @@
-"""Derive settings of sweeps inside a rule, or along one factor from a failure."""
+"""Derive the settings of sweeps inside a rule, or along one factor from a failure.
+
+A factor is a parameter of a control, named "control.parameter", or one of the settings
+"object", "environment" and "model".
+"""
 
 from __future__ import annotations
 
@@ -13,7 +17,7 @@ from advsearch.extend import Parameter, SweepConfig, rules, settings, wording
 from advsearch.questions.explain.rows import SCENE_SETTINGS
 
 N_VALUES_ALONG = 9
-"""Values of a factor that are tried to find the nearest right prediction."""
+"""Number of values of a factor that are tried to find the nearest right prediction."""
 
 
 def make_sweep_inside(
@@ -29,17 +33,17 @@ def make_sweep_inside(
     Sampled ranges are cut to the conditions. Axes of the grid, and the lists of
     objects, environments and models, are reduced to the values that rows under the
     conditions have. If this makes more than twice as many configurations as requested,
-    every second value of the longest axis is left out, repeatedly. Not every condition
-    can be expressed in this way: so some configurations may lie outside, and the caller
-    has to leave these out.
+    every second value of the longest axis is left out, repeatedly. Some conditions
+    cannot be expressed in this way. So some configurations may lie outside of them, and
+    the caller has to filter these.
 
     Args:
         config: settings of the original sweep.
         table: rows of the original sweep.
         conditions: conditions on the factors, all of which have to hold.
-        samples: number of configurations, about.
+        samples: approximate number of configurations.
         seed: seed of the draws.
-        arc: index of the arc to render, if a condition on an angle has several.
+        arc: index of the arc to render, if a condition on an angle has two arcs.
     """
     inside = table[rules.find_covered(conditions, table)]
     values_inside = {
@@ -56,7 +60,7 @@ def make_sweep_inside(
     grid = thin_grid(full_grid, max_points=2 * samples / n_scenes)
     n_configurations = count_grid_points(grid) * n_scenes
     controls = cut_controls(config, table, conditions, arc)
-    # draws at each point of the grid in each scene, if anything is sampled
+    # number of draws at each point of the grid in each scene, if anything is sampled
     draws = math.ceil(samples / n_configurations) if controls else None
     return make_minimal_config(
         config, grid=grid, controls=controls, samples=draws, seed=seed, **scene_settings
@@ -64,8 +68,9 @@ def make_sweep_inside(
 
 
 def thin_grid(grid: Mapping[str, Any], max_points: float) -> dict[str, Any]:
-    """Return a grid from whose longest axis every second value is left out, until it
-    has at most `max_points` points, or a single one.
+    """Return a grid with at most `max_points` points, or a single one.
+
+    Every second value of the longest axis is left out until the grid is small enough.
     """
     thinned = dict(grid)
     while count_grid_points(thinned) > max(max_points, 1):
@@ -80,7 +85,7 @@ def count_grid_points(grid: Mapping[str, Any]) -> int:
 
 
 def count_axis_values(values: Any) -> int:
-    """Return the number of values of an axis; something else than a list is one."""
+    """Return the number of values of an axis: 1 for anything that is no list."""
     return len(values) if isinstance(values, list) else 1
 
 
@@ -89,8 +94,8 @@ def cut_scene_settings(
 ) -> dict[str, str | None]:
     """Return object, environment and model of a sweep that renders under conditions.
 
-    Each has only those names that have rows under the conditions; all names if there
-    are no such rows.
+    Each setting lists only names with rows under the conditions. If there are no such
+    rows, it lists all names.
 
     Args:
         config: settings of the sweep.
@@ -113,34 +118,33 @@ def cut_controls(
     """Return the controls of a sweep with their sampled ranges cut to conditions.
 
     A range is cut to the bounds of its condition, and to the values that rows have. A
-    condition on an angle may be two arcs of the circle; the range becomes one of them.
-    An arc that passes 360 degrees cannot be set, so that the range stays as it was.
+    condition on an angle may have two opposite arcs of the circle: the range becomes
+    one of them. An arc that passes 360 degrees cannot be set: the range is not cut
+    then.
 
-    A control without any range samples all of its parameters; as soon as one has a
-    range, only parameters with a range are sampled. So if a control without ranges gets
-    its first one here, its other parameters get the ranges that rows have.
+    If no parameter of a control has a range in the settings, all of them are sampled
+    from their full ranges. If some have a range, only these are sampled. So if a
+    control gets its first range here, its other parameters get the ranges of the rows'
+    values.
 
     Args:
         config: settings of the sweep.
         table: its rows.
-        conditions: conditions on the factors; those on names, and on factors that were
+        conditions: conditions on the factors. Those on names, and on factors that were
             not sampled, are skipped.
         arc: index of the arc, for conditions on angles.
     """
     controls = {name: dict(options) for name, options in config.controls.items()}
     for condition in conditions:
-        is_of_names = condition.options is not None
-        if is_of_names or not is_sampled(config, condition.factor):
+        # `options` are the names of a condition on names.
+        if condition.options is not None or not is_sampled(config, condition.factor):
             continue
         instance, _, parameter = condition.factor.partition(".")
         declared = config.declared_parameters(instance) or {}
-        if condition.turn:  # of an angle, a full turn
-            low, high = condition.arcs[arc % len(condition.arcs)]
-        else:
-            low = max(condition.low, float(table[condition.factor].min()))
-            high = min(condition.high, float(table[condition.factor].max()))
-        if high > declared[parameter].high:  # an angle that passes 360 degrees
+        low, high = _find_range(condition, table, arc)
+        if high > declared[parameter].high:  # an arc that passes 360 degrees
             continue
+        # the settings of the sweep, without ranges that were added for other conditions
         has_ranges = bool(declared.keys() & config.controls[instance].keys())
         if not has_ranges:
             ranges = observed_ranges(config, table, instance, declared)
@@ -150,13 +154,34 @@ def cut_controls(
     return controls
 
 
+def _find_range(
+    condition: rules.RuleCondition, table: pd.DataFrame, arc: int
+) -> tuple[float, float]:
+    """Return the range of values in which a condition on numbers holds.
+
+    Args:
+        condition: the condition.
+        table: rows of the sweep, whose values limit the range of a factor that is no
+            angle.
+        arc: index of the arc, for an angle. A condition with a single arc uses it for
+            every index.
+    """
+    is_of_angle = condition.turn > 0.0
+    if is_of_angle:
+        return condition.arcs[arc % len(condition.arcs)]
+    values = table[condition.factor]
+    low = max(condition.low, float(values.min()))
+    high = min(condition.high, float(values.max()))
+    return low, high
+
+
 def observed_ranges(
     config: SweepConfig,
     table: pd.DataFrame,
     instance: str,
     declared: Mapping[str, Parameter],
 ) -> dict[str, Any]:
-    """Return the range that rows have of each sampled parameter of a control.
+    """Return the range of the values of each sampled parameter of a control.
 
     Args:
         config: settings of the sweep.
@@ -165,7 +190,8 @@ def observed_ranges(
         declared: parameters of the control by name.
 
     Returns:
-        [lowest, highest] of numbers, or the choices, by the name of the parameter.
+        By the name of the parameter: [minimum, maximum] for numbers, or the names as
+        {"choices": [...]}.
     """
     ranges: dict[str, Any] = {}
     for name, parameter in declared.items():
@@ -186,10 +212,11 @@ def make_sweep_along(
     table: pd.DataFrame,
     seed: int,
 ) -> SweepConfig:
-    """Return the settings of a sweep along one factor, everything else as in a row.
+    """Return the settings of a sweep along one factor, with all else as in a row.
 
-    The factor has the row's own value first, then all names, or `N_VALUES_ALONG` evenly
-    spaced numbers. Every other parameter is an axis of one value, that of the row.
+    The values of the factor are the row's own value, then all names, or
+    `N_VALUES_ALONG` evenly spaced numbers. Every other parameter is an axis of the grid
+    with one value, that of the row.
 
     Args:
         config: settings of the original sweep.
@@ -199,44 +226,58 @@ def make_sweep_along(
         seed: seed of the noise.
     """
     values = list_values_along(table[factor], row[factor])
-    # a parameter is named "control.parameter"; object, environment and model are not
+    # Parameters, which have a dot in their name, are axes of the grid.
     grid: dict[str, object] = {
         name: [row[name]] for name in row if "." in name and is_settable(config, name)
     }
-    # settings that are no axes: object, environment and model
-    scene_settings = {
-        name: next(iter(find_names(config, name, str(row[name]))), None)
-        for name in SCENE_SETTINGS
-    }
+    # Object, environment and model are settings.
+    scene_settings = _find_scene_settings(config, row)
     if factor in SCENE_SETTINGS:
         scene_settings[factor] = ",".join(
             name for value in values for name in find_names(config, factor, str(value))
         )
     else:
         grid[factor] = values
-
-    # a parameter must not be set and be an axis at the same time
+    # A parameter must not be set and be an axis at the same time.
     set_values = {
         name: value for name, value in config.set_.items() if name not in grid
     }
-    changes: dict[str, object] = {"keep_pictures": "all", "set": set_values}
-    # ten images take less than a worker takes to load
-    changes |= {"workers": None, "cluster": None}
-    controls = select_choices(config, grid)
     return make_minimal_config(
         config,
         grid=grid,
-        controls=controls,
+        controls=select_choices(config, grid),
         samples=None,
         seed=seed,
-        **changes,
+        keep_pictures="all",
+        set=set_values,
+        # Workers and machines of a cluster take longer to start than ten images to
+        # render.
+        workers=None,
+        cluster=None,
         **scene_settings,
     )
 
 
+def _find_scene_settings(
+    config: SweepConfig, row: Mapping[str, float | str]
+) -> dict[str, str | None]:
+    """Return object, environment and model of a row, as settings of a sweep.
+
+    Rows have short names of them, so that several names in the settings may match: the
+    first one is used. None for a setting that the sweep does not have.
+    """
+    scene_settings: dict[str, str | None] = {}
+    for name in SCENE_SETTINGS:
+        matching_names = find_names(config, name, str(row[name]))
+        scene_settings[name] = matching_names[0] if matching_names else None
+    return scene_settings
+
+
 def list_values_along(column: pd.Series, first: float | str) -> list[float | str]:
-    """Return the values of a factor that are tried: `first`, then all names of the
-    column, or `N_VALUES_ALONG` evenly spaced numbers of its range.
+    """Return the values of a factor that are tried.
+
+    They are `first`, then all names of the column, or `N_VALUES_ALONG` evenly spaced
+    numbers in its range.
     """
     if column.dtype == "category":
         candidates: Sequence[float | str] = column.cat.categories.tolist()
@@ -251,10 +292,11 @@ def list_values_along(column: pd.Series, first: float | str) -> list[float | str
 def select_choices(
     config: SweepConfig, grid: Mapping[str, object]
 ) -> dict[str, dict[str, Any]]:
-    """Return the controls whose parameters are all in a grid, with their choices alone.
+    """Return the controls whose parameters are all in a grid, with only their choices.
 
-    A choice is a setting of a control that is no parameter, such as the kind of a
-    light. Such a control samples nothing, but its choices still decide the images.
+    A choice is a setting of a control that is no parameter, such as the type of a light
+    ("area" or "point"). A control whose parameters are all in the grid samples nothing,
+    but its choices still decide the images.
 
     Args:
         config: settings of the original sweep.
@@ -271,6 +313,7 @@ def select_choices(
             for parameter in control_type.declare_parameters(options)
         ]
         if choices and all(name in grid for name in parameters):
+            # "kind" states the type of the control, if that is not its name.
             controls[instance] = {
                 name: value
                 for name, value in options.items()
@@ -280,30 +323,40 @@ def select_choices(
 
 
 def is_sampled(config: SweepConfig, factor: str) -> bool:
-    """Return whether a sweep samples a parameter from a range that can be set."""
-    # a parameter is called "control.parameter"; others are settings
+    """Return whether a sweep samples a factor from a range of its control.
+
+    It does not if the factor is a setting ("object"), an axis of the grid, or the time
+    of a frame on a path.
+    """
     instance, dot, parameter = factor.partition(".")
     is_parameter = bool(dot) and instance in config.controls
-    is_frame = bool(config.path) and parameter == "time"  # of a drive
-    if not is_parameter or is_frame or factor in config.grid:
+    # With a `path`, a sweep renders drives: the frames follow each other in time.
+    is_frame_time = bool(config.path) and parameter == "time"
+    if not is_parameter or is_frame_time or factor in config.grid:
         return False
-    return parameter in (config.declared_parameters(instance) or ())
+    # None for a control whose parameters are not known without the scene
+    declared = config.declared_parameters(instance) or {}
+    return parameter in declared
 
 
 def is_settable(config: SweepConfig, name: str) -> bool:
     """Return whether a value of a row, by its name, can be set.
 
-    Settings can ("object"), and parameters that their control declares. Others follow
-    from what is set, as "path.distance" does.
+    Settings ("object") can be set, and parameters that their control declares. Other
+    values are computed from these, such as "path.distance".
     """
     instance, dot, parameter = name.partition(".")
     is_setting = not dot
-    declared = config.declared_parameters(instance)  # None: any, in the scene
+    declared = config.declared_parameters(instance)
+    # None: the parameters are those of the scene, and any of them can be set.
     return is_setting or declared is None or parameter in declared
 
 
 def find_names(config: SweepConfig, setting: str, value: str) -> list[str]:
-    """Return the names in a setting that rows write as `value`; else the first name."""
+    """Return the names in a setting that rows write as `value`; else the first name.
+
+    Empty if the setting is empty.
+    """
     setting_value = getattr(config, setting)
     names = settings.split_names(setting_value) if setting_value else ()
     matching = [
@@ -321,7 +374,7 @@ def make_minimal_config(config: SweepConfig, **changes: object) -> SweepConfig:
         "aov": None,
         "surface": False,
     }
-    # Without controls nothing is sampled, and a sampler other than the default is
-    # refused.
+    # Without controls nothing is sampled. Then `SweepConfig` rejects any sampler but
+    # the default one.
     sampler = {} if changes.get("controls") else {"sampler": "sobol"}
     return SweepConfig(**{**config.to_json(), **quiet, **changes, **sampler})

@@ -21,7 +21,7 @@ def precision(context: RunContext[PrecisionConfig]) -> PrecisionResult:
     """Measure error against run time of a scene and its gradients
     (docs/precision.md).
     """
-    # imports torch
+    # This import takes long, because it imports torch.
     from advsearch.questions.precision.carry_out import measure_precision
 
     return measure_precision(context)

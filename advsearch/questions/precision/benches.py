@@ -1,7 +1,7 @@
-"""Measures pictures and gradients of several settings against references, in rounds.
+"""Measure images and gradients of several settings against references, in rounds.
 
-Within a time budget every setting is measured once, then every setting again, so that a
-machine that slows down does so for all of them.
+In each round every setting is measured once. So if the machine slows down, it does so
+for all settings.
 """
 
 from __future__ import annotations
@@ -27,13 +27,14 @@ from advsearch.questions.precision.rule import (
     estimate_reference,
 )
 
-# calls of a setting that have to fit into the budget before it is started
+# number of calls of a setting that have to fit into the budget before it is started
 MIN_CALLS = 5
-# first calls of a setting, which take longer
+# number of first calls of a setting, which take longer
 COLD_CALLS = 2
-# fraction of the remaining time that one setting may need
+# maximum fraction of the remaining time for one setting
 MAX_SETTING_FRACTION = 0.25
-# longest list of parameters in a name; of a longer one only the first is named
+# maximum length of a list of parameters in a name; a longer list is replaced by its
+# first parameter
 MAX_NAME_LETTERS = 28
 # maximum number of independent parts of a reference
 MAX_REFERENCE_PARTS = 64
@@ -41,7 +42,12 @@ Part = TypeVar("Part")
 
 
 class TimeBudget:
-    """A number of seconds from now on, by a clock."""
+    """Count down a number of seconds from now on.
+
+    Args:
+        seconds: the time.
+        clock: returns the current time in seconds.
+    """
 
     def __init__(
         self, seconds: float, clock: Callable[[], float] = time.perf_counter
@@ -61,8 +67,12 @@ class TimeBudget:
 
 @dataclass
 class MeasuredRounds:
-    """Measurements by setting, the seconds of each call, and settings that did not
-    fit.
+    """Measurements of settings.
+
+    Attributes:
+        results: measurements of each setting.
+        wall_seconds: seconds of each call of a setting.
+        skipped: settings that did not fit into the time.
     """
 
     results: dict[SampleSetting, list[Any]] = field(default_factory=dict)
@@ -72,16 +82,18 @@ class MeasuredRounds:
     def estimate_call_seconds(self, setting: SampleSetting) -> float:
         """Estimate the seconds of a call other than the first ones.
 
-        If the setting has been called, it is the median of its last calls. Otherwise
-        the time is proportional to the cost, as for the most expensive setting of its
-        line, or else as for the slowest line. It is 0 if nothing has been called.
+        If the setting has been called, the estimate is the median of its last calls.
+        Otherwise it is the cost of the setting times the seconds per unit of cost of
+        the most expensive setting on its line (the same estimator with another sample
+        count). If its line has not been called, those of the slowest line are used. The
+        estimate is 0 if nothing has been called.
         """
         if setting in self.wall_seconds:
             call_seconds = self.wall_seconds[setting]
             warm_calls = call_seconds[COLD_CALLS:] or call_seconds[-1:]
             return statistics.median(warm_calls[-3:])
         by_cost = sorted(self.wall_seconds, key=lambda known: known.cost)
-        # The last one of a line, which is the most expensive, stays.
+        # Later settings replace earlier ones, so that the most expensive one is left.
         most_expensive = {known.line: known for known in by_cost}
         seconds_per_cost = {
             line: self.estimate_call_seconds(known) / known.cost
@@ -139,10 +151,10 @@ def measure_in_rounds(
 
     In the first round a setting is started only if there is time for `MIN_CALLS` calls
     of it and of all settings before it. The first setting is always measured. A first
-    call compiles kernels and takes longer, so each setting is called twice at once: the
-    second call tells its time. A call that is not expected to fit is not started, so
-    the budget can be exceeded by the first calls of a setting only. Each call has its
-    own seed.
+    call compiles kernels and takes longer. So each setting is called twice at once, and
+    its time is estimated from the second call. A call that is not expected to fit is
+    not started: only the first calls of a setting can exceed the budget. Each call has
+    its own seed.
 
     Args:
         settings: the settings, in any order.
@@ -172,7 +184,7 @@ def measure_in_rounds(
                 measure_once(setting)
         else:
             measured.skipped.append(setting)
-    # The two calls at once were the first round.
+    # The first round is over: each setting was called twice.
     for _ in range(1, rounds):
         for setting in measured.results:
             if measured.estimate_call_seconds(setting) <= budget.seconds_left:
@@ -188,8 +200,9 @@ def take_reference_parts(
 ) -> list[Part]:
     """Return as many independent parts of a reference as fit into a budget.
 
-    Each has its own seed. There are at least two, however long they take, as the error
-    is estimated from their difference. There are at most `MAX_REFERENCE_PARTS`.
+    Each part has its own seed. There are at least two parts, however long they take,
+    because the error is estimated from their difference. There are at most
+    `MAX_REFERENCE_PARTS`.
 
     Args:
         take_part: computes a part with a seed.
@@ -204,7 +217,8 @@ def take_reference_parts(
             break
         start = budget.clock()
         parts.append(take_part(seeds.stream(seed, "reference", len(parts))))
-        # A slow part may come again, but one slow part does not count for ever.
+        # The next part may be as slow as the slowest so far, whose influence halves
+        # with each part.
         expected_seconds = max(budget.clock() - start, 0.5 * expected_seconds)
         on_done()
     return parts
@@ -217,13 +231,13 @@ def choose_part_samples(
     parts: int = 4,
     counts: Sequence[int] = (16, 64, 256, 1024),
 ) -> int:
-    """Return the largest sample count of which several calls fit into some seconds.
+    """Return the largest sample count with which all parts fit into some seconds.
 
-    `COLD_CALLS` calls compile kernels; the one after them is timed. The time is assumed
-    to be proportional to the number of samples.
+    `COLD_CALLS` calls compile kernels; the next call is timed. The time is assumed to
+    be proportional to the number of samples.
 
     Args:
-        call: function that computes a part with a number of samples per pixel.
+        call: computes a part with a number of samples per pixel.
         seconds: time of all parts together.
         parts: number of parts.
         counts: sample counts, ascending; the first is returned if none fits.
@@ -231,7 +245,7 @@ def choose_part_samples(
     for _ in range(COLD_CALLS + 1):
         start = time.perf_counter()
         call(counts[0])
-    # of the last call
+    # the time of the last call
     seconds_per_sample = (time.perf_counter() - start) / counts[0]
     fitting = [
         count for count in counts if parts * count * seconds_per_sample <= seconds
@@ -242,7 +256,8 @@ def choose_part_samples(
 def run_timed(function: Callable[[], Part]) -> tuple[Part, dict[str, float]]:
     """Call a function; return its result and its times.
 
-    `seconds` is the time of all processors, `wall_seconds` that of the clock.
+    `seconds` is the sum of the time of all processors, `wall_seconds` that of the
+    clock.
     """
     process_start = time.process_time()
     wall_start = time.perf_counter()
@@ -256,29 +271,34 @@ def run_timed(function: Callable[[], Part]) -> tuple[Part, dict[str, float]]:
 # ---- pictures
 
 REFERENCE_SAMPLER = "multijitter"
-"""Sampler of references: unbiased as all, and twice as fast to an error as others."""
-OIDN = " + oidn"
+"""Sampler of references. It is unbiased, as all samplers are, and reaches an error in
+half of the time of others.
+"""
+OIDN = " + oidn"  # suffix of the name of a line with denoiser
 SAMPLE_COUNTS = {
     "independent": (4, 8, 16, 32, 64, 128, 256),
     "orthogonal": (4, 25, 121, 289),
 }
 OTHER_SAMPLE_COUNTS = (4, 16, 64, 256)
-"""Sample counts by sampler, which accepts them exactly, and those of all others.
+"""Sample counts of some samplers, and those of all other samplers.
 
-All but the independent sampler compile a kernel for each count.
+A sampler renders exactly with these counts; others would be rounded up. The independent
+sampler has more of them because it does not compile a kernel for each count.
 """
 PREFERRED_LINES = ("independent", "multijitter", "independent" + OIDN)
 OTHER_LINES_COST = 6.0
-"""Lines that are measured first if time is short, and the extra cost of others."""
+"""Lines that are measured first, and the factor on the cost of other lines, which come
+later.
+"""
 
 
 class PictureBench:
-    """Measures the error of pictures of one configuration (d,), and of the model's
-    margin.
+    """Measure the errors of images of one configuration, and of the model's margin.
 
-    Every sampler is measured, some with a denoiser too. Pictures with and without
-    denoiser have the same reference, margins their own. A *line* is the name of a
-    sampler, with `OIDN` at its end if it is denoised.
+    Every sampler is measured, and some of them also with a denoiser. All images have
+    the same reference; margins with and without denoiser have different ones. A *line*
+    is a sampler with or without denoiser. It is denoted by the name of the sampler,
+    followed by `OIDN` if there is a denoiser.
 
     Attributes:
         settings: all lines with all of their sample counts.
@@ -303,18 +323,18 @@ class PictureBench:
         self._margin = margin
         self._space = renderer.space
         self._formation = renderer.formation
-        # All samplers, then two of them once more with a denoiser.
+        # All samplers without denoiser, then two of them with a denoiser.
         self._lines = list(samplers)
         for name in ("independent", REFERENCE_SAMPLER):
             if name in samplers:
                 self._lines.append(name + OIDN)
-        # values that errors are measured against, by ("picture" or "margin", denoiser)
+        # references, by quantity ("picture" or "margin") and denoiser
         self._references: dict[tuple[str, str], ReferenceValue] = {}
         scenes = {
             name: renderer.scene.copy_with(sampler=name)
             for name in {*samplers, REFERENCE_SAMPLER}
         }
-        # The references have renderers, too, whether their lines are measured or not.
+        # The lines of references have renderers, too, even if they are not measured.
         self._renderers = {
             line: renderer.copy_with(
                 scenes[line.removesuffix(OIDN)], denoiser=get_denoiser(line)
@@ -342,11 +362,12 @@ class PictureBench:
         Returns:
             A row of the result for each reference.
         """
-        # "none" comes first, since samplers without a denoiser do
+        # "none" comes first, as in `_lines`: the other references need it.
         denoisers = list(dict.fromkeys(map(get_denoiser, self._lines)))
         rows = []
         for index, denoiser in enumerate(denoisers):
-            # an even fraction of what is left, since an earlier one may have left time
+            # The remaining time is divided evenly: an earlier reference may have left
+            # some of its time.
             n_left = len(denoisers) - index
             rows += self._compute_references_of(
                 denoiser, budget.take_fraction(1.0 / n_left), seed, on_done
@@ -362,6 +383,8 @@ class PictureBench:
     ) -> list[PrecisionReference]:
         """Render and store the references of lines with a denoiser, or with none.
 
+        The references without denoiser have to be computed first.
+
         Args:
             denoiser: "none" or "oidn".
             budget: time of these references.
@@ -372,12 +395,11 @@ class PictureBench:
             A row of the result for the image (without denoiser only) and one for the
                 margin.
         """
-        line = REFERENCE_SAMPLER
-        if denoiser == "oidn":
-            line += OIDN
-        first_seed = 0
+        line = REFERENCE_SAMPLER if denoiser == "none" else REFERENCE_SAMPLER + OIDN
+        # These renders are only timed, so that any seed will do.
         spp = choose_part_samples(
-            partial(self._render_radiance, line, first_seed), budget.seconds_left
+            lambda count: self._render_radiance(line, seed=0, spp=count),
+            budget.seconds_left,
         )
         radiances = take_reference_parts(
             partial(self._render_radiance, line, spp=spp), budget, on_done, seed
@@ -390,7 +412,7 @@ class PictureBench:
             )
             self._references["picture", "none"] = image
             rows.append(_make_row("picture", line, image, spp))
-        # Denoised images, too, are compared with the one without denoiser.
+        # Denoised images are compared with the reference without denoiser, too.
         self._references["picture", denoiser] = self._references["picture", "none"]
         margin = estimate_reference(
             parts, lambda mean: np.array([self._margin(self._display_mean(mean))])
@@ -400,7 +422,7 @@ class PictureBench:
         return rows
 
     def _display_mean(self, mean: Float64Array) -> Tensor:
-        """Return the image (H, W, 3) of a mean radiance (n,)."""
+        """Return the image (H, W, 3) for a mean radiance (H * W * 3,)."""
         size = (*self._formation.resolution, 3)
         return self._display(torch.from_numpy(mean).to(torch.float32).reshape(size))
 
@@ -441,8 +463,12 @@ class PictureBench:
 
 
 def list_line_settings(line: str) -> list[SampleSetting]:
-    """Return the settings of a line of pictures: one for each sample count."""
-    # The cost decides the order: other lines come later, as if they were slower.
+    """Return the settings of a line of images: one for each sample count.
+
+    A line is a sampler, such as "independent", or a sampler with denoiser.
+    """
+    # The cost decides the order of measurements. Other lines have a higher cost so that
+    # they come later.
     cost_factor = 1.0 if line in PREFERRED_LINES else OTHER_LINES_COST
     return [
         SampleSetting(
@@ -450,6 +476,7 @@ def list_line_settings(line: str) -> list[SampleSetting]:
             estimator=line,
             spp=count,
             cost=count * cost_factor,
+            # settings with the same denoiser are compared with each other
             family=get_denoiser(line),
         )
         for count in SAMPLE_COUNTS.get(line, OTHER_SAMPLE_COUNTS)
@@ -457,14 +484,24 @@ def list_line_settings(line: str) -> list[SampleSetting]:
 
 
 def get_denoiser(line: str) -> str:
-    """Return the denoiser of a line."""
+    """Return the denoiser of a line: "oidn" or "none"."""
     return "oidn" if line.endswith(OIDN) else "none"
 
 
 ADJOINT_COST = {"adjoint": 3.0, "material": 60.0}
-"""Cost of adjoint gradients in renders, with the kernels that `material` compiles."""
+"""Cost of adjoint gradients, in renders. That of `material` includes the compilation of
+kernels.
+"""
 # maximum number of coordinates for a reference by differences
 MAX_DIFFERENCE_COORDINATES = 32
+# maximum sample count of a reference by differences, and the lower counts to try
+DIFFERENCE_SAMPLE_COUNTS = (16, 64, 256)
+# number of parts of a reference by differences that have to fit into its time
+DIFFERENCE_PARTS = 3
+# samples per pixel, and (minimum, maximum) number of seeds, of the check of a reference
+# by an adjoint
+BIAS_CHECK_SPP = 64
+BIAS_CHECK_REPEATS = (2, 4)
 
 
 @dataclass(frozen=True)
@@ -498,7 +535,7 @@ class GradientPart:
         )
 
     def count_renders(self, estimator: str) -> int:
-        """Return the renders of a gradient by an estimator, besides the image."""
+        """Return the number of renders of a gradient, without that of the image."""
         return sum(replace(group, estimator=estimator).renders for group in self.groups)
 
 
@@ -514,9 +551,11 @@ def list_gradient_parts(
         groups: parameters of the search space, with the estimators that are valid for
             each.
         linear: whether the loss is linear; then differences of the loss ("secant")
-            equal those of the picture, and are left out.
+            equal those of the image, and are left out.
     """
-    differentiable_groups = [group for group in groups if group.valid]
+    # `valid` lists the estimators of a group; without any it has no gradient.
+    differentiable_groups = [group for group in groups if len(group.valid) > 0]
+    # pairs of the groups of a part and their estimators
     comparable_sets = gradients.planning.list_comparable_sets(differentiable_groups)
     controls = [part_groups[0].control for part_groups, _ in comparable_sets]
     parts = []
@@ -531,7 +570,7 @@ def list_gradient_parts(
 
 
 def _join_parameters(groups: Sequence[gradients.Group]) -> str:
-    """Join the parameters of groups by commas; of a long list, name only the first."""
+    """Join the parameters of groups by commas; a long list has only the first one."""
     parameters = ",".join(group.parameter for group in groups)
     if len(parameters) > MAX_NAME_LETTERS:
         return f"{groups[0].parameter},... ({len(groups)})"
@@ -539,11 +578,11 @@ def _join_parameters(groups: Sequence[gradients.Group]) -> str:
 
 
 class GradientBench:
-    """Measures the error of the gradient (n,) of one part of a space at u, by every
-    estimator.
+    """Measure the error of a gradient by every estimator.
 
-    The reference has a better sampler: differences at two steps for few coordinates,
-    else the mean of an adjoint.
+    It is the gradient (n,) of one part of a space. The reference uses a better sampler.
+    For few coordinates it is computed by finite differences with two steps, else as the
+    mean of an adjoint.
 
     Attributes:
         part: the coordinates.
@@ -570,19 +609,21 @@ class GradientBench:
         self._loss = loss
         self._u = u
         self.part = part
-        # renderer of references, whose sampler reaches an error in the least time
+        # renderer of references, with the sampler that is fastest at the same error
         self._exact = renderer.copy_with(
             renderer.scene.copy_with(sampler=REFERENCE_SAMPLER)
         )
-        # Differences have no bias of an adjoint, but take renders for each coordinate.
+        # Differences do not have the bias of an adjoint, but need renders for each
+        # coordinate.
         self._by_differences = part.size <= MAX_DIFFERENCE_COORDINATES
         if self._by_differences:
             self._reference_estimator = "differences"
         else:
-            # an adjoint, if there is one
             adjoints = [name for name in part.estimators if name in ADJOINT_COST]
-            self._reference_estimator = (*adjoints, *part.estimators)[0]
+            # the first adjoint; without any, the first estimator
+            self._reference_estimator = adjoints[0] if adjoints else part.estimators[0]
         self.reference: ReferenceValue | None = None
+        # Gradients have the sample counts of images with the independent sampler.
         self.settings = [
             self.make_setting(estimator, count)
             for estimator in part.estimators
@@ -594,7 +635,7 @@ class GradientBench:
         gradient_renders = ADJOINT_COST.get(
             estimator, self.part.count_renders(estimator)
         )
-        renders = 1.0 + gradient_renders  # one of the image itself
+        renders = 1.0 + gradient_renders  # one render of the image itself
         return SampleSetting(
             quantity="gradient",
             estimator=estimator,
@@ -609,12 +650,12 @@ class GradientBench:
         """Compute the reference within a budget.
 
         Args:
-            budget: time that it may take.
+            budget: time of the reference.
             seed: seed of its parts.
             on_done: called after each part of the reference.
 
         Returns:
-            The one row of the reference in the result.
+            A list with the row of the reference in the result.
         """
         if self._by_differences:
             compute = self._compute_reference_by_differences
@@ -644,18 +685,20 @@ class GradientBench:
         Returns:
             The reference, and the samples per pixel of each of its parts.
         """
-        compute = partial(self._compute_derivatives, self._list_probes())
-        first_seed = 0
+        probes = self._list_probes()
+        # These renders are only timed, so that any seed will do.
         spp = choose_part_samples(
-            partial(compute, first_seed),
+            lambda count: self._compute_derivatives(probes, noise=0, spp=count),
             budget.seconds_left,
-            parts=3,
-            counts=(16, 64, 256),
+            parts=DIFFERENCE_PARTS,
+            counts=DIFFERENCE_SAMPLE_COUNTS,
         )
-        parts = take_reference_parts(partial(compute, spp=spp), budget, on_done, seed)
+        parts = take_reference_parts(
+            partial(self._compute_derivatives, probes, spp=spp), budget, on_done, seed
+        )
         derivatives = [derivative for derivative, _ in parts]
-        # Extrapolation to a step of 0 removes most of what two steps disagree by: a
-        # quarter is taken as what is left.
+        # The values with two steps differ. Extrapolation to a step of 0 removes most of
+        # that difference: a quarter of it is assumed to be left as a bias.
         disagreements = [disagreement for _, disagreement in parts]
         bias = float(np.linalg.norm(np.mean(disagreements, axis=0))) / 4.0
         return estimate_reference(derivatives, bias=bias), spp
@@ -663,12 +706,23 @@ class GradientBench:
     def _compute_reference_by_estimator(
         self, budget: TimeBudget, seed: int, on_done: Callable[[], None]
     ) -> tuple[ReferenceValue, int]:
-        """Compute the reference as the mean gradient of an estimator, as above."""
+        """Compute the reference as the mean gradient by an estimator.
+
+        Args:
+            budget: time of the reference.
+            seed: seed of the renders.
+            on_done: called after each part.
+
+        Returns:
+            The reference, and the samples per pixel of each of its parts.
+        """
         compute = partial(
             self._compute_gradient, self._exact, self._reference_estimator
         )
-        first_seed = 0
-        spp = choose_part_samples(partial(compute, first_seed), budget.seconds_left)
+        # These renders are only timed, so that any seed will do.
+        spp = choose_part_samples(
+            lambda count: compute(seed=0, spp=count), budget.seconds_left
+        )
         parts = take_reference_parts(partial(compute, spp=spp), budget, on_done, seed)
         return estimate_reference(parts), spp
 
@@ -693,31 +747,33 @@ class GradientBench:
     ) -> Float64Array:
         """Compute the derivatives along directions by finite differences.
 
-        A derivative is computed with two steps and extrapolated to a step of zero. The
-        result is (2, n): the derivatives, and the differences between the values at
-        both steps, which tell how accurate they are.
+        A derivative is computed with two steps and extrapolated to a step of zero.
 
         Args:
             probes: n directions.
             noise: seed of the renders' noise.
             spp: samples per pixel.
+
+        Returns:
+            (2, n): the derivatives; and the differences between the values with both
+            steps, which show how accurate the derivatives are.
         """
         bench = gradients.Bench(self._exact, self._loss, self._u, noise, spp)
-        references = [
-            gradients.measure_reference(bench, probe, repeats=(1, 1))
-            for probe in probes
-        ]
-        pairs = [
-            (reference.value, reference.steps[0] - reference.steps[1])
-            for reference in references
-        ]
-        table: Float64Array = np.array(pairs, dtype=np.float64).T
+        derivatives = []
+        disagreements = []
+        for probe in probes:
+            # one seed: `repeats` are the minimum and the maximum number of seeds
+            reference = gradients.measure_reference(bench, probe, repeats=(1, 1))
+            value_at_step, value_at_half_step = reference.steps
+            derivatives.append(reference.value)
+            disagreements.append(value_at_step - value_at_half_step)
+        table: Float64Array = np.array([derivatives, disagreements], dtype=np.float64)
         return table
 
     def get_reference_error(self, setting: SampleSetting, quantity: str) -> float:
         """Return the relative error of the reference; 0 before it is computed.
 
-        There is one reference for all settings.
+        All settings have the same reference.
         """
         return self.reference.error if self.reference else 0.0
 
@@ -736,26 +792,32 @@ class GradientBench:
         return {"gradient": {**errors, **times}}
 
     def check_bias(self, seed: int) -> str | None:
-        """Check the reference by an adjoint against differences along one direction.
+        """Check the reference against finite differences along one direction.
 
-        An adjoint may be biased where it ignores moving edges. The derivative along a
-        direction by the reference is their dot product.
+        An adjoint may be biased, because it ignores moving edges. The derivative along
+        the direction by the reference is the dot product of the two.
+
+        Args:
+            seed: seed of the renders.
 
         Returns:
-            A sentence if the reference is biased; None if not, or if the reference is
-            itself by differences.
+            A sentence if the reference is biased; None if it is not, or if it is
+            computed by differences itself.
         """
         if self._reference_estimator == "differences" or self.reference is None:
             return None
         exact = self._exact
+        # The plan stays like this: the renderer is not used after this check.
         exact.plan = gradients.restrict_plan(
             exact.plan, self.part.group_names, self._reference_estimator
         )
-        bench = gradients.Bench(exact, self._loss, self._u, seed, spp=64)
+        bench = gradients.Bench(exact, self._loss, self._u, seed, BIAS_CHECK_SPP)
         probe = gradients.find_probes(bench)[0]
-        differences = gradients.measure_reference(bench, probe, repeats=(2, 4))
+        differences = gradients.measure_reference(
+            bench, probe, repeats=BIAS_CHECK_REPEATS
+        )
         slope = float(self.reference.value @ self.part.select(probe.direction))
-        noise = self.reference.error * abs(slope)
+        noise = self.reference.error * abs(slope)  # the error is relative
         estimate = gradients.GradientEstimate(
             self._reference_estimator, slope, noise, repeats=1, seconds=0.0
         )
@@ -765,8 +827,8 @@ class GradientBench:
             f"{self.part.name}: the reference is the mean of "
             f"{self._reference_estimator}, and along one direction it "
             f"gives {slope:.3g}, differences {differences.value:.3g} +- "
-            f"{differences.noise:.1g}: its errors leave out "
-            "that bias"
+            f"{differences.noise:.1g}: the reported errors do "
+            "not include that bias"
         )
 
     def _compute_gradient(

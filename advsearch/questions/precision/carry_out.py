@@ -1,4 +1,4 @@
-"""`precision`: measure error against run time of a scene."""
+"""Measure how the error of images and gradients of a scene depends on run time."""
 
 from __future__ import annotations
 
@@ -54,18 +54,17 @@ from advsearch.questions.precision.rule import (
     summarize_samples,
 )
 
-# fractions of the time by quantity; unused time is that of later ones
+# fraction of the time for each quantity; later quantities get unused time
 TIME_FRACTIONS = {"image": 0.6, "gradient": 0.4}
 # fraction of a quantity's time for its reference
 REFERENCE_FRACTION = 0.35
+# Fraction of a gradient's time, without that of its reference, in which the recommended
+# setting is measured again.
 CONFIRM_FRACTION = 0.4
+# minimum number of these measurements that confirms the setting, and their maximum
+# number
 MIN_CONFIRMATIONS = 4
 MAX_CONFIRMATIONS = 64
-"""Fraction of a gradient's time to measure the recommended setting again, and how
-often.
-
-It counts from `MIN_CONFIRMATIONS` measurements on.
-"""
 
 
 def measure_precision(context: RunContext[PrecisionConfig]) -> PrecisionResult:
@@ -83,13 +82,14 @@ def measure_precision(context: RunContext[PrecisionConfig]) -> PrecisionResult:
     for remark in remarks:
         context.progress.message(remark)
     measurer = QuantityMeasurer(config, problem, context.progress)
-    measurements = context.open_measurements()
+    measurements = context.open_measurements()  # those of a resumed run are stored
     setup_seconds = time.perf_counter() - start_time
     result = measurements.collect(
         measurer.measure_sittings(
-            # a stored sitting is read; only others are measured
+            # a stored sitting is read; a new one is measured
             lambda name, measure: measurements.get_row(name, Sitting, measure)
         ),
+        # makes the result from the sittings so far, after each of them
         lambda sittings: _make_result(context, measurer, sittings, setup_seconds),
     )
     paths = _write_figures(context.run, result)
@@ -106,7 +106,7 @@ def _make_result(
 
     Args:
         context: the settings and the run.
-        measurer: measurer, which knows the problem.
+        measurer: the measurer, which has the problem.
         sittings: the finished sittings, of the image and of gradients.
         setup_seconds: seconds of loading.
     """
@@ -114,7 +114,7 @@ def _make_result(
     problem = measurer.problem
 
     def join(name: str) -> list[Any]:
-        """Join the lists that this field has in all sittings."""
+        """Join the lists in this field of all sittings."""
         return [row for sitting in sittings for row in getattr(sitting, name)]
 
     points = join("points")
@@ -181,8 +181,8 @@ class PlannedSitting(NamedTuple):
 
     Attributes:
         name: name under which its measurements are stored.
-        fraction: its fraction of the time.
-        measure: measures it within a budget.
+        fraction: fraction of the total time for the quantity.
+        measure: measures the quantity within a budget.
     """
 
     name: str
@@ -191,10 +191,10 @@ class PlannedSitting(NamedTuple):
 
 
 class QuantityMeasurer:
-    """The quantities that can be measured.
+    """Measure the image of a scene and the gradients of its controls.
 
-    With a linear loss, gradients are those of an undenoised linear image and of a
-    smooth loss, so that theory knows how their error falls.
+    With the setting `loss=linear`, gradients are those of a smooth linear loss of the
+    raw image, without denoiser and tone curve: theory predicts how their error falls.
 
     Attributes:
         problem: the attack whose scene, controls and model are measured.
@@ -209,7 +209,7 @@ class QuantityMeasurer:
         Args:
             config: the settings.
             problem: problem of an attack, whose scene, controls and model are measured.
-            progress: gets the stages.
+            progress: the progress bar.
         """
         self._config = config
         self.problem = problem
@@ -219,10 +219,13 @@ class QuantityMeasurer:
         self._renderer = problem.renderer
         self._loss = cast(gradients.Loss, problem.compute_loss)
         if self._is_linear:
-            # A smooth loss of the raw image: differences may be taken per pixel.
+            # The loss is a linear function of the raw image, so that theory predicts
+            # the slope of the error.
             self._renderer = problem.renderer.copy_with(
                 denoiser="none", transfer="linear"
             )
+            # Differences have steps over which outlines move by a pixel: the loss is
+            # smooth, but not linear in wider steps.
             self._renderer.plan = self._renderer.plan.with_pixel_steps()
             self._loss = gradients.make_smooth_loss(
                 self._renderer.formation.resolution, config.seed
@@ -233,8 +236,7 @@ class QuantityMeasurer:
         """Plan the sittings: the image first, then the gradient of each control.
 
         Raises:
-            InputError: if the gradient is to be measured and no control has a
-                derivative.
+            InputError: the gradient is to be measured, but no control has a derivative.
         """
         quantities = self._config.measured_quantities
         sittings = []
@@ -262,10 +264,10 @@ class QuantityMeasurer:
     def measure_sittings(
         self, read_or_measure: Callable[[str, Callable[[], Sitting]], Sitting]
     ) -> Iterator[Sitting]:
-        """Yield each sitting, within the time of the settings.
+        """Yield the sitting of each quantity.
 
         A sitting measures one quantity without a break. Time that it does not use is
-        shared among the later ones.
+        divided among the later ones.
 
         Args:
             read_or_measure: returns the stored sitting of a name, or calls the function
@@ -282,37 +284,44 @@ class QuantityMeasurer:
             yield sitting
 
     def round_up(self, point: PrecisionPoint, samples: float) -> int:
-        """Return the next number of samples that a setting accepts.
+        """Round up to a number of samples that the sampler of a point accepts.
 
-        A line of the image is named after its sampler; one of a gradient has that of
-        the run.
+        Args:
+            point: point of the estimator.
+            samples: number of samples per pixel.
         """
         sampler: str = self._config.pixel_sampler
         if point.quantity != "gradient":
+            # For images, the estimator is the name of a sampler, perhaps with `OIDN`.
             sampler = point.estimator.removesuffix(OIDN)
         return self._renderer.scene.round_sample_count(samples, sampler)
 
     def may_be_steeper(self, point: PrecisionPoint) -> bool | None:
         """Return whether the error may fall faster than that of independent samples.
 
-        It may with a stratified sampler (Owen 1997). None if theory says nothing, as
-        where the estimator has a bias: of a step (differences), of an approximation
-        (`material`), or of the denoiser.
+        It may with any other sampler (Owen 1997). None if theory predicts nothing
+        because the estimator has a bias: by the step (differences), by an approximation
+        (`material`), by a loss that is not linear, or by the denoiser.
         """
-        sampler: str = self._config.pixel_sampler
         if point.quantity == "gradient":
+            sampler: str = self._config.pixel_sampler
             is_unbiased = self._is_linear and point.estimator == "adjoint"
         else:
+            # For images, the estimator is the name of a sampler, perhaps with `OIDN`.
             sampler = point.estimator
-            is_unbiased = point.family == "none"  # not denoised
-        return sampler != "independent" if is_unbiased else None
+            is_denoised = point.family != "none"
+            is_unbiased = not is_denoised
+        if not is_unbiased:
+            return None
+        return sampler != "independent"
 
     def _measure_image(self, budget: TimeBudget) -> Sitting:
-        """Measure pictures and the model's margin on them."""
+        """Measure images and the model's margin on them."""
         problem = self.problem
         u = problem.add_conditions(problem.domain.start)
 
         def margin(image: torch.Tensor) -> float:
+            """Return the model's margin on an image (H, W, 3)."""
             return -problem.judge(image, u).score  # a score is a negative margin
 
         bench = PictureBench(
@@ -323,12 +332,12 @@ class QuantityMeasurer:
     def _measure_gradient(self, part: GradientPart, budget: TimeBudget) -> Sitting:
         """Measure the gradient of a part, then its recommended setting again.
 
-        The recommended setting was selected as the best of many noisy ones, so its
-        error looks too small. New measurements of it do not have that bias.
+        The recommended setting was selected as the best of many noisy ones, so that its
+        measured error is too small on average. New measurements do not have that bias.
 
         Args:
             part: the coordinates of the gradient, such as those of one control.
-            budget: time of all of it.
+            budget: time of the reference and of all measurements.
         """
         renderer = self._renderer
         title = f"gradient of {part.name}"
@@ -336,18 +345,19 @@ class QuantityMeasurer:
         bench = GradientBench(
             renderer, self._loss, gradients.find_interior_point(renderer), part
         )
-        # `CONFIRM_FRACTION` of what the reference leaves is for the confirmation.
-        first_fraction = 1.0 - CONFIRM_FRACTION * (1.0 - REFERENCE_FRACTION)
+        # A part of the time without the reference is reserved for new measurements.
+        confirm_fraction = CONFIRM_FRACTION * (1.0 - REFERENCE_FRACTION)
         sitting = self._measure_settings(
-            title, bench, budget.take_fraction(first_fraction)
+            title, bench, budget.take_fraction(1.0 - confirm_fraction)
         )
+        # Recommendations are for each quantity: the gradient is the only one here.
         recommended = recommend_settings(
             sitting.points,
             confirmations=[],
             goal=self._config.error,
             round_up=self.round_up,
             or_steeper=self.may_be_steeper,
-        )[0]  # one for each quantity, and the gradient is the only one
+        )[0]
         warnings = []
         if budget.seconds_left > 0.0:
             bias_warning = bench.check_bias(self._seed)
@@ -368,8 +378,9 @@ class QuantityMeasurer:
     ) -> list[PrecisionPoint]:
         """Measure the recommended setting of a gradient again.
 
-        The list has its point. It is empty if there was no time for enough
-        measurements, or if nothing is recommended.
+        Returns:
+            A list with the point of the setting. It is empty if there was no time for
+            enough measurements, or if nothing is recommended.
 
         Args:
             title: title of the progress.
@@ -435,10 +446,10 @@ class QuantityMeasurer:
         )
 
     def _begin_stage(self, name: str, budget: TimeBudget) -> Callable[..., None]:
-        """Start a stage of the progress bar in seconds, and return what advances it.
+        """Start a stage of the progress bar, and return a function to advance it.
 
-        The returned function moves the bar to the seconds that have passed; keywords
-        are shown next to it.
+        The bar counts seconds. That function moves the bar to the seconds that have
+        passed. Its keywords are displayed next to the bar.
         """
         total = max(1, math.ceil(budget.seconds_left))
         done = 0
@@ -447,6 +458,7 @@ class QuantityMeasurer:
         )
 
         def advance(**info: float | str) -> None:
+            """Move the bar to the seconds that have passed."""
             nonlocal done
             passed = min(total, total - math.ceil(budget.seconds_left))
             self._progress.advance(passed - done, **info)
@@ -460,7 +472,7 @@ def _summarize_settings(
 ) -> list[PrecisionPoint]:
     """Return a point for each measured setting and quantity.
 
-    A measurement has numbers for each quantity, such as "picture" and "margin".
+    A measurement has numbers for each quantity: "picture" and "margin", or "gradient".
     """
     points = []
     for setting, samples in measured.results.items():
@@ -517,10 +529,10 @@ def recommend_settings(
         points: measured settings.
         confirmations: gradient settings that were measured again.
         goal: relative error that has to be reached.
-        round_up: function that returns the next sample count that a sampler accepts,
-            such as a power of two.
-        or_steeper: function of a point that tells whether its error may fall faster
-            than that of independent samples; None if theory does not say.
+        round_up: rounds up to a sample count that a sampler accepts, such as a power of
+            two.
+        or_steeper: returns whether the error of a point may fall faster than that of
+            independent samples; None if theory predicts nothing.
     """
     # one candidate for each estimator, by quantity, control and family
     candidates: dict[tuple[str, str, str], list[Recommended]] = {}
@@ -535,7 +547,7 @@ def recommend_settings(
     for (quantity, control, family), comparable in candidates.items():
         best = min(
             comparable,
-            # Every candidate has seconds, though the field may be empty.
+            # Every candidate has seconds; `or` is only for the type of the field.
             key=lambda candidate: candidate.seconds or 0.0,
             default=Recommended(quantity=quantity, control=control),
         )

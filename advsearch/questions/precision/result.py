@@ -23,13 +23,16 @@ from advsearch.extend import (
 )
 
 QUANTITIES = ("image", "gradient")
+"""What `precision` can measure."""
 SAMPLERS = ("independent", "stratified", "multijitter", "orthogonal", "ldsampler")
-"""What `precision` measures, and the samplers that it knows."""
+"""Samplers that `precision` can compare."""
 
 
 class PrecisionConfig(DerivativeConfig):
-    """Settings of `precision`: error against run time, of a scene, its controls and a
-    model.
+    """Settings of `precision`, which measures error against run time.
+
+    The errors are those of images of a scene, of a model's margin, and of the gradients
+    of controls.
     """
 
     command: ClassVar[str] = "precision"
@@ -38,25 +41,25 @@ class PrecisionConfig(DerivativeConfig):
         settings.Clash(
             "samplers",
             lambda config: "image" not in config.measured_quantities,
-            "is of the image, which `quantities` leaves out; leave it out too",
+            "applies to the image, which `quantities` leaves out; leave it out too",
         ),
         settings.Clash(
             "loss",
             lambda config: "gradient" not in config.measured_quantities,
-            "is of the gradient, which `quantities` leaves out; leave it out too",
+            "applies to the gradient, which `quantities` leaves out; leave it out too",
         ),
     )
 
     quantities: str = setting(
         "image,gradient",
         "search",
-        "what is measured, separated by commas",
+        "quantities to measure, separated by commas",
         ", ".join(QUANTITIES),
     )
     seconds: float = setting(
         120.0,
         "search",
-        "time that all measurements may take",
+        "time of all measurements",
         unit="seconds",
         gt=0.0,
         le=1e9,
@@ -69,7 +72,7 @@ class PrecisionConfig(DerivativeConfig):
         le=1.0,
     )
     rounds: int = setting(
-        8, "search", "measurements of every setting, at most", ge=3, le=1000
+        8, "search", "maximum number of measurements of a setting", ge=3, le=1000
     )
     samplers: str = setting(
         ",".join(SAMPLERS),
@@ -80,8 +83,8 @@ class PrecisionConfig(DerivativeConfig):
     loss: Literal["linear", "model"] = setting(
         "linear",
         "search",
-        "whose gradient is measured: a smooth linear loss of the raw picture, or the "
-        "model's in its image formation",
+        "loss whose gradient is measured: a smooth linear loss of the raw image, or "
+        "the loss of the model with its image formation",
     )
     run: str | None = setting_as_in(
         SceneConfig, "run", otherwise="runs/OBJECT-precision-NNN"
@@ -90,7 +93,7 @@ class PrecisionConfig(DerivativeConfig):
     @field_validator("quantities", "samplers", mode="before")
     @classmethod
     def _names_from_list(cls, value: Any) -> Any:
-        """Join a list of names by commas, which is how a string states them."""
+        """Convert a list of names to a string with commas between them."""
         if isinstance(value, (list, tuple)):
             return ",".join(str(part) for part in value)
         return value
@@ -98,10 +101,11 @@ class PrecisionConfig(DerivativeConfig):
     @field_validator("quantities", "samplers")
     @classmethod
     def _check_names(cls, value: str, info: Any) -> str:
-        """Refuse an empty list, duplicates, and names that are not known.
+        """Reject an empty list, duplicates, and unknown names.
 
         Raises:
-            ValueError: for each of these.
+            ValueError: a clause of what was got. pydantic catches it, and the user gets
+                a message with the known names.
         """
         names = settings.split_names(value)
         known = QUANTITIES if info.field_name == "quantities" else SAMPLERS
@@ -129,33 +133,36 @@ class PrecisionPoint(results.Measured):
 
     family: str = Field(
         default="",
-        description="what it is recommended among: `raw`, `oidn`, `depth` or "
-        "`predicted`; absent of gradients",
+        description="denoiser of an image, `none` or `oidn`: only settings of the same "
+        "family are compared for a recommendation; empty for gradients",
     )
     heavy_tailed: bool = Field(
         default=False,
-        description="a few pixels hold the error, so that it has no interval",
+        description="whether a few pixels have most of the error; then there is no "
+        "interval",
     )
     wall_seconds: results.JsonFloat | None = results.optional_field(
-        "by the clock; `seconds` are processor time"
+        "time by the clock; `seconds` is processor time"
     )
 
     @property
     def is_known(self) -> bool:
-        """Whether the error is well above the reference's own; else it is an upper
-        limit.
+        """Whether the error is known: clearly larger than that of the reference.
+
+        Otherwise it is an upper limit.
         """
         return self.status == "ok"
 
     @property
     def rms(self) -> float:
-        """The error as a number; NaN where there is none."""
+        """The root mean square error; NaN if there is none."""
         return math.nan if self.error is None else self.error
 
 
 class PrecisionSlope(results.Fields):
-    """A line through the points of an estimator: log of the error against log of the
-    samples.
+    """A line through the points of an estimator.
+
+    It relates the logarithm of the error to the logarithm of the samples.
     """
 
     quantity: str
@@ -163,52 +170,60 @@ class PrecisionSlope(results.Fields):
     estimator: str
     slope: float
     interval: results.Interval
-    offset: float = Field(description="logarithm of the error at one sample")
-    points: int
-    theory: float | None = Field(description="what the slope should be")
-    or_steeper: bool
-    agrees: bool | None = Field(description="null where that can't be told")
+    offset: float = Field(description="natural logarithm of the error with one sample")
+    points: int = Field(description="number of points of the fit")
+    theory: float | None = Field(
+        description="slope that theory predicts; null if it predicts none"
+    )
+    or_steeper: bool = Field(description="whether theory allows a steeper slope, too")
+    agrees: bool | None = Field(
+        description="whether the slope agrees with theory; null if that is not known"
+    )
 
 
 class PrecisionReference(results.Fields):
-    """A reference that stands for the truth, and its error."""
+    """A reference, which is used as the truth, and its error."""
 
     quantity: str
     control: str = ""
     reference: str
     error: results.JsonFloat
-    parts: int
-    spp: int = Field(description="samples a pixel of all parts together")
+    parts: int = Field(description="number of independent parts")
+    spp: int = Field(description="samples per pixel, summed over all parts")
 
 
 class Recommended(results.Fields):
-    """The setting that reaches the goal soonest."""
+    """The fastest setting that reaches the goal."""
 
     quantity: str
     control: str
     family: str = ""
     goal: float | None = None
     estimator: str | None = results.optional_field(
-        "null where nothing that was measured reaches it"
+        "null if no setting that was measured reaches the goal"
     )
     spp: int | None = None
     seconds: results.JsonFloat | None = None
     error: results.JsonFloat | None = None
     basis: str | None = results.optional_field(
-        "measured, fitted, interpolated, extrapolated or confirmed"
+        "how the samples were found: `measured`, `fitted`, `interpolated`, "
+        "`extrapolated` or `confirmed`"
     )
-    repeats: int | None = results.optional_field("measurements that confirm it")
+    repeats: int | None = results.optional_field(
+        "number of new measurements that confirm it"
+    )
 
 
 class Sitting(results.Fields):
-    """What was measured without a break: the picture and the margin, or a control's
-    gradient.
+    """The measurements of one quantity, which were made without a break.
+
+    They are those of the image and the margin, or of the gradient of a control.
     """
 
     points: list[PrecisionPoint] = Field(default=[])
     references: list[PrecisionReference] = Field(default=[])
     confirmations: list[PrecisionPoint] = Field(
-        default=[], description="recommended settings, measured anew"
+        default=[], description="new measurements of recommended settings"
     )
     warnings: list[str] = Field(default=[])
     left_out: list[str] = Field(default=[])
@@ -216,7 +231,7 @@ class Sitting(results.Fields):
 
 
 class Machine(results.Fields):
-    """The machine that times were measured on."""
+    """The machine on which times were measured."""
 
     cpu: str
     cores: int
@@ -235,7 +250,7 @@ class PrecisionResult(RunResult):
     loss: str
     spp: int
     machine: Machine
-    goal: float = Field(description="relative error that is wanted")
+    goal: float = Field(description="relative error that is to be reached")
     points: list[PrecisionPoint]
     slopes: list[PrecisionSlope]
     references: list[PrecisionReference]
@@ -246,23 +261,22 @@ class PrecisionResult(RunResult):
 
 
 WARM_UP_CALLS = 3
-"""Calls of a setting whose times don't count where there are more: the first compiles
-and records kernels, the second may record them again, and so may the first one after
-other scenes were rendered.
+"""Number of first calls of a setting whose times are not used if there are more calls.
+
+The first one compiles and records kernels. The second may record them again, and so may
+the first one after other scenes were rendered.
 """
 FAMILY_SUFFIXES = {"none": " without denoiser", "oidn": " with denoiser"}
 READING_NOTE = (
-    "Each row is a setting: its error beside a reference of far more samples, with the "
-    "95 % interval of that "
-    "error, and the processor time, in seconds, that one picture or gradient takes. A "
-    "margin is how far the right "
-    "prediction leads the wrong one, in logits; a cosine of 1 means that a gradient "
-    "points the right way."
+    "Each row is a setting: its error relative to a reference with far more samples, "
+    "the 95 % interval of that error, and the processor time in seconds for one image "
+    "or gradient. A margin is the logit of the right class minus that of the wrong "
+    "one. A cosine of 1 means that a gradient has the right direction."
 )
 
 
 def describe_quantity(quantity: str, control: str = "") -> str:
-    """Name a quantity in a sentence."""
+    """Return the name of a quantity for a sentence."""
     return f"the gradient of {control}" if quantity == "gradient" else f"the {quantity}"
 
 
@@ -280,7 +294,7 @@ SLOPE_COLUMNS: Mapping[str, views.Column] = {
     "": lambda slope: {
         True: "agrees",
         False: "DISAGREES",
-        None: "" if slope.theory is None else "can't be told",
+        None: "" if slope.theory is None else "not known",
     }[slope.agrees],
 }
 REFERENCE_COLUMNS: Mapping[str, views.Column] = {
@@ -296,7 +310,7 @@ def make_view(result: PrecisionResult) -> ShownResult:
     """Lay out a result: recommendations, errors, slopes and references."""
     headline = make_headline(result)
     if result.is_unfinished:
-        headline = f"It was stopped: only a part was measured. {headline}"
+        headline = f"Stopped early: not everything was measured. {headline}"
     machine = result.machine
     threads = " and ".join(
         f"{count} of {name}" for name, count in machine.threads.items()
@@ -311,7 +325,7 @@ def make_view(result: PrecisionResult) -> ShownResult:
 
 
 def _make_parts(result: PrecisionResult) -> list[ResultPart]:
-    """Return the lists and tables of a result, in the order in which they are shown."""
+    """Return the lists and tables of a result in their order."""
     recommendations = [
         describe_recommendation(recommendation, result.goal)
         for recommendation in result.recommendations
@@ -322,7 +336,7 @@ def _make_parts(result: PrecisionResult) -> list[ResultPart]:
     ]
     return [
         ResultPart("Recommended", recommendations),
-        # A page has this note at the table of references instead.
+        # On a page this note is at the table of references instead.
         ResultPart(text=[READING_NOTE], only="text"),
         *error_tables,
         ResultPart.make_table(
@@ -336,17 +350,17 @@ def _make_parts(result: PrecisionResult) -> list[ResultPart]:
             title="References, with their own errors",
             note=READING_NOTE,
         ),
-        ResultPart("Not measured, the time was up", result.left_out),
+        ResultPart("Not measured for lack of time", result.left_out),
     ]
 
 
 def make_headline(result: PrecisionResult) -> str:
     """Summarize a result in a sentence: the first setting that reaches the goal."""
-    # a recommendation without an estimator states that none reaches the goal
+    # In a recommendation without an estimator, no setting reaches the goal.
     first = next((row for row in result.recommendations if row.estimator), None)
     if first is None:
         return (
-            "Nothing that was measured is known to reach the error: give it more "
+            "No setting that was measured is known to reach the error: set more "
             "`seconds` or a larger `error`."
         )
     quantity = describe_quantity(first.quantity, first.control)
@@ -363,10 +377,10 @@ def describe_recommendation(recommendation: Recommended, goal: float) -> str:
     goal_text = f"{100 * goal:.3g} % error of {quantity}{suffix}"
     if recommendation.estimator is None:
         return (
-            f"{goal_text}: not reached by anything that was measured; give it more "
+            f"{goal_text}: not reached by any setting that was measured; set more "
             "`seconds` or a larger `error`"
         )
-    # Only the exceptions are named, such as "extrapolated".
+    # Only an unusual basis is stated, such as "extrapolated".
     is_usual = recommendation.basis in ("interpolated", "fitted")
     basis = "" if is_usual else f" ({recommendation.basis})"
     return (
@@ -376,14 +390,15 @@ def describe_recommendation(recommendation: Recommended, goal: float) -> str:
 
 
 def list_cautions(points: Sequence[PrecisionPoint]) -> list[str]:
-    """Return warnings about points: errors of few pixels, and a busy machine.
+    """Return warnings about errors of few pixels, and about a busy machine.
 
     The machine counts as busy if most measurements took more than twice their processor
     time by the clock: they waited for other programs.
     """
     # Heavy tails: a few pixels have most of the error.
     heavy = sorted({point.estimator for point in points if point.heavy_tailed})
-    # of each point with a time by the clock: whether it took twice the processor time
+    # for each point with a time by the clock: whether it took over twice the processor
+    # time
     waited = [
         point.wall_seconds > 2.0 * point.seconds
         for point in points
@@ -393,24 +408,28 @@ def list_cautions(points: Sequence[PrecisionPoint]) -> list[str]:
     warnings = []
     if heavy:
         warnings.append(
-            f"{', '.join(heavy)}: a few pixels hold most of the error (fireflies), so "
-            "that repeats say too little and "
-            "it has no interval; a denoiser or more `rounds` help"
+            f"{', '.join(heavy)}: a few pixels have most of the error (fireflies), so "
+            "that a few repeats do not show its size and there is no interval; a "
+            "denoiser or more `rounds` help"
         )
     if is_busy:
         warnings.append(
-            "the machine was busy with something else: by the clock, most pictures and "
-            "gradients took over twice their "
-            "processor time; measure again when it is quiet"
+            "the machine was busy with other programs: by the clock, most images and "
+            "gradients took over twice their processor time; measure again when it is "
+            "idle"
         )
     return warnings
 
 
 def _make_error_table(quantity: str, points: Sequence[PrecisionPoint]) -> ResultPart:
-    """Make the table of errors of a quantity: "picture", "margin" or "gradient".
+    """Make the table of errors of a quantity.
 
     Only gradients have a control and a cosine. An unknown error is printed as an upper
     limit with "<".
+
+    Args:
+        quantity: "picture", "margin" or "gradient".
+        points: points of all quantities.
     """
     rows = [point for point in points if point.quantity == quantity]
     columns: dict[str, views.Column] = (
@@ -467,9 +486,9 @@ MINUS = "\N{MINUS SIGN}"
 def draw_figures(result: PrecisionResult) -> figures.Figures:
     """Return work-precision diagrams as files: error against seconds, both logarithmic.
 
-    Filled markers are known errors. Open markers with an arrow are upper limits, as the
-    reference has a similar error. The dashed line falls as the error of independent
-    samples does. The result is empty if no error is known.
+    Filled markers are known errors. Open markers with an arrow are upper limits, since
+    the reference has a similar error. The dashed line has the slope of the error of
+    independent samples. The result is empty if no error is known.
     """
     panels: dict[str, list[PrecisionPoint]] = {}
     for point in result.points:
@@ -510,19 +529,20 @@ def _make_caption(result: PrecisionResult) -> str:
         thread = "thread" if count == 1 else "threads"
         thread_counts.append(f"{count} {name} {thread}")
     threads = ", ".join(thread_counts)
-    # Times of warm-up calls don't count: of few repeats, the last one is left.
+    # Times of warm-up calls are not used, see `median_time`. With few repeats only the
+    # last one is left.
     max_repeats = max(point.repeats for point in result.points)
-    seconds = f"of the last of {max_repeats} repeats at most"
-    if max_repeats > WARM_UP_CALLS + 1:
-        seconds = (
-            f"medians of at most {max_repeats - WARM_UP_CALLS} interleaved repeats"
-        )
+    max_timed_repeats = max_repeats - WARM_UP_CALLS
+    if max_timed_repeats > 1:
+        seconds = f"medians of at most {max_timed_repeats} interleaved repeats"
+    else:
+        seconds = f"of the last of {max_repeats} repeats at most"
     legend = "Filled: known"
     if any(point.interval for point in result.points):
         legend += ", with its 95 % interval"
     legend += "."
     if not all(point.is_known for point in result.points):
-        legend += " Open, with an arrow: at most this, the reference is no better."
+        legend += " Open, with an arrow: an upper limit, the reference is no better."
     return (
         f"{machine.cpu}, {machine.cores} cores, {threads}; seconds are "
         f"{seconds}.\n{legend}"
@@ -537,7 +557,7 @@ def _draw_errors(
     Args:
         axes: axes of matplotlib.
         points: points of one quantity, and of one control if it is a gradient.
-        result: result that they are part of, with the slopes and the goal.
+        result: result with these points, and with the slopes and the goal.
     """
     quantity = points[0].quantity
     control = points[0].control
@@ -582,11 +602,11 @@ def _make_label(name: str, slope: PrecisionSlope | None) -> str:
         return name
     theory = f" (not {slope.theory:.2f})" if slope.agrees is False else ""
     label = f"{name}  {slope.slope:.2f}{theory}"
-    return label.replace(" -", f" {MINUS}")  # the sign that figures have
+    return label.replace(" -", f" {MINUS}")  # figures have a typographic minus sign
 
 
 def _draw_goal(axes: Any, goal: float) -> None:
-    """Draw a dotted line at the error that is the goal, in percent, if it is in view."""
+    """Draw a dotted line at the goal, an error in percent, if it is in view."""
     lower, upper = axes.get_ylim()
     if lower < goal < upper:
         axes.axhline(goal, color="#1c1d20", linewidth=0.8, linestyle=":")
@@ -608,12 +628,13 @@ def _draw_theory(axes: Any, points: Sequence[PrecisionPoint]) -> None:
     """
     start = min(point.seconds for point in points)
     end = max(point.seconds for point in points)
-    # The lowest point relative to that law.
-    # A line over a shorter range would say nothing.
-    if not end >= 1.5 * start:
+    spans_enough_time = end >= 1.5 * start  # False if a time is NaN
+    if not spans_enough_time:
         return
-    smallest = min(point.rms * math.sqrt(point.seconds) for point in points)
-    scale = PERCENT * smallest * 0.8  # a little under the lowest point
+    # the scale for which the line passes through the lowest point, relative to its
+    # slope
+    smallest_scale = min(point.rms * math.sqrt(point.seconds) for point in points)
+    scale = PERCENT * smallest_scale * 0.8  # a little under that point
     # the middle of the range on a logarithmic axis
     center = math.sqrt(start * end)
     axes.plot(
@@ -643,7 +664,7 @@ def _draw_line(
     Args:
         axes: axes of matplotlib, logarithmic.
         line: the points, by ascending samples.
-        number: number of the estimator, which chooses color and marker.
+        number: index of the estimator, which decides color and marker.
         label: label in the legend.
     """
     color = COLORS[number % len(COLORS)]
@@ -658,7 +679,7 @@ def _draw_line(
     for point in line:
         _draw_point(axes, point, color, marker)
     axes.plot(
-        # an empty line, whose entry in the legend has marker and line
+        # an empty line, which adds an entry with marker and line to the legend
         [],
         [],
         marker=marker,
@@ -682,7 +703,8 @@ def _draw_point(axes: Any, point: PrecisionPoint, color: str, marker: str) -> No
     x = point.seconds
     y = PERCENT * point.rms
     lower, upper = (PERCENT * bound for bound in point.interval or (math.nan, math.nan))
-    # Neither a missing interval (NaN) nor one of over four times the error is drawn.
+    # An interval is not drawn if it is missing (NaN), or if its upper bound is over
+    # four times the error.
     if upper < 4.0 * y:
         axes.plot([x, x], [lower, upper], color=color, linewidth=0.8, alpha=0.6)
     axes.plot(
@@ -700,18 +722,20 @@ def _draw_point(axes: Any, point: PrecisionPoint, color: str, marker: str) -> No
             "linewidth": 0.8,
             "shrinkA": 3,
         }
-        arrow_tip = y * 0.72  # the axis is logarithmic: as long for every point
+        # On a logarithmic axis, a factor gives all arrows the same length.
+        arrow_tip = y * 0.72
         axes.annotate("", (x, arrow_tip), (x, y), arrowprops=arrow)
 
 
 def _plain_axis(axis: Any) -> None:
-    """Set ticks at 1, 2 and 5 times powers of ten, labelled as plain numbers.
+    """Set ticks at round numbers, with labels as plain numbers.
 
-    The usual ticks of a logarithmic axis are powers of ten, of which a narrow range has
-    only one. The first list of factors that gives three ticks is used, so a wide range
-    has powers only, and a narrow one has denser ticks.
+    The usual ticks of a logarithmic axis are powers of ten, but a narrow range may have
+    only one of these. So ticks are factors times powers of ten. The first list of
+    factors that gives three ticks is used: a wide range has powers of ten only, and a
+    narrow one has denser ticks.
     """
-    # takes long to import
+    # Importing it takes long.
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
 
     low, high = sorted(axis.get_view_interval())
@@ -730,7 +754,7 @@ def _plain_axis(axis: Any) -> None:
             if low <= factor * 10.0**power <= high
         ]
         if len(ticks) >= 3:
-            break  # else the next factors give more ticks
+            break
     axis.set_major_locator(FixedLocator(ticks))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
     axis.set_minor_formatter(NullFormatter())

@@ -1,6 +1,6 @@
 """Statistics of repeated measurements: errors, slopes, and the fastest setting.
 
-An error is relative to a reference that has an error of its own. Nothing here renders.
+An error is relative to a reference, which has an error itself. Nothing here renders.
 """
 
 from __future__ import annotations
@@ -25,14 +25,16 @@ from advsearch.questions.precision.result import (
 
 Float64Array = npt.NDArray[np.float64]
 Numbers = Mapping[str, float]
-"""One measurement: `error`, `cosine`, `seconds` of processor time and others; `fourth`
-is the sum of the fourth powers of all relative errors in a picture, whose squares
-`error` adds up.
+"""Numbers of one measurement by name.
+
+They are the relative `error`, `cosine`, `seconds` of processor time, `wall_seconds`,
+and `fourth`: the sum of the fourth powers of the relative errors of all values.
+(`error` is the root of the sum of their squares.)
 """
 RoundUp = Callable[[PrecisionPoint, float], int]
-"""From a point and a number of samples to the next number that its setting takes."""
+"""Rounds a number of samples up to one that the estimator of a point accepts."""
 
-# multiple of the reference's own error above which a measured error is known
+# a measured error is known if it exceeds this multiple of the reference's error
 MIN_ERROR_RATIO = 2.0
 # confidence of every interval
 CONFIDENCE = 0.95
@@ -40,13 +42,12 @@ MIN_TAIL_SIZE = 1000
 MIN_ERROR_PIXELS = 100
 """Limits of heavy tails.
 
-For values of at least `MIN_TAIL_SIZE` numbers it is checked how many of them hold the
-error. If these are fewer than `MIN_ERROR_PIXELS`, in all measurements together, a few
-noisy pixels decide it, and an interval would cover the truth too rarely
-(`benchmarks/precision.py
---intervals`).
+For a value of at least `MIN_TAIL_SIZE` numbers, the effective number of pixels that
+have the error is estimated, over all measurements together. If it is less than
+`MIN_ERROR_PIXELS`, a few noisy pixels decide the error, and an interval would cover the
+truth too rarely (`benchmarks/precision.py --intervals`).
 """
-# difference from theory that a slope may have, whatever its interval
+# maximum difference from theory of a slope that agrees with it, whatever its interval
 SLOPE_TOLERANCE = 0.1
 # slope of the error of a mean of independent samples against their number
 MONTE_CARLO_SLOPE = -0.5
@@ -54,10 +55,11 @@ MONTE_CARLO_SLOPE = -0.5
 MAX_EXTRAPOLATION = 16.0
 # minimum number of different sample counts of a fit
 MIN_FIT_POINTS = 3
-# A line that is fitted or extrapolated is at least this steep. Flatter ones reach an
-# error only with sample counts of which nothing is known.
+# Maximum slope of a line that is used for a recommendation. A flatter line reaches an
+# error only with sample counts far beyond the measured ones.
 MAX_FALLING_SLOPE = -0.1
-# A line is extrapolated at most this steep, however steep it is between points.
+# Minimum slope of an extrapolation: a line that is steeper between points is
+# extrapolated with this slope.
 MIN_EXTRAPOLATED_SLOPE = -1.0
 
 
@@ -69,9 +71,10 @@ class SampleSetting:
         quantity: "picture", "margin" or "gradient".
         estimator: name of the sampler with the denoiser, or of the gradient estimator.
         spp: samples per pixel.
-        cost: the expected time in any unit.
-        control: control of a gradient, the name of its part; else empty.
-        family: settings are compared and recommended within one: the denoiser.
+        cost: expected time, in any unit.
+        control: for a gradient, the name of its part, such as a control; else empty.
+        family: for an image, its denoiser; only settings of the same family are
+            compared for a recommendation. Empty for gradients.
     """
 
     quantity: str
@@ -83,15 +86,19 @@ class SampleSetting:
 
     @property
     def line(self) -> tuple[str, str, str]:
-        """The settings that differ in samples alone have the same line."""
+        """The key of a line: settings that differ only in the number of samples."""
         return self.quantity, self.control, self.estimator
 
 
 @dataclass(frozen=True, eq=False)
 class ReferenceValue:
-    """A value (n,) that stands for the truth, with its relative error.
+    """A value that is used as the truth, with its error.
 
-    `norm` is its norm, `parts` the number of independent parts that it is the mean of.
+    Attributes:
+        value: (n,) the value.
+        error: relative error of the value.
+        norm: norm of the value.
+        parts: number of independent parts whose mean it is.
     """
 
     value: Float64Array
@@ -103,20 +110,24 @@ class ReferenceValue:
         """Compare a value (n,) with the reference.
 
         Returns:
-            `error`, the norm of the difference divided by that of the reference;
-            `cosine` of the angle between them; `fourth`, the sum of fourth powers of
-            the relative errors of the single numbers. NaN if a norm is zero, and
-            `fourth` also if there are too few numbers to tell tails.
+            "error": norm of the difference, divided by the norm of the reference.
+            "cosine": cosine of the angle between both; NaN if one of them is zero.
+            "fourth": sum of the fourth powers of the relative errors of all n numbers;
+            NaN if there are too few numbers (`MIN_TAIL_SIZE`) to detect heavy tails, or
+            if the reference is zero.
         """
         difference = value - self.value
-        norm = float(np.linalg.norm(value)) * self.norm
-        has_tails = len(value) >= MIN_TAIL_SIZE and self.norm > 0.0
+        product_of_norms = float(np.linalg.norm(value)) * self.norm
+        cosine = math.nan
+        if product_of_norms > 0.0:
+            cosine = float(value @ self.value) / product_of_norms
+        can_detect_tails = len(value) >= MIN_TAIL_SIZE and self.norm > 0.0
         fourth = math.nan
-        if has_tails:
+        if can_detect_tails:
             fourth = float(np.sum((difference / self.norm) ** 4))
         return {
             "error": relative_error(float(np.linalg.norm(difference)), self.norm),
-            "cosine": float(value @ self.value) / norm if norm > 0.0 else math.nan,
+            "cosine": cosine,
             "fourth": fourth,
         }
 
@@ -129,19 +140,20 @@ def estimate_reference(
     """Return a function of the mean of independent parts, with its jackknife error.
 
     The jackknife (Efron 1982, chapter 3) computes the function again without each part
-    in turn. With n parts, v the value with all of them, v_i that without part i, and m
-    the mean of the v_i, the standard error is sqrt((n - 1) / n * sum |v_i - m|^2). The
-    bias, which noise causes in a nonlinear function, is (n - 1) * |m - v|. The error is
-    the root of the sum of squares of both and of the known `bias`.
+    in turn. With K parts, v the value with all of them, v_i the value without part i,
+    and m the mean of the v_i, the standard error is sqrt((K - 1) / K * sum |v_i -
+    m|^2). The estimated bias, which noise causes in a nonlinear function, is (K - 1) *
+    |m - v|. It is used only as far as it exceeds the standard error. The error is the
+    root of the sum of squares of both and of the known `bias`.
 
     Args:
-        parts: independent estimates (n,) of the same quantity.
+        parts: K independent estimates (n,) of the same quantity.
         function: function of the mean, from (n,) to (m,). For example, it applies a
             tone curve, or computes a model's margin.
         bias: a known bias of the value.
 
     Raises:
-        ValueError: if there are fewer than two parts.
+        ValueError: there are fewer than two parts.
     """
     count = len(parts)
     if count < 2:
@@ -162,8 +174,8 @@ def estimate_reference(
     bias_estimate = 0.0
     if count > 2:
         bias_estimate = (count - 1) * float(np.linalg.norm(center - value))
-    # The estimate of the bias scatters as much as the value does: what is less may be
-    # chance, and the scatter counts already.
+    # The estimate of the bias has about the same standard error as the value. So a bias
+    # up to this size may be chance, and the standard error is already counted.
     bias_estimate = max(0.0, bias_estimate - scatter)
     norm = float(np.linalg.norm(value))
     error = math.hypot(scatter, bias_estimate, bias)
@@ -177,18 +189,20 @@ def summarize_samples(
 ) -> PrecisionPoint:
     """Estimate the error of a setting from repeated measurements.
 
-    The differences from the reference contain its error, too. Both errors are
-    independent, so their squares add: mean square = error^2 + reference_error^2. If the
-    root mean square is below `MIN_ERROR_RATIO` times the reference's error, it may be
-    only that: then the error is not known, and the root mean square is an upper limit.
-    The interval comes from the scatter of the squares, on a logarithmic scale. There is
-    none for a single measurement or with heavy tails.
+    A difference from the reference contains the error of the reference, too. Both
+    errors are independent, so their squares add: mean square = error^2 +
+    reference_error^2. If the root mean square is below `MIN_ERROR_RATIO` times the
+    reference's error, it may be mostly that error. Then the error of the setting is not
+    known, and the root mean square is an upper limit. The same holds if all measured
+    errors are 0, or if one is infinite. The interval is computed from the standard
+    error of the mean square. There is none for a single measurement, nor with heavy
+    tails.
 
     Args:
         setting: the setting that was measured.
         samples: the measurements, each with its relative "error", and with "cosine" and
-            times if they are known.
-        reference_error: relative error of what they were compared with.
+            times if they are known. All have the same names.
+        reference_error: relative error of the reference.
     """
     squares = [numbers["error"] ** 2 for numbers in samples]
     mean_square = statistics.fmean(squares)
@@ -197,6 +211,7 @@ def summarize_samples(
     error = math.sqrt(mean_square)
     if is_known:
         error = math.sqrt(mean_square - reference_error**2)
+    # whether a few pixels have most of the error
     is_heavy = is_heavy_tailed(samples)
     interval = None
     if is_known and not is_heavy and len(squares) > 1:
@@ -230,8 +245,8 @@ MAX_LOG_FACTOR = 50.0
 def _interval_factor(squares: Sequence[float], mean_square: float) -> float:
     """Return the factor between a root mean square and either bound of its interval.
 
-    The interval is symmetric on a logarithmic scale: the root mean square is divided by
-    the factor for the lower bound, and multiplied for the upper one.
+    The interval is symmetric on a logarithmic scale: its lower bound is the root mean
+    square divided by the factor, and its upper bound is the product of both.
 
     Args:
         squares: squares of at least two measured errors.
@@ -245,12 +260,13 @@ def _interval_factor(squares: Sequence[float], mean_square: float) -> float:
 
 
 def is_heavy_tailed(samples: Sequence[Numbers]) -> bool:
-    """Return whether a few pixels hold most of the error of the pictures.
+    """Return whether a few pixels have most of the error of the images.
 
     If n pixels had equal errors and all others none, (sum of squares)^2 / (sum of
-    fourth powers) would be n: so this is the effective number of pixels. Few are less
-    than `MIN_ERROR_PIXELS`. False if the pictures are too small to tell. What happens
-    in none of the pictures, such as a firefly in every hundredth one, cannot be seen.
+    fourth powers) would be n. So this is the effective number of pixels, and it is
+    small if it is less than `MIN_ERROR_PIXELS`. False if the images are too small.
+    Rare events that are in none of the images, such as a firefly in every hundredth
+    image, cannot be detected.
     """
     sum_of_squares = sum(numbers["error"] ** 2 for numbers in samples)
     # NaN without fourth powers, which makes the result false
@@ -261,12 +277,18 @@ def is_heavy_tailed(samples: Sequence[Numbers]) -> bool:
 
 
 def median_time(seconds: Sequence[float]) -> float:
-    """Return the median of times without warm-up calls, or the last one if all are."""
+    """Return the median of times without warm-up calls.
+
+    If there are only warm-up calls, it is the time of the last one.
+    """
     return statistics.median(seconds[WARM_UP_CALLS:] or seconds[-1:])
 
 
 def relative_error(error: float, size: float) -> float:
-    """Divide an error by a norm; an error of nothing is infinite unless it is 0."""
+    """Divide an error by a norm.
+
+    If the norm is 0, the result is infinite, or 0 if the error is 0, too.
+    """
     if size > 0.0:
         return error / size
     return 0.0 if error == 0.0 else math.inf
@@ -277,17 +299,18 @@ def fit_line(
 ) -> PrecisionSlope | None:
     """Fit the line of log error against log samples by least squares.
 
-    Only points with a known error are used, as the others have only an upper limit. The
-    result is None if these have fewer than `MIN_FIT_POINTS` different sample counts.
+    Only points with a known error are used, since the others have only an upper limit.
+    The result is None if these have fewer than `MIN_FIT_POINTS` different sample
+    counts.
 
-    The slope agrees with theory if it differs from `MONTE_CARLO_SLOPE` by
-    `SLOPE_TOLERANCE` at most. It disagrees if it differs by more, and its interval
-    excludes theory as well. Otherwise `agrees` is None: not known.
+    The slope agrees with theory if it differs from `MONTE_CARLO_SLOPE` by at most
+    `SLOPE_TOLERANCE`. It disagrees if it differs by more, and its interval excludes
+    theory as well. Otherwise `agrees` is None: not known.
 
     Args:
         points: points of one estimator.
-        or_steeper: whether a steeper slope agrees with theory, too, as for samples that
-            are spread evenly. None if theory predicts no slope; then `agrees` is None.
+        or_steeper: whether a steeper slope agrees with theory, too, as for stratified
+            samples. None if theory predicts no slope; then `agrees` is None.
     """
     known = [point for point in points if point.is_known]
     if len({point.spp for point in known}) < MIN_FIT_POINTS:
@@ -322,11 +345,14 @@ def _agrees_with_theory(
     Args:
         slope: slope of log error against log samples.
         half_width: half the width of its interval.
-        or_steeper: whether a steeper slope agrees, too; None if theory says nothing.
+        or_steeper: whether a steeper slope agrees, too; None if theory predicts no
+            slope.
     """
     if or_steeper is None:
         return None
-    deviation = slope - MONTE_CARLO_SLOPE  # negative if steeper, and so never too large
+    # Slopes are negative: the deviation of a steeper slope is negative, and so never
+    # too large.
+    deviation = slope - MONTE_CARLO_SLOPE
     if not or_steeper:
         deviation = abs(deviation)
     if deviation <= SLOPE_TOLERANCE:
@@ -338,32 +364,32 @@ def _agrees_with_theory(
 def describe_disagreement(
     slope: PrecisionSlope, points: Sequence[PrecisionPoint]
 ) -> str | None:
-    """Describe how a slope disagrees with theory, and the likeliest reason.
+    """Describe how a slope disagrees with theory, and the most likely reason.
 
     None if it agrees.
     """
     if slope.agrees is not False or slope.theory is None:
         return None
     if slope.slope <= slope.theory:
-        reason = "the fewest samples are not in the asymptotic range yet"
+        reason = "the smallest sample counts are not in the asymptotic range yet"
     elif has_leveled_off(points):
-        reason = "it levels off: a bias is left that no samples remove"
+        reason = "it levels off: there is a bias, which more samples do not remove"
     else:
-        reason = "heavy-tailed noise, clipping at few samples or a bias"
+        reason = "heavy-tailed noise, clipping with few samples, or a bias"
     return (
         f"{slope.control or slope.quantity} by {slope.estimator}: the error falls with "
         f"slope {slope.slope:.2f} against "
         f"samples (95 %: {slope.interval[0]:.2f} to {slope.interval[1]:.2f}), theory "
-        f"says {slope.theory:g}"
+        f"predicts {slope.theory:g}"
         f"{' or steeper' if slope.or_steeper else ''}: {reason}"
     )
 
 
 def has_leveled_off(points: Sequence[PrecisionPoint]) -> bool:
-    """Return whether the error has stopped falling, as it does if there is a bias.
+    """Return whether the error has stopped falling, as with a bias.
 
-    That is so if the slope between the last two known points is less than half as steep
-    as the steepest slope before.
+    It has if the slope between the last two known points is less than half as steep as
+    the steepest slope before.
     """
     known = sorted(
         (point for point in points if point.is_known), key=lambda point: point.spp
@@ -382,7 +408,7 @@ def has_leveled_off(points: Sequence[PrecisionPoint]) -> bool:
 
 def round_up_exactly(point: PrecisionPoint, samples: float) -> int:
     """Return the next whole number of samples."""
-    return math.ceil(samples - 1e-9)  # a whole number may be larger by rounding
+    return math.ceil(samples - 1e-9)  # rounding errors must not add a sample
 
 
 def recommend_count(
@@ -393,21 +419,22 @@ def recommend_count(
 ) -> Recommended | None:
     """Return the smallest sample count at which one estimator reaches a relative error.
 
-    A line is fitted to the logarithms of error and samples. If it passes through the
-    intervals of all known points, of at least four, the count comes from the line.
-    Otherwise the error is interpolated between the points on logarithmic axes. Beyond
-    the last point the error follows the slope of the fit, or that of theory if there
-    are too few points for a fit. It is extrapolated to at most `MAX_EXTRAPOLATION`
-    times the samples, and not at all if the error has leveled off. An upper limit
-    counts as an error of that size. The time is interpolated as well; beyond the last
-    point it is proportional to the samples.
+    A line is fitted to the logarithms of error and samples. If it has more than
+    `MIN_FIT_POINTS` points and passes through the intervals of all of them, the count
+    is computed from the line. Otherwise the error is interpolated between the points on
+    logarithmic axes. Beyond the last point the error follows the slope of the line, or
+    the slope that theory predicts if there are too few points for a line. It is
+    extrapolated to at most `MAX_EXTRAPOLATION` times the samples, and not at all if the
+    error has leveled off. An upper limit counts as an error of that size. The time is
+    interpolated as well; beyond the last point it is proportional to the samples.
 
     Args:
         points: points of one estimator.
         goal: relative error that has to be reached.
-        round_up: returns a sample count that the estimator accepts.
+        round_up: rounds up to a sample count that the estimator accepts.
         or_steeper: whether the error may fall faster than that of independent samples;
-            None if theory does not say.
+            None if theory predicts no slope. Only this matters here: whether there is a
+            slope to extrapolate with if there is no line.
 
     Returns:
         The recommendation; None if no count is known to reach the goal.
@@ -435,7 +462,7 @@ def recommend_count(
         goal=goal,
         estimator=ordered[0].estimator,
         spp=spp,
-        # beyond the last point, time is proportional to samples: slope 1
+        # slope 1: beyond the last point, time is proportional to samples
         seconds=_interpolate_value(ordered, spp, seconds, slope=1.0),
         error=error,
         basis=basis,
@@ -450,9 +477,8 @@ def _error_on_line(line: PrecisionSlope, spp: float) -> float:
 def _explains_points(line: PrecisionSlope, ordered: Sequence[PrecisionPoint]) -> bool:
     """Return whether a falling line passes through the interval of every known point.
 
-    A line through only `MIN_FIT_POINTS` points nearly always does, so this is no
-    evidence, and the result is False. It is False, too, if a known point has no
-    interval.
+    With only `MIN_FIT_POINTS` points a line nearly always does, which is no evidence:
+    then the result is False. It is False, too, if a known point has no interval.
     """
     has_spare_points = line.points > MIN_FIT_POINTS
     is_falling = line.slope <= MAX_FALLING_SLOPE
@@ -472,16 +498,20 @@ def _explains_points(line: PrecisionSlope, ordered: Sequence[PrecisionPoint]) ->
 def _solve_line(
     line: PrecisionSlope, ordered: Sequence[PrecisionPoint], goal: float
 ) -> tuple[float | None, str]:
-    """Return the samples at which a fitted line reaches a goal, and their basis.
+    """Return the number of samples at which a fitted line reaches a goal.
 
     The line is log(error) = offset + slope * log(samples), which is solved for the
-    samples. They are at least the smallest number that was measured, and None if they
-    exceed `MAX_EXTRAPOLATION` times the largest.
+    samples.
 
     Args:
         line: the fitted line.
         ordered: its points, by ascending samples.
         goal: relative error that has to be reached.
+
+    Returns:
+        The samples, at least the smallest number that was measured; None if they exceed
+        `MAX_EXTRAPOLATION` times the largest. And whether this is "measured", "fitted"
+        (between measured numbers) or "extrapolated".
     """
     samples = math.exp((math.log(goal) - line.offset) / line.slope)
     smallest = float(ordered[0].spp)
@@ -503,8 +533,8 @@ def _interpolate_error(
     Args:
         ordered: points by ascending samples.
         spp: the sample count.
-        line: fitted line, whose slope the error follows beyond the last point; None
-            follows theory.
+        line: fitted line, whose slope the error follows beyond the last point. If it is
+            None, the error follows the slope of theory.
     """
     slope = MONTE_CARLO_SLOPE
     if line:
@@ -518,24 +548,24 @@ def confirm_recommendation(
     point: PrecisionPoint,
     round_up: RoundUp = round_up_exactly,
 ) -> Recommended:
-    """Return a recommendation that rests on a point measured after it was selected.
+    """Return a recommendation that is corrected by new measurements of its setting.
 
-    The setting that looks cheapest among noisy ones is often a lucky one, whose error
-    was measured too small. New measurements with other seeds do not have that bias. If
-    their error is above the goal, the sample count grows by (error / goal)^2, as the
-    error of independent samples falls with the root of their number, but by at most
-    `MAX_EXTRAPOLATION`.
+    A setting that was selected as the fastest of many is often one whose error was
+    measured too small by chance. New measurements with other seeds do not have that
+    bias. If their error is above the goal, the sample count is multiplied by (error /
+    goal)^2, since the error of independent samples falls with the root of their number.
+    The factor is at most `MAX_EXTRAPOLATION`.
 
     Args:
         recommendation: recommendation with a goal and a sample count.
-        point: the new measurement of it.
-        round_up: returns a sample count that the estimator accepts.
+        point: the new measurements of its setting.
+        round_up: rounds up to a sample count that the estimator accepts.
     """
     assert recommendation.goal is not None and recommendation.spp is not None
     needed_growth = max(1.0, (point.rms / recommendation.goal) ** 2)
     needed_spp = recommendation.spp * min(MAX_EXTRAPOLATION, needed_growth)
     spp = round_up(point, needed_spp)
-    # The count is rounded up: it may have grown by a little more than is needed.
+    # Since the count is rounded up, it may grow by a little more than is needed.
     growth = spp / recommendation.spp
     update = {
         "spp": spp,
@@ -561,13 +591,14 @@ def _interpolate_count(
     Args:
         ordered: points by ascending samples.
         goal: the relative error.
-        line: fitted line, for sample counts beyond the last point; None if there is
-            none.
-        or_steeper: None if theory predicts no slope, which is used without a line.
+        line: fitted line, whose slope is used beyond the last point; None if there is
+            none, and the slope of theory is used.
+        or_steeper: None if theory predicts no slope: then there is no extrapolation
+            without a line. Whether it is True or False does not matter here.
 
     Returns:
-        The number of samples, or None if it is too far beyond the last point; and
-        whether it is "measured", "interpolated" or "extrapolated".
+        The number of samples, or None if it cannot be extrapolated; and whether it is
+        "measured", "interpolated" or "extrapolated".
     """
     indices_above = [index for index, point in enumerate(ordered) if point.rms > goal]
     if not indices_above:
@@ -577,7 +608,7 @@ def _interpolate_count(
         return _extrapolate_count(ordered, goal, line, or_steeper), "extrapolated"
     above = ordered[last_above]
     below = ordered[last_above + 1]
-    # part of the way from `above` to `below`, in logarithms
+    # position of the goal between `above` (0) and `below` (1), on a logarithmic scale
     fraction = math.log(above.rms / goal) / math.log(above.rms / below.rms)
     return above.spp * (below.spp / above.spp) ** fraction, "interpolated"
 
@@ -599,7 +630,8 @@ def _extrapolate_count(
         ordered: points by ascending samples.
         goal: the relative error.
         line: fitted line; None if there is none.
-        or_steeper: None if theory predicts no slope.
+        or_steeper: None if theory predicts no slope. Whether it is True or False does
+            not matter here.
     """
     last = ordered[-1]
     slope = None
@@ -611,8 +643,8 @@ def _extrapolate_count(
         return None
     if not last.is_known or has_leveled_off(ordered):
         return None
-    # error ~ samples^slope, so samples ~ error^(1 / slope). A slope that is steeper
-    # than the limit would promise too much.
+    # error ~ samples^slope, so samples ~ error^(1 / slope). With a slope that is
+    # steeper than the limit, the count would often be too small.
     factor = (goal / last.rms) ** (1.0 / max(slope, MIN_EXTRAPOLATED_SLOPE))
     return last.spp * factor if factor <= MAX_EXTRAPOLATION else None
 

@@ -25,7 +25,7 @@ from advsearch.questions.replay.result import (
 def replay(context: RunContext[ReplayConfig], parts: Any = None) -> ReplayResult:
     """Render the adversarial scene of a run under other conditions.
 
-    The clean scene is rendered under each of them too.
+    The clean scene is rendered under each condition, too.
     """
     from advsearch.questions.replay.conditions import run_replay  # imports torch
 

@@ -1,9 +1,8 @@
-"""Render the adversarial scene of a run under conditions that it was not verified
-under.
+"""Render the adversarial scene of a run under other conditions.
 
 A condition changes the samples, the renderer, the tone curve, the file format, the
-camera or the model. The clean scene is rendered under each condition too, so that a
-prediction which is wrong in both is not counted as a success.
+camera or the model. The clean scene is rendered under each condition, too: if the model
+is wrong there, a wrong prediction for the adversarial scene is no success.
 """
 
 from __future__ import annotations
@@ -45,11 +44,11 @@ ProgressOption = workbench.ProgressOption
 
 AS_VERIFIED = "as verified"
 """Name of the condition that changes nothing."""
-RUN_LIGHT = "own"
-"""Conditions with this `light` start from the radiance that the run itself renders."""
+RUN_RENDERS = "own"
+"""Key of the radiance and of the images that the renderer of the run renders."""
 RUN_MODEL = "the run's own"
-"""Stands for the run's model in the check that no model is named twice."""
-DEFAULT_SPP = 64
+"""Name of the run's model in the check that no model is named twice."""
+DEFAULT_SPP = 64  # samples per pixel for an attack that was not verified
 JPEG_QUALITIES = (90, 75, 50)
 MIN_SIZE = 8
 MAX_SIZE = 4096
@@ -70,7 +69,7 @@ SENSORS: dict[str, dict[str, float]] = {
         "compression": 25.0,
     },
 }
-"""Values of the control `sensor` by the camera that they imitate; all others are 0."""
+"""Values of the control `sensor` that imitate a camera; all other values are 0."""
 CURVES = {
     "gamma": "a power of 1/2.2 in place of sRGB",
     "reinhard": "highlights rolled off, x / (1 + x)",
@@ -86,38 +85,43 @@ class ReplayCondition:
     """One condition of a replay.
 
     Attributes:
-        name: what is changed, as the setting `ways` names it.
-        description: what it is changed to.
-        make_problem: creates the problem under this condition, which may hold a scene
-            of its own.
+        name: what is changed, as in the setting `ways`: "jpeg".
+        description: what it is changed to: "quality 75".
+        make_problem: creates the problem under this condition, which may load another
+            scene.
         spp: samples per pixel.
-        light: conditions of equal light share one radiance; None renders its own.
-        source: conditions of equal source share one image; None has its own.
-        change: is applied to the image before the model sees it.
-        unavailable_reason: why it cannot be rendered here; empty if it can.
+        radiance_key: key of the linear radiance. Conditions with the same key and the
+            same samples share renders; None for a condition that shares none.
+        image_key: key of the image that is made of the radiance (by tone curve and
+            rounding). Conditions with the same key share it; None for a condition that
+            shares none.
+        change: function that is applied to the image before the model gets it; None if
+            there is none.
+        unavailable_reason: why the condition cannot be rendered here; empty if it can.
     """
 
     name: str
     description: str
     make_problem: Callable[[], Problem]
     spp: int
-    light: Hashable = None
-    source: Hashable = None
+    radiance_key: Hashable = None
+    image_key: Hashable = None
     change: ImageChange | None = None
     unavailable_reason: str = ""
 
     def to_retrial(self) -> workbench.RetrialCondition:
-        """Create the condition that the verifier renders, and its problem."""
+        """Create the problem, and the condition for the code that makes the trials."""
         title = self.description
         if self.name != AS_VERIFIED:
             title = f"{self.name}: {self.description}"
         return workbench.RetrialCondition(
-            title,
-            self.make_problem(),
-            self.spp,
-            self.source or title,
-            self.change,
-            self.light,
+            name=title,
+            problem=self.make_problem(),
+            spp=self.spp,
+            # The title is unique, so that no other condition shares the image.
+            image_key=self.image_key or title,
+            change_image=self.change,
+            radiance_key=self.radiance_key,
         )
 
 
@@ -160,16 +164,23 @@ def same_render(
 ) -> ReplayCondition:
     """Return a condition that uses the run's images as they are, or changes them.
 
-    All such conditions have the same `light` and `source`, so they share their renders.
-    With the samples per pixel of the verification nothing is rendered again for them.
+    All such conditions share the radiance and the images of the run:
+    with the same samples per pixel, each image is rendered only once for all of them.
+
+    Args:
+        problem: problem of the run.
+        name: name of the condition, as in the setting `ways`.
+        description: what is changed to what.
+        spp: samples per pixel.
+        change: function that is applied to the image; None for no change.
     """
     return ReplayCondition(
         name,
         description,
         make_problem=lambda: problem,
         spp=spp,
-        light=RUN_LIGHT,
-        source=RUN_LIGHT,
+        radiance_key=RUN_RENDERS,
+        image_key=RUN_RENDERS,
         change=change,
     )
 
@@ -221,7 +232,7 @@ def with_scene(problem: Problem, **changes: Any) -> Problem:
     """Return the problem with a new scene in which some of its options are changed."""
     scene = problem.renderer.scene.copy_with(**changes)
     renderer_changes = {}
-    # The renderer has a sampler of its own.
+    # The renderer states the sampler, too.
     if "sampler" in changes:
         renderer_changes["sampler"] = changes["sampler"]
     return replace(
@@ -232,7 +243,7 @@ def with_scene(problem: Problem, **changes: Any) -> Problem:
 def image_formation_conditions(problem: Problem, spp: int) -> Iterator[ReplayCondition]:
     """Yield conditions with another denoiser or tone curve.
 
-    A tone curve needs no renders of its own: it is applied to the run's radiance.
+    A tone curve needs no other renders: it is applied to the run's radiance.
     """
     denoiser = "none"
     if problem.renderer.formation.denoiser == "none":
@@ -242,7 +253,10 @@ def image_formation_conditions(problem: Problem, spp: int) -> Iterator[ReplayCon
     for curve, text in CURVES.items():
         make_problem = partial(with_renderer, problem, transfer=curve)
         description = f"{curve}, {text}"
-        yield ReplayCondition("curve", description, make_problem, spp, RUN_LIGHT)
+        # It shares the radiance of the run, but not the image.
+        yield ReplayCondition(
+            "curve", description, make_problem, spp, radiance_key=RUN_RENDERS
+        )
 
 
 def with_renderer(problem: Problem, **changes: Any) -> Problem:
@@ -279,7 +293,7 @@ def apply_sensor(
 def blender_condition(problem: Problem, spp: int) -> ReplayCondition:
     """Return the condition that renders with Cycles.
 
-    If Blender is not installed, or the scene cannot be exported, the condition holds
+    If Blender is not installed, or the scene cannot be exported, the condition states
     the reason, which the result reports.
     """
     renderer = problem.renderer
@@ -305,9 +319,9 @@ def model_condition(
 ) -> ReplayCondition:
     """Return the condition under which another model predicts the scene.
 
-    If the other model takes images of the same size and formation as the run's own
-    model, it predicts the same renders, which saves time. Otherwise the scene is
-    rendered for it.
+    If the other model takes images of the same size, tone curve and denoiser as the
+    run's own model, it predicts the run's images, which saves time. Otherwise the scene
+    is rendered for it.
 
     Args:
         problem: problem of the run.
@@ -315,19 +329,25 @@ def model_condition(
         name: name of the other model.
         spp: samples per pixel.
     """
-    # Conditions with equal `light` share their renders.
-    light: Hashable = name
+    # Conditions with the same key share radiance and image. With the name of the model
+    # as the key, no other condition shares them.
+    shared_key: Hashable = name
     takes_same_images = other_problem.renderer.formation == problem.renderer.formation
     if takes_same_images:
-        light = RUN_LIGHT
+        shared_key = RUN_RENDERS
         other_problem = replace(other_problem, renderer=problem.renderer)
 
     def make_problem() -> Problem:
-        """Return a copy of the problem, as each condition has its own."""
+        """Return a copy of the problem, since each condition needs its own one."""
         return replace(other_problem)
 
     return ReplayCondition(
-        "model", name, make_problem=make_problem, spp=spp, light=light, source=light
+        "model",
+        name,
+        make_problem=make_problem,
+        spp=spp,
+        radiance_key=shared_key,
+        image_key=shared_key,
     )
 
 
@@ -336,15 +356,15 @@ def photograph_conditions(
 ) -> Iterator[ReplayCondition]:
     """Yield a condition for each photograph of a folder.
 
-    If the attack used a single photograph, that one is left out: the unchanged
-    condition tries it already.
+    If the attack used a single photograph, it is left out: the unchanged condition
+    renders it already.
 
     Args:
         parts: parts of the attack.
         folder: directory of photographs, or a name as for the setting `backdrop`.
         spp: samples per pixel.
-        threads: {"threads": number of threads} for the problems; empty for the run's
-            own.
+        threads: {"threads": number of threads} for the problems; empty for the number
+            of the run.
     """
     other_photographs, used_photographs = workbench.move_to_photographs(parts, folder)
     if len(used_photographs) == 1:
@@ -365,7 +385,12 @@ def photograph_conditions(
 def _make_photograph_problem(
     parts: workbench.AttackParts, threads: Mapping[str, int]
 ) -> Problem:
-    """Make the problem of an attack in a photograph, of which no derivative is needed."""
+    """Make the problem of an attack in a photograph, without derivatives.
+
+    Args:
+        parts: parts of the attack.
+        threads: setting of the number of threads; empty for that of the run.
+    """
     config = parts.config.model_copy(update=dict(threads))
     return workbench.make_problem(replace(parts, config=config), differentiated=False)
 
@@ -397,12 +422,12 @@ def replay(
     if isinstance(attack, AttackResult):
         if attack.run is None:
             raise InputError(
-                "attack: expected an attack that was kept, got one that "
-                "was not; give it a `run`"
+                "attack: expected an attack whose run is stored, got one that "
+                "is not; set its `run`"
             )
         run = attack.run
-        # Parts that exist in Python only, such as a model object, cannot be loaded from
-        # the run. The result still has them.
+        # Parts that exist only in Python, such as a model object, cannot be loaded from
+        # the run. The result has a function that returns them.
         python_only = _read_python_only_parts(Path(run))
         if attack.parts is not None:
             parts = attack.parts()
@@ -416,9 +441,10 @@ def replay(
 
 
 def _read_python_only_parts(run: Path) -> list[settings.PythonOnly]:
-    """Read what an attack was called with that only Python can pass.
+    """Return the arguments of an attack that exist only in Python, such as a model.
 
-    A command cannot repeat a replay of it. What only the search used is left out.
+    With such an argument, no command of the shell can repeat the replay. Arguments that
+    only the search used, such as a policy, do not matter here and are left out.
 
     Args:
         run: directory of the attack.
@@ -433,14 +459,14 @@ def _read_python_only_parts(run: Path) -> list[settings.PythonOnly]:
 def run_replay(
     context: RunContext[ReplayConfig], parts: workbench.AttackParts | None = None
 ) -> ReplayResult:
-    """Render an adversarial scene again as the settings of a run say.
+    """Render an adversarial scene again under the conditions that settings select.
 
-    Every trial is stored at once, so that a resumed run continues with the next.
+    Every trial is stored at once, so that a resumed run continues with the next one.
 
     Args:
         context: the settings and the run.
-        parts: Python objects that the attack was called with, such as its model; None
-            loads what the run names.
+        parts: loaded parts of the attack, such as its model object; None to load what
+            the run of the attack names.
 
     Raises:
         InputError: the attack has no adversarial configuration, or its scene has
@@ -453,7 +479,7 @@ def run_replay(
     attack = _load_attack(attack_directory)
     settings.check_no_duplicates((RUN_MODEL, *config.models), "model")
     parts = parts or workbench.load_parts_of_run(attack_directory)
-    # an empty mapping, so that the run's own setting remains
+    # settings to change: none, if the number of threads of the run stays
     threads = {} if config.threads is None else {"threads": config.threads}
     load_problem = partial(workbench.make_problem_with_warnings, parts, **threads)
     problem, warnings = load_problem()
@@ -466,15 +492,15 @@ def run_replay(
     table = _Table(
         u=workbench.read_stored_configuration(attack_directory, problem),
         trials=config.trials,
-        # a stream of its own: no noise of the attack is repeated
+        # another stream of seeds, so that no noise of the attack is repeated
         seed=seeds.stream(parts.config.seed, "replay"),
         run=context.run,
         progress=context.progress,
     )
     with context.until_interrupted():
-        # Conditions with the same renders are tried together, so that each image is
+        # Conditions that share renders are in the same batch, so that each image is
         # rendered once.
-        for batch in batch_by_light(conditions, spp):
+        for batch in batch_by_renders(conditions, spp):
             table.fill(batch)
     rows = table.list_rows(conditions)
     return context.result(
@@ -546,20 +572,19 @@ def select_conditions(
         if condition.name in config.selected_names
     ]
     for model_name in config.models:
-        # A run with several models has an `ensemble`, which the single other model
-        # replaces.
+        # The other model replaces all models of a run with an `ensemble`.
         other_problem = load_problem(model=model_name, ensemble=None)[0]
         conditions.append(model_condition(problem, other_problem, model_name, spp))
     return conditions
 
 
-def batch_by_light(
+def batch_by_renders(
     conditions: Sequence[ReplayCondition], spp: int
 ) -> list[list[ReplayCondition]]:
     """Divide conditions into batches that share their renders.
 
     The first batch has all conditions that share the renders of the run; it is empty if
-    there are none. Every other condition is a batch by itself.
+    there are none. Every other condition is a separate batch.
 
     Args:
         conditions: the conditions.
@@ -568,7 +593,9 @@ def batch_by_light(
     shared = []
     single = []
     for condition in conditions:
-        uses_run_renders = condition.light == RUN_LIGHT and condition.spp == spp
+        uses_run_renders = (
+            condition.radiance_key == RUN_RENDERS and condition.spp == spp
+        )
         if uses_run_renders:
             shared.append(condition)
         else:
@@ -582,12 +609,10 @@ class _Table:
 
     Attributes:
         u: the adversarial configuration (d,).
-        trials: trials of the clean and of the adversarial scene under each condition.
-        seed: root of the seeds of the trials.
-        run: stores the trials.
-        progress: reports them.
-        rows: the results, by condition.
-        renders: number of images rendered so far.
+        trials: number of trials of each scene, clean and adversarial, under a
+            condition. seed: root of the seeds of the trials. run: the run that stores
+            the trials. progress: the progress bar. rows: the results by condition.
+            renders: number of images rendered so far.
     """
 
     u: torch.Tensor
@@ -613,7 +638,7 @@ class _Table:
             if condition.unavailable_reason
         ]
         if reasons:
-            # It is a batch by itself: conditions that share renders are available.
+            # Then it is the only condition: those that share renders are available.
             self._add_not_done(conditions, reasons[0])
             return
         try:
@@ -622,7 +647,7 @@ class _Table:
             self._add_not_done(conditions, str(error))
 
     def list_rows(self, conditions: Sequence[ReplayCondition]) -> list[ReplayRow]:
-        """Return the rows in the order of conditions; an interrupted run lacks some."""
+        """Return the rows so far in the order of conditions."""
         return [
             self.rows[condition] for condition in conditions if condition in self.rows
         ]
@@ -657,7 +682,7 @@ class _Table:
         retrial_of_condition = {
             condition: condition.to_retrial() for condition in conditions
         }
-        # conditions may share a renderer, which counts once
+        # Conditions may share a renderer, which is counted once.
         renderer_by_id = {
             id(retrial.problem.renderer): retrial.problem.renderer
             for retrial in retrial_of_condition.values()
@@ -676,7 +701,7 @@ class _Table:
         """Try the clean scene under all conditions, then the adversarial scene.
 
         Args:
-            retrial_of_condition: what renders and predicts each condition.
+            retrial_of_condition: each condition in the form that `Retrials` takes.
         """
         retrials = workbench.Retrials(
             list(retrial_of_condition.values()),
@@ -692,7 +717,7 @@ class _Table:
             for condition, retrial in retrial_of_condition.items()
         }
         for condition, retrial in retrial_of_condition.items():
-            # "answer" is the kind of the stored rows
+            # "answer" is the kind under which rows are stored.
             verification = retrials.try_adversarial("answer", self.u, retrial)
             self.rows[condition] = ReplayRow(
                 change=condition.name,
@@ -709,6 +734,6 @@ def describe_changed_file(path: Path, parts: workbench.AttackParts) -> list[str]
     if not name:
         return []
     return [
-        f"{name} is not what it was when the run was made: what does not hold may "
-        "come from that."
+        f"{name} is not what it was when the run was made, which may be the reason "
+        "if the adversarial scene does not hold."
     ]

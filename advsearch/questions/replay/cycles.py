@@ -1,7 +1,7 @@
-"""Render a scene with Cycles, Blender's path tracer, in a process of its own.
+"""Render a scene with Cycles, Blender's path tracer, in a separate process.
 
-Blender reads the scene as glTF, so that the images differ in more than noise: textures
-have 8 bits, surfaces are Blender's, and round lamps are faceted.
+Blender reads the scene as glTF, so that images differ in more than noise: textures have
+8 bits, materials are those of Blender, and spherical lamps have facets.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from advsearch.extend import (
 )
 
 MAX_RENDER_SECONDS = 300
-"""Time limit of one image, Blender's start included; `stored_files.scaled` adapts
-it.
+"""Time limit of one image, including the start of Blender; `stored_files.scale_limit`
+adapts it.
 """
 POLL_INTERVAL = 0.02
-"""Seconds between two checks whether an image is finished."""
+"""Seconds between two checks of whether an image is finished."""
 MATT = assets.Material(roughness=1.0, metallic=0.0, specular=0.0)
 """Material of the ground."""
 
@@ -142,25 +142,15 @@ scene.world = world
 world.use_nodes = True
 add_environment(world)
 
-render = scene.render
-render.engine = "CYCLES"
-render.resolution_x = settings["width"]
-render.resolution_y = settings["height"]
-render.resolution_percentage = 100
-render.use_file_extension = False
-render.use_compositing = False
-render.image_settings.file_format = "OPEN_EXR"
-render.image_settings.color_depth = "32"
-cycles = scene.cycles
-cycles.device = "CPU"
-cycles.pixel_filter_type = "BOX"
-cycles.filter_width = 1.0
-cycles.use_adaptive_sampling = False
-cycles.use_denoising = settings["denoise"]
-cycles.sample_clamp_direct = 0.0
-cycles.sample_clamp_indirect = 0.0
-cycles.blur_glossy = 0.0
-for kind in ("max_bounces", "diffuse_bounces", "glossy_bounces", "transmission_bounces"):
+render = scene.render render.engine = "CYCLES" render.resolution_x = settings["width"]
+render.resolution_y = settings["height"] render.resolution_percentage = 100
+render.use_file_extension = False render.use_compositing = False
+render.image_settings.file_format = "OPEN_EXR" render.image_settings.color_depth = "32"
+cycles = scene.cycles cycles.device = "CPU" cycles.pixel_filter_type = "BOX"
+cycles.filter_width = 1.0 cycles.use_adaptive_sampling = False cycles.use_denoising =
+settings["denoise"] cycles.sample_clamp_direct = 0.0 cycles.sample_clamp_indirect = 0.0
+cycles.blur_glossy = 0.0 for kind in ("max_bounces", "diffuse_bounces",
+"glossy_bounces", "transmission_bounces"):
     setattr(cycles, kind, settings["bounces"])
 
 for line in sys.stdin:
@@ -172,13 +162,14 @@ for line in sys.stdin:
     bpy.ops.render.render(write_still=True)
     os.replace(path + ".part", path + ".exr")
 """
-"""What Blender runs: load the scene, then render an image for each line of its input.
+"""Script that Blender runs. It loads the scene, then renders an image for each line of
+its standard input.
 
 A line has the seed, the samples per pixel and the number of the image.
 """
 
 
-# Blender's cameras look along their own -z, and not along +z.
+# Cameras of Blender look along their -z axis, and ours along +z.
 TO_BLENDER_CAMERA = np.diag([-1.0, 1.0, -1.0, 1.0])
 
 
@@ -237,7 +228,7 @@ class Cycles:
         self._resolution = size
         self._depth = max_depth
         self._denoise = denoise
-        # the scene's inputs that the process has loaded
+        # inputs of the scene that the process has loaded
         self._inputs: dict[str, Tensor] = {}
         self._process: _Process | None = None
 
@@ -254,7 +245,7 @@ class Cycles:
             torch.equal(self._inputs[name], inputs[name]) for name in inputs
         )
         if self._process is None or not is_same_scene:
-            self._process = None  # which ends Blender before it starts again
+            self._process = None  # ends the earlier process of Blender, if there is one
             self._process = _Process(self._command, *self._export(inputs))
             self._inputs = {
                 name: value.detach().clone() for name, value in inputs.items()
@@ -271,7 +262,7 @@ class Cycles:
 
         Args:
             inputs: values of the scene's inputs by name, such as
-                "mug.bsdf.reflectance"; they override the description.
+                "mug.bsdf.reflectance"; they take precedence over the description.
         """
         scene = self._description
         height, width = self._resolution
@@ -282,14 +273,13 @@ class Cycles:
         if scene.environment is not None:
             radiance = np.asarray(scene.environment.radiance, np.float32)
         if "environment.padded" in values:
-            # A searched environment repeats one column at each side, so that
-            # interpolation wraps around. These two columns are removed.
+            # An environment map that is searched has an additional column at each side,
+            # so that interpolation wraps around. These two columns are removed.
             radiance = values["environment.padded"][:, 1:-1].numpy()
 
         blender_settings = self._make_settings(
             values, width, height, has_environment=radiance is not None
         )
-        # z is up in our scenes, and y in glTF.
         shapes = [_turn_for_blender(mesh) for mesh in meshes]
         return blender_settings, workbench.encode_glb(shapes), radiance
 
@@ -310,7 +300,7 @@ class Cycles:
             has_environment: whether an environment map lights the scene.
         """
         scene = self._description
-        # Blender's environment maps begin a quarter of a turn from ours.
+        # Blender's environment maps are rotated by a quarter turn compared to ours.
         turn = math.pi / 2.0 - math.radians(scene.get_number("environment.rotation"))
         return {
             "width": width,
@@ -320,7 +310,8 @@ class Cycles:
             "environment": has_environment,
             "turn": turn,
             "strength": 2.0 ** scene.get_number("environment.exposure"),
-            # A path of two segments has none: light, surface, camera.
+            # A path of two segments, from the light to a surface to the camera, has no
+            # bounce.
             "bounces": max(0, self._depth - 2),
             "denoise": self._denoise,
         }
@@ -330,13 +321,9 @@ class Cycles:
     ) -> dict[str, object]:
         """Return the camera for `RENDER_SCRIPT`.
 
-        Blender's angle of view is in radians. Its shift is a fraction of the longer
-        side of the image and points upwards, while ours is a fraction of the width or
-        height and points downwards.
-
         Args:
-            values: the scene's inputs by name, such as "camera.fov" in degrees; the
-                description has those that are missing.
+            values: the scene's inputs by name, such as "camera.fov" in degrees. Missing
+                ones have the values of the scene's description; a missing shift is 0.
             width, height: width and height of the image in pixels.
         """
         scene = self._description
@@ -344,11 +331,11 @@ class Cycles:
             "camera.to_world",
             torch.from_numpy(geometry.camera_to_world(scene, width / height)),
         )
-        fov = float(
-            values.get("camera.fov", torch.tensor([scene.get_number("camera.fov")]))[0]
-        )
-        shift_x = float(values.get("camera.shift_x", torch.zeros(1))[0])
-        shift_y = float(values.get("camera.shift_y", torch.zeros(1))[0])
+        fov = _get_number(values, "camera.fov", scene.get_number("camera.fov"))
+        shift_x = _get_number(values, "camera.shift_x", 0.0)
+        shift_y = _get_number(values, "camera.shift_y", 0.0)
+        # Our shift is a fraction of the width or the height, and its y axis points
+        # down. Blender's is a fraction of the longer side, and its y axis points up.
         longer_side = max(width, height)
         return {
             "camera": (to_world.double().numpy() @ TO_BLENDER_CAMERA).tolist(),
@@ -357,8 +344,19 @@ class Cycles:
         }
 
 
+def _get_number(values: Mapping[str, Tensor], name: str, default: float) -> float:
+    """Return the number in an input of a scene (1,), in float32.
+
+    Args:
+        values: the scene's inputs by name.
+        name: name of the input.
+        default: the number if there is no such input.
+    """
+    return float(values.get(name, torch.tensor([default]))[0])
+
+
 def _find_unsupported(description: SceneDescription) -> list[str]:
-    """Return what a scene has that cannot be transferred to Blender."""
+    """Return the parts of a scene that cannot be transferred to Blender."""
     supported_types = (parts.MeshPart, parts.PointLamp, parts.BallLamp)
     unsupported = [
         part.name for part in description.parts if not isinstance(part, supported_types)
@@ -386,7 +384,7 @@ def _describe_lamps(
 
     Args:
         scene: the scene.
-        values: the scene's inputs by name; the scene has those that are missing.
+        values: the scene's inputs by name; missing ones have the values of the scene.
     """
     lamps: list[dict[str, object]] = []
     for lamp in scene.lamps.values():
@@ -412,9 +410,11 @@ def _describe_lamps(
 
 
 def _turn_for_blender(shape: assets.Shape) -> assets.Shape:
-    """Rotate a mesh so that it has our axes in Blender.
+    """Rotate a mesh by 90 degrees around the vertical axis (z), before it is exported.
 
-    Blender imports glTF with -y in front.
+    The export as glTF and the import by Blender rotate it back by the same angle: what
+    is in front in glTF is at -y in Blender. So the mesh has the same coordinates in
+    Blender as in our scene.
     """
     rotation = np.array(
         [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], np.float32
@@ -441,13 +441,15 @@ def _make_ground(
     """
     photograph = scene.photograph
     if photograph is not None:
+        # The ground is a mesh onto which the photograph is projected.
         base_color = photograph.base_color if reflectance is None else reflectance
         texture = color.linear_to_srgb(base_color.clamp(0.0, 1.0)).numpy()
         return [assets.Shape("ground", photograph.mesh, texture, MATT)]
 
     half_size = np.float32(scene.get_number("ground.size") / 2.0)
-    has_ground = half_size > 0.0 and not workbench.is_paved(scene)
-    if not has_ground:
+    # A scene is paved if one of its meshes is the ground.
+    has_plain_ground = half_size > 0.0 and not workbench.is_paved(scene)
+    if not has_plain_ground:
         return []
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
     faces = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
@@ -466,7 +468,7 @@ class _Process:
         program: the command that starts Blender with a script.
         blender_settings: what `RENDER_SCRIPT` reads as JSON.
         meshes: the scene as glTF.
-        radiance: radiance of the environment, linear (H, W, 3); None without.
+        radiance: radiance of the environment, linear (H, W, 3); None if there is none.
 
     Raises:
         BlenderError: Blender can't be started.
@@ -527,8 +529,8 @@ class _Process:
             BlenderError: Blender can't be started.
         """
         script = self._directory / "render.py"
-        # Blender takes the arguments after "--" as the script's; Python needs none.
-        # "-I" marks a Python with the module bpy in place of the program Blender.
+        # Blender passes arguments after "--" to the script. The program may also be a
+        # Python with the module bpy, which is started with "-I" and needs no "--".
         separator = [] if "-I" in program else ["--"]
         with self._log.open("wb") as log:
             try:
@@ -536,8 +538,7 @@ class _Process:
                     [*program, str(script), *separator, str(self._directory)],
                     cwd=self._directory,
                     env=workbench.make_environment(str(self._directory)),
-                    # The log is a file, as a full pipe that nobody reads would block
-                    # Blender.
+                    # The log is a file: a pipe would block Blender when it is full.
                     stdin=subprocess.PIPE,
                     stdout=log,
                     stderr=log,
@@ -573,7 +574,7 @@ class _Process:
         # Blender writes the file under its final name when it is complete.
         while not path.is_file():
             has_stopped = self._process.poll() is not None
-            # It may have written the file just before it stopped.
+            # Blender may have written the file just before it stopped.
             if has_stopped and not path.is_file():
                 log = self._log.read_text("utf-8", "replace")
                 raise BlenderError(f"Blender stopped{workbench.get_last_line(log)}")
@@ -584,8 +585,9 @@ class _Process:
             time.sleep(POLL_INTERVAL)
         with OpenEXR.File(str(path)) as image:
             channels = image.channels().values()
-            # There is one layer, named by Blender.
-            pixels = next(iter(channels)).pixels  # RGB, perhaps with alpha
+            # There is one layer, whose name Blender chooses. It has RGB, perhaps with
+            # alpha.
+            pixels = next(iter(channels)).pixels
             radiance = torch.from_numpy(np.array(pixels[..., :3], dtype=np.float32))
         path.unlink()
         return radiance

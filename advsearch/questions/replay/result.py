@@ -35,15 +35,15 @@ RENDER_METHODS = (
     "sensor",
     "blender",
 )
-"""What a replay may change beside the model."""
+"""Names of the changes of a replay, apart from another model."""
 REPLAY_TRIALS = 10
-"""Half of an attack's: there are many rows, to be compared. The 95 % interval of 10 of
-10 begins at 69 %.
+"""Default number of trials, half of that of an attack, because there are many
+conditions. The 95 % interval for 10 successes in 10 trials begins at 69 %.
 """
 
 
 class ReplayConfig(Config):
-    """Settings of `replay`: which adversarial scene is rendered, and under what."""
+    """Settings of `replay`: the adversarial scene, and the conditions."""
 
     command: ClassVar[str] = "replay"
     clashes: ClassVar[tuple[settings.Clash, ...]] = tuple(
@@ -53,13 +53,13 @@ class ReplayConfig(Config):
     attack: str = setting(
         ...,
         "replay",
-        "the run whose adversarial scene is rendered again",
+        "run whose adversarial scene is rendered again",
         "the name or the folder of a run of attack",
     )
     ways: str | None = setting(
         None,
         "replay",
-        "what is changed, separated by commas",
+        "conditions that are changed one at a time, separated by commas",
         f"some of {', '.join(RENDER_METHODS)}",
         otherwise="all, or with `backdrop` none",
     )
@@ -67,14 +67,14 @@ class ReplayConfig(Config):
         SceneConfig,
         "backdrop",
         group="replay",
-        description="other photographs that the scene is tried in",
+        description="other photographs in which the scene is rendered",
         expects="a folder of photographs with their camera files",
         otherwise="none",
     )
     model: str | None = setting(
         None,
         "replay",
-        "other models that the scene is tried on, separated by commas",
+        "other models that predict the scene, separated by commas",
         "models as `attack` takes them",
         otherwise="none",
     )
@@ -99,6 +99,7 @@ class ReplayConfig(Config):
     @field_validator("ways")
     @classmethod
     def _check_names(cls, value: str | None) -> str | None:
+        """Reject a name that is not in `RENDER_METHODS`."""
         if value is not None and set(settings.split_names(value)) - set(RENDER_METHODS):
             raise ValueError("an unknown way")
         return value
@@ -131,64 +132,78 @@ CLEAN_IS_WRONG = "already wrong"
 class ReplayRow(results.Fields):
     """Trials of the clean and of the adversarial scene under one condition."""
 
-    change: str = Field(description="what is changed; `as verified` where nothing is")
-    condition: str = Field(description="to what")
+    change: str = Field(
+        description="what is changed; `as verified` if nothing is changed"
+    )
+    condition: str = Field(description="what it is changed to")
     ending: str = Field(
-        description="`found` where the adversarial scene holds under it, as for an "
-        "attack; or `not done`"
+        description="`found` if the adversarial scene holds under the condition; else "
+        "another status as for an attack, or `not done`"
     )
     clean: results.ControlGroup | None = Field(
         None,
-        description="trials of the clean scene under it, and in how many it is "
-        "right; absent if not done",
+        description="trials of the clean scene under the condition, and in how many "
+        "the model is right; absent if not done",
     )
     verified: results.VerifiedRate | None = Field(
         None,
-        description="trials of the adversarial scene, beside these; absent if not done",
+        description="trials of the adversarial scene with the same seeds; absent if "
+        "not done",
     )
     reason: str = Field(
-        "", description="why it was not done, and what to do; absent if it was"
+        "", description="why it was not done, and what to do; absent if it was done"
     )
 
 
 PHOTOGRAPH = "photograph"
 """Name of the conditions under which the scene is rendered into another photograph."""
 SEARCHED_PHOTOGRAPH = "searched photograph"
-"""The same for the photographs that the run itself was searched over."""
+"""Likewise, for the photographs that the search of the run itself used."""
 
 
 class PhotographTransfer(results.Fields):
-    """In how many photographs an adversarial scene holds."""
+    """Counts of photographs in which an adversarial scene holds.
 
-    photographs: int = Field(description="that it was tried in")
-    clean_right: int = Field(description="in which the model is right without it")
-    holding: int = Field(description="of these, in which it holds")
+    It holds in a photograph if the model is wrong there, but right for the clean scene.
+    """
+
+    photographs: int = Field(
+        description="number of photographs in which it was rendered"
+    )
+    clean_right: int = Field(
+        description="number of these in which the model is right for the clean scene"
+    )
+    holding: int = Field(
+        description="number of the latter in which the adversarial scene holds"
+    )
     rate: results.Estimate | None = Field(
-        description="holding of clean_right; null where that is 0"
+        description="`holding` / `clean_right`; null if `clean_right` is 0"
     )
 
 
 class ReplayResult(views.InNotebook, results.SceneResult):
-    """How an adversarial scene fares under other conditions than it was verified
-    under.
-    """
+    """Whether an adversarial scene holds under other conditions."""
 
     command: ClassVar[str] = "replay"
 
-    adversarial_run: str = Field(description="the run whose adversarial scene it is")
-    run_ending: str = Field(description="how that run ended")
+    adversarial_run: str = Field(
+        description="directory of the run with the adversarial scene"
+    )
+    run_ending: str = Field(description="status of that run")
     table: list[ReplayRow]
     transfer: PhotographTransfer | None = Field(
         None,
-        description="over the photographs of `backdrop` that the run did not use; "
-        "absent without",
+        description="counts of the photographs of `backdrop` that the search did not "
+        "use; absent if there are none",
     )
     searched: PhotographTransfer | None = Field(
         None,
-        description="over those that it was searched over, as `transfer`; absent "
-        "without",
+        description="likewise, counts of the photographs that the search used; absent "
+        "if there are none",
     )
-    renders: int = Field(description="pictures that were rendered in this sitting")
+    renders: int = Field(
+        description="number of images that were rendered since the run was last started"
+    )
     warnings: list[str] = Field(description="sentences that a reader has to know")
 
     @property
@@ -218,12 +233,13 @@ HEADS = (
 
 
 TRIALS_NOTE = (
-    "Trials with fresh seeds, the same under every condition, rounded to 8 bits, "
-    "with 95 % Clopper-Pearson intervals. A success is what the search sought, where "
-    "the clean scene is right with the same seed under the same condition."
+    "Trials have fresh seeds, the same under every condition, and images are rounded "
+    "to 8 bits. Intervals are 95 % Clopper-Pearson intervals. A trial is a success if "
+    "the adversarial scene has the prediction that the search was for, and the model is "
+    "right for the clean scene with the same seed under the same condition."
 )
 VERDICTS = {HOLDS: "holds", CLEAN_IS_WRONG: "clean is wrong too"}
-"""By status; all others do not hold."""
+"""Verdicts by status; with any other status the scene does not hold."""
 
 
 def count_transfer(
@@ -232,9 +248,8 @@ def count_transfer(
     """Count in how many photographs an adversarial scene holds.
 
     A scene holds if the model is still wrong. The rate is among photographs in which
-    the model is right about the clean scene. The result is None without photographs.
-
-    Each photograph counts once, however many renders it was tried with.
+    the model is right for the clean scene. Each photograph counts once, whatever the
+    number of trials. The result is None without photographs.
 
     Args:
         table: all rows.
@@ -263,12 +278,15 @@ def count_transfer(
 def describe_transfer(transfer: PhotographTransfer, kind: str = "other") -> str:
     """Return a sentence on the photographs in which an adversarial scene holds.
 
+    It holds in a photograph if the model is wrong there, but right for the clean scene.
+
     Args:
         transfer: the counts.
         kind: kind of the photographs, an adjective.
     """
     clean = f"the clean scene is right in {transfer.clean_right} of them"
     photographs = wording.format_count(transfer.photographs, f"{kind} photograph")
+    # Without a rate, the clean scene is right in no photograph.
     if transfer.rate is None or transfer.rate.interval is None:
         return f"It was tried in {photographs}: {clean}, so that they say nothing."
     interval = wording.format_interval(transfer.rate.interval)
@@ -296,7 +314,11 @@ def make_replay_view(result: ReplayResult) -> ShownResult:
 
 
 def make_cells(row: ReplayRow) -> list[str]:
-    """Return the cells of a condition under `HEADS`."""
+    """Return the cells of a condition under `HEADS`.
+
+    `format_rate_cells` returns two cells: the rate and its interval.
+    """
+    # The unchanged condition has the same text in both fields.
     condition = "" if row.change == row.condition else row.condition
     if row.clean is None or row.verified is None:
         return [row.change, condition, "", "", "", "", f"{NOT_DONE}: {row.reason}"]
@@ -314,6 +336,7 @@ def make_replay_claims(result: ReplayResult) -> Iterator[views.Claim]:
     run_name = PurePath(result.adversarial_run).name
     for row in result.table:
         name = f"the adversarial scene of {run_name}, {row.change}"
+        # The unchanged condition has the same text in both fields.
         if row.change != row.condition:
             name += f": {row.condition}"
         yield views.Claim.from_case(name, row.ending, row.verified)
@@ -332,7 +355,7 @@ def make_replay_claims(result: ReplayResult) -> Iterator[views.Claim]:
 
 
 def summarize_replay(result: ReplayResult) -> str:
-    """Summarize in words under which conditions the adversarial scene holds."""
+    """Summarize under which conditions the adversarial scene holds."""
     if all(row.ending == NOT_DONE for row in result.table):
         return "Nothing was rendered again."
     # The first row is the unchanged condition.
@@ -358,12 +381,15 @@ def summarize_replay(result: ReplayResult) -> str:
     clean_wrong = [row for row in changed if row.ending == CLEAN_IS_WRONG]
     if clean_wrong:
         names = ", ".join(f"{row.change}: {row.condition}" for row in clean_wrong)
-        text += f" The clean scene itself fails under {names}, where it says nothing."
+        text += (
+            f" The model is wrong for the clean scene, too, under {names}: these "
+            "conditions show nothing about the adversarial scene."
+        )
     return text
 
 
 def _describe_unchanged(row: ReplayRow) -> str:
-    """Describe whether the scene holds under the condition that changes nothing."""
+    """Return whether the scene holds under the unchanged condition, as a predicate."""
     if row.ending == HOLDS:
         return "holds"
     return "was not rendered" if row.ending == NOT_DONE else "does not hold"

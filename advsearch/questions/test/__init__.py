@@ -1,6 +1,4 @@
-"""Test claims about a model, each found held, failed or undecided: a gate at every
-change.
-"""
+"""Test claims about a model. The verdict of each is held, failed or undecided."""
 
 from __future__ import annotations
 
@@ -56,7 +54,7 @@ def test(
     from advsearch.questions.test.carry_out import try_suite  # imports torch
 
     config = context.config
-    # checked before the test, which may take hours
+    # Files are checked before the test, which may take hours.
     files: dict[str, Path] = {}
     for name in FILE_FORMATS:
         file = getattr(config, name)
@@ -65,7 +63,7 @@ def test(
     for name, path in files.items():
         if path.is_dir() or not path.absolute().parent.is_dir():
             raise InputError(
-                f"{name}: expected a file in a folder that is there, got "
+                f"{name}: expected a file in a folder that exists, got "
                 f"{path}; make the folder first"
             )
     parsed_suite = None if suite is None else parse_suite(suite, config.suite)

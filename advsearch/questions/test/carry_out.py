@@ -1,4 +1,4 @@
-"""`test`: test the claims of a suite in order, counterexamples first."""
+"""Test the claims of a suite in order, counterexamples first."""
 
 from __future__ import annotations
 
@@ -51,10 +51,15 @@ from advsearch.questions.test.settings import (
 
 @dataclass(frozen=True)
 class PlannedClaim:
-    """A claim or a counterexample, and the settings that it is tested with.
+    """A claim or a counterexample that is to be tested.
 
-    `refusal` is why a counterexample cannot be tested on the model; `config` then has
-    the settings of its own model.
+    Attributes:
+        name: name of the claim, or of the counterexample.
+        kind: kind of the claim, or "counterexample".
+        config: settings with which it is tested.
+        example: the counterexample; None for a claim of the suite.
+        refusal: why a counterexample cannot be tested on the model; empty if it can. If
+            it cannot, `config` has the settings with which it was found.
     """
 
     name: str
@@ -67,37 +72,39 @@ class PlannedClaim:
 def try_suite(
     context: RunContext[SuiteConfig], suite: Suite | None = None
 ) -> SuiteResult:
-    """Test the claims of a suite; what a resumed run decided is not tested again.
+    """Test the claims of a suite.
 
-    With the setting `add` only the new counterexample is tested. If the model does not
-    fail on it, the counterexample is deleted again.
+    Claims that a resumed run has already decided are not tested again. With the setting
+    `add` only the new counterexample is tested. It is deleted again unless its verdict
+    is FAILED, which means that the model is wrong on it.
 
     Args:
         context: context of the experiment; its settings name the suite.
-        suite: parsed suite that replaces the file that the settings name.
+        suite: parsed suite that replaces the file in the settings.
 
     Raises:
-        InputError: if the suite names something that does not exist, contradicts
-            itself, or could not be tested; nothing is rendered then.
+        InputError: the suite names something that does not exist, contradicts itself,
+            or cannot be tested. Nothing is rendered then.
     """
     start = time.perf_counter()
     config = context.config
     context.progress.stage("reading the suite")
-    # a check before the work: raises an error if the run of twins cannot be read
+    # Raises an error before the work begins if the run of twins cannot be read.
     if config.twins is not None:
         workbench.read_twins(config.twins)
-    # A resumed run tests the suite that it has started with, even if the file has
-    # changed.
+    # A resumed run tests the suite with which it has started, even if the file has
+    # changed since.
     loaded_suite = _read_noted_suite(context.resumed) or suite or _read_suite(config)
     added = None
     if config.add is not None:
         added = counterexamples.add_counterexample(config.suite, config.add)
     try:
         planned = _plan_claims(loaded_suite, config, added)
-        is_from_file = loaded_suite is not suite
-        if is_from_file:
-            # A file may come from others: it must not load code or use powers that only
-            # the caller may grant.
+        is_from_caller = loaded_suite is suite
+        if not is_from_caller:
+            # A file, or a stored run, may come from others. Without permission of the
+            # user, its settings must not run code or have other effects outside of the
+            # run.
             for claim in planned:
                 claim.config.check_powers(f"claims.{claim.name}.settings")
         remarks = _check_claims(planned, loaded_suite)
@@ -114,16 +121,16 @@ def try_suite(
     if added is not None and suite_run.results[0].verdict != FAILED:
         counterexamples.delete_counterexample(added)
         raise InputError(
-            f"add: the adversarial scene of {config.add} is not kept: "
+            f"add: the adversarial scene of {config.add} is not stored: "
             f"{suite_run.results[0].reason}"
         )
     return suite_run.make_result(context.ending, added)
 
 
 def _read_noted_suite(resumed: Path | None) -> Suite | None:
-    """Read the suite that a resumed run began with.
+    """Read the suite with which a resumed run has started.
 
-    Return None for a new run, and for one that was stopped before it noted any.
+    None for a new run, and for a run that was stopped before it stored its suite.
     """
     if resumed is None or not Store.is_in(resumed):
         return None
@@ -135,7 +142,11 @@ def _read_noted_suite(resumed: Path | None) -> Suite | None:
 
 
 def _read_suite(config: SuiteConfig) -> Suite:
-    """Read the suite that settings name, with their seed, or a new random one."""
+    """Read the suite in the settings, and set its seed.
+
+    The seed is that of the suite, that of the settings if they have one, or a new
+    random one with the setting `fresh`.
+    """
     suite = settings.read_suite(config.suite)
     seed = suite.seed if config.seed is None else config.seed
     if config.fresh:
@@ -161,8 +172,8 @@ def _note_settings(
         if claim.example is not None
     }
     run.store.write_note(SETTINGS_NOTE, json.dumps(settings_of_examples))
-    # The digests of files that these settings name are stored: they must not change
-    # before the run is resumed.
+    # Stores the digests of the files in these settings, or compares them with stored
+    # ones: the files must not change before the run is resumed.
     used_settings = list[dict[str, Any]]()
     for planned_claim in planned:
         used_settings.append(planned_claim.config.to_json())
@@ -182,7 +193,7 @@ class _SuiteRun:
         tester: tests claims.
         planned: all claims, counterexamples first.
         expected: the expected verdict of each claim that is not expected to be held.
-        results: so far, in the order of what is planned.
+        results: the results so far, in the order of `planned`.
     """
 
     tester: ClaimTester
@@ -193,7 +204,7 @@ class _SuiteRun:
     def run_claims(self) -> str:
         """Test every claim, and return the status of the run.
 
-        After an interrupt, the claims that are left get results without a verdict.
+        After an interrupt, the remaining claims get undecided results.
         """
         tester = self.tester
         with tester.context.until_interrupted():
@@ -202,8 +213,8 @@ class _SuiteRun:
                 last = self.results[-1]
                 tester.progress.message(f"{claim.name}: {last.verdict}: {last.reason}")
                 if number < len(self.planned):
-                    # The summary of the claims so far is written after each claim, so
-                    # that it can be read even if the run is killed.
+                    # The summary is written after each claim, so that it can be read
+                    # even if the run is killed.
                     so_far = self.make_result(results.INTERRUPTED, None)
                     tester.run.write_summary(so_far)
         if tester.context.ending == results.INTERRUPTED:
@@ -217,22 +228,23 @@ class _SuiteRun:
         if Cause.COUNTEREXAMPLE_FAILED in causes:
             tester.warnings.append(
                 "A counterexample failed, so that no claim was "
-                "tried; `all` goes on with them."
+                "tested; with the setting `all` they are tested, too."
             )
         return results.OUT_OF_TIME if Cause.OUT_OF_TIME in causes else "done"
 
     def _test_claim(self, claim: PlannedClaim) -> ClaimResult:
-        """Return the result of a claim, testing it if necessary.
+        """Return the result of a claim, and test the claim if necessary.
 
-        A claim that the run has tested before has a stored result. A result is stored
-        unless the time ended its test, so that a resumed run tests the claim again.
+        A resumed run has stored the results of claims that it has tested before. A
+        result is not stored if the time ended its test: then a resumed run tests the
+        claim again.
         """
         key = f"claim {claim.name}"
         tester = self.tester
         noted = tester.run.store.read_json_note(key)
         if noted is not None:
             return ClaimResult.from_values(noted)
-        # for example because a counterexample has failed or the time is over
+        # a result if it must not be tested, for example because the time is over
         untested = self._refuse_claim(claim)
         if untested is not None:
             return untested
@@ -253,11 +265,11 @@ class _SuiteRun:
         return tested
 
     def _refuse_claim(self, claim: PlannedClaim) -> ClaimResult | None:
-        """Return the result of a claim that is not tested; None for one that is.
+        """Return the result of a claim that must not be tested, else None.
 
-        There are three reasons. A counterexample failed unexpectedly, then claims are
-        not tested unless the setting `all` is set. The time is over. Or a
-        counterexample does not suit the model.
+        There are three reasons. First, a counterexample has failed unexpectedly: then
+        claims are not tested unless the setting `all` is set. Second, the time is over.
+        Third, a counterexample does not suit the model.
         """
         counterexample_failed = any(
             result.kind == "counterexample" and not result.accepted
@@ -278,13 +290,14 @@ class _SuiteRun:
     def _make_untested(
         self, claim: PlannedClaim, reason: str, cause: Cause | None = None
     ) -> ClaimResult:
-        """Make the result of a claim that is not tested, or not yet.
+        """Make the result of a claim before it is tested, or of one that is not tested.
 
         Args:
             claim: the claim.
             reason: reason why it is not tested; empty if it is about to be tested.
-            cause: kind of that reason; None without.
+            cause: kind of that reason; None if there is no reason, or another kind.
         """
+        # The statement of a counterexample is added when it is tested.
         text = ""
         if claim.example is None:
             text = describe_claim(self.tester.suite.claims[claim.name], claim.config)
@@ -298,7 +311,7 @@ class _SuiteRun:
         )
 
     def _add_result(self, claim: PlannedClaim, tested: ClaimResult) -> None:
-        """Add the result of a claim, with what is expected and how to repeat it."""
+        """Add the result of a claim, with its expected verdict and its command."""
         repeat = self._repeat_command(f"only={claim.name}") or ""
         expected = self.expected.get(claim.name, "held")
         self.results.append(
@@ -308,15 +321,22 @@ class _SuiteRun:
     def _repeat_command(self, *changes: str) -> str | None:
         """Return the command that tests the claims again with the same seed.
 
-        It changes nothing but its own run. None if no command can.
+        The command writes only its own run: settings with other effects, such as files
+        to write, have their defaults in it. None if no command can repeat the run,
+        because it has Python objects.
+
+        Args:
+            *changes: further settings of the command, such as "only=NAME".
         """
         config = self.tester.config
         command = config.command_line(self.tester.run.path)
         if command is None:
             return None
         arguments = list(changes)
+        # A new random seed would not repeat the run.
         if config.fresh:
             arguments += ["fresh=false", f"seed={self.tester.suite.seed}"]
+        # Settings that affect more than the run, except for those of the run itself.
         for power in config.powers:
             if power.name not in ("run", "overwrite"):
                 arguments.append(f"{power.name}={json.dumps(power.default)}")
@@ -325,12 +345,12 @@ class _SuiteRun:
     def make_result(self, ending: str, added: Counterexample | None) -> SuiteResult:
         """Make the result of the claims so far.
 
-        With the setting `update`, the verdicts of a complete run are stored as those
-        that are expected from now on.
+        With the setting `update`, the verdicts of a complete run are stored as the
+        expected verdicts.
 
         Args:
             ending: status of the run.
-            added: the counterexample that the run has added, if any.
+            added: the counterexample that the run has added; None if there is none.
         """
         tester = self.tester
         config = tester.config
@@ -363,7 +383,7 @@ class _SuiteRun:
             seed=tester.suite.seed,
             command_line=self._repeat_command(),
             python_only=config.python_only,
-            twins=self._find_twins(configs),
+            twins=self._find_twin_evidence(configs),
         )
 
     def _update_expected(
@@ -391,16 +411,17 @@ class _SuiteRun:
         ]
         return updated, changes
 
-    def _find_twins(self, configs: Sequence[SceneConfig]) -> Any:
-        """Return how far renders agree with photographs, by a run of twins.
+    def _find_twin_evidence(self, configs: Sequence[SceneConfig]) -> Any:
+        """Return how far renders agree with photographs, from a run of `twins`.
 
         Twins are renders of photographed objects, which are compared with the
-        photographs. The result is None if the settings name no run of twins.
+        photographs. The result is None if the settings name no run of `twins`.
 
         Args:
             configs: settings of each claim.
         """
         model_names = self.tester.model_names
+        are_all_in_photographs = all(config.backdrop is not None for config in configs)
         return workbench.find_twin_evidence(
             self.tester.config.twins,
             model=_join_distinct(
@@ -409,12 +430,12 @@ class _SuiteRun:
             task=_join_distinct(config.task_name for config in configs),
             object_name=_join_distinct(config.object for config in configs),
             environment=_join_distinct(config.environment_name for config in configs),
-            in_photograph=all(config.backdrop is not None for config in configs),
+            in_photograph=are_all_in_photographs,
         )
 
 
 def _join_distinct(names: Iterable[str]) -> str:
-    """Join names with commas, each once."""
+    """Join distinct names with commas."""
     return ",".join(dict.fromkeys(names))
 
 
@@ -423,15 +444,16 @@ def _plan_claims(
 ) -> list[PlannedClaim]:
     """Plan what is tested: counterexamples first, then claims.
 
-    A new counterexample is tested alone.
+    If a counterexample is added, only it is tested.
 
     Args:
         suite: the suite.
         config: settings of the command, which override those of the suite.
-        added: the new counterexample, or None.
+        added: the new counterexample; None if there is none.
 
     Raises:
-        InputError: if names clash, or `only` selects nothing or names no claim.
+        InputError: a claim and a counterexample have the same name, or `only` selects
+            nothing or has an unknown name.
     """
     changes = {
         "model": config.model,
@@ -447,8 +469,8 @@ def _plan_claims(
     for claim in planned:
         if claim.name in suite.claims:
             raise InputError(
-                f"claims.{claim.name}: a counterexample is called so, too; call "
-                "the claim something else"
+                f"claims.{claim.name}: a counterexample has the same name; rename the "
+                "claim"
             )
     if added is not None:
         return planned
@@ -463,10 +485,10 @@ def _select_claims(
 ) -> list[PlannedClaim]:
     """Select the claims that the setting `only` names, by default all.
 
-    The name of `ALL_COUNTEREXAMPLES` selects all counterexamples.
+    The name `ALL_COUNTEREXAMPLES` selects all counterexamples.
 
     Raises:
-        InputError: if it names no claim, or none is left.
+        InputError: a name is unknown, or there are no counterexamples to select.
     """
     known = [*(claim.name for claim in planned), ALL_COUNTEREXAMPLES]
     for name in config.selected_claims:
@@ -482,6 +504,7 @@ def _select_claims(
             if claim.name in config.selected_claims
             or (all_examples and claim.example is not None)
         ]
+    # Every other name selects something, and a suite has at least one claim.
     if not selected:
         raise InputError(
             f"only: expected {ALL_COUNTEREXAMPLES} in "
@@ -497,7 +520,13 @@ def _plan_example(
 ) -> PlannedClaim:
     """Plan the test of a counterexample.
 
-    If it does not suit the suite's model, the reason is stored, and it is not tested.
+    If it does not suit the suite's model, the plan has the reason, and it is not
+    tested.
+
+    Args:
+        example: the counterexample.
+        suite: the suite.
+        changes: settings of the command; None for a setting that is not changed.
     """
     refusal = ""
     try:
@@ -515,13 +544,13 @@ def _plan_example(
 
 
 def _check_claims(planned: Sequence[PlannedClaim], suite: Suite) -> list[str]:
-    """Load everything that claims name, and return remarks.
+    """Load everything that claims name, and return remarks about the claims.
 
     Otherwise a wrong name would be noticed only after minutes of rendering.
-    Counterexamples are not loaded here, as they are tested first anyway.
+    Counterexamples are not loaded here, since they are tested first anyway.
 
     Raises:
-        InputError: if a claim could not be tested or decided.
+        InputError: a claim cannot be tested, or cannot be decided.
     """
     claims = [
         (planned_claim, suite.claims[planned_claim.name])
@@ -547,10 +576,13 @@ def _check_claims(planned: Sequence[PlannedClaim], suite: Suite) -> list[str]:
 
 
 def _list_used_configs(planned: PlannedClaim, claim: AnyClaim) -> list[AttackConfig]:
-    """Return the settings of what a claim loads, of each model.
+    """Return the settings with which a claim loads scene and model.
+
+    A claim that compares two models has settings for each of them.
 
     Raises:
-        InputError: if they are not those of a single search, for a claim about one.
+        InputError: the claim is about a search, and its settings are not those of a
+            single search.
     """
     config = planned.config
     if not isinstance(config, AttackConfig):
@@ -558,25 +590,33 @@ def _list_used_configs(planned: PlannedClaim, claim: AnyClaim) -> list[AttackCon
     if isinstance(claim, NotBrokenClaim):
         _check_search(planned.name, config)
     if isinstance(claim, NoWorseClaim):
-        return [config, config.model_copy(update={"model": claim.than})]
+        other_model_config = config.model_copy(update={"model": claim.than})
+        return [config, other_model_config]
     return [config]
 
 
 def _check_search(name: str, config: AttackConfig) -> None:
     """Check that the settings of a claim are those of a single search for an error.
 
+    Args:
+        name: name of the claim, for the message.
+        config: settings of the search.
+
     Raises:
-        InputError: for the first setting that belongs to another kind of run.
+        InputError: a setting belongs to another kind of run, such as several attacks.
     """
     for setting, is_wrong, expected in (
         ("object", len(config.objects) > 1, "one object; make a claim of each"),
         ("epsilon", len(config.epsilons) > 1, "one epsilon; make a claim of each"),
+        # With one object and one epsilon, only several models make several attacks.
         ("model", config.is_study, "one model; make a claim of each"),
+        # A search for the smallest budget has no budget of its own.
         (
             "smallest",
             config.smallest,
             "a budget, which the claim is about; leave it out",
         ),
+        # A search that makes the object easier finds no error.
         (
             "minimise",
             config.minimise,

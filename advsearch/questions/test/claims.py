@@ -1,6 +1,4 @@
-"""Test each kind of claim: by sampled pictures, a search, or trials of a
-counterexample.
-"""
+"""Test claims by sampled images or by a search, and counterexamples by trials."""
 
 from __future__ import annotations
 
@@ -63,24 +61,28 @@ MAX_DESCRIBED_VALUES = 4
 # the values of a configuration with more dimensions are not stored with its picture
 MAX_STORED_VALUES = 64
 ChangePicture = Callable[["workbench.Query", Tensor], Tensor]
-"""Maps a query and its picture to the picture that the other side predicts."""
-# pictures that are requested at once, for each worker
+"""Returns the image that the other side predicts, for a query and its image."""
+# number of images per worker that are requested at once
 BATCHES_AHEAD = 2
-# assumed number of workers of a cluster, which is not known
+# assumed number of workers of a cluster, since it is not known
 CLUSTER_WORKERS = 8
 Evaluated = tuple["workbench.Query", policies.Evaluation, policies.Evaluation | None]
-"""A query, its evaluation, and that of the other side if there is one."""
+"""A query, its evaluation by the model under test, and that by the other side. The last
+one is None if there is no other side.
+"""
 ATTACK_WORKER = "advsearch.questions.attack.carry_out:attack_worker"
 CLAIM_WORKER = "advsearch.questions.test.claims:claim_worker"
 
 
 class _OtherSide(NamedTuple):
-    """What the evaluations of the model under test are compared with.
+    """What the predictions of the model under test are compared with.
+
+    It is another model, or the same model on changed images.
 
     Attributes:
-        journal: evaluates the other model, or the same one on changed pictures.
-        change: makes the other side's picture of the first one; None if the other side
-            has a rendering of its own.
+        journal: evaluates the other side, and stores its evaluations.
+        change: changes the image of the model under test to that of the other side;
+            None if the other side renders its own image.
     """
 
     journal: workbench.Journal
@@ -88,13 +90,14 @@ class _OtherSide(NamedTuple):
 
 
 class _PictureScore(NamedTuple):
-    """What a picture shows about a claim.
+    """What an image shows about a claim.
 
     Attributes:
-        score: from 0 (against the claim) to 1 (for it); None if the object is out of
-            view, so that the picture does not count.
-        badness: how bad an example against the claim it is.
-        text: describes what the model predicts.
+        score: from 0 (against the claim) to 1 (for it); None if the image does not
+            count, because the object is out of view.
+        badness: rank as an example against the claim: the image with the largest value
+            is reported.
+        text: description of the predictions.
     """
 
     score: float | None
@@ -103,12 +106,12 @@ class _PictureScore(NamedTuple):
 
 
 class _Example(NamedTuple):
-    """The worst picture against a claim.
+    """The image that is reported as an example against a claim.
 
     Attributes:
-        badness: how bad it is.
-        query: the query of the picture.
-        text: describes what the model predicts.
+        badness: its rank, see `_PictureScore`.
+        query: its query.
+        text: description of the predictions.
     """
 
     badness: float
@@ -118,14 +121,14 @@ class _Example(NamedTuple):
 
 @dataclass
 class _PictureSample:
-    """What the pictures show that a claim was tested with.
+    """What sampled images show about a claim.
 
     Attributes:
-        scores: scores of each picture that counts, from 0 to 1; see `score_picture`.
-        wrong_payloads: what the task recorded of wrong predictions.
-        n_hidden: pictures without the object in view, which do not count.
-        verdict: what they decide.
-        worst: the worst picture against the claim, if there is one.
+        scores: score of each image that counts, from 0 to 1; see `score_picture`.
+        wrong_payloads: data that the task has stored about wrong predictions.
+        n_hidden: number of images with the object out of view, which do not count.
+        verdict: verdict from the images so far.
+        worst: the worst example against the claim; None if there is none.
     """
 
     scores: list[float] = field(default_factory=list)
@@ -140,10 +143,11 @@ class _TrialSample:
     """What trials of a counterexample show.
 
     Attributes:
-        outcomes: whether the model is right in each; None does not count.
-        wrong_payloads: what the task recorded of wrong predictions.
-        label: label of the first wrong prediction; empty without one.
-        picture: its picture inside the run.
+        outcomes: whether the model is right in each trial; None for a trial that does
+            not count.
+        wrong_payloads: data that the task has stored about wrong predictions.
+        label: label of the first wrong prediction; empty if there is none.
+        picture: path of its image inside the run; None if there is none.
     """
 
     outcomes: list[bool | None] = field(default_factory=list)
@@ -163,31 +167,34 @@ class _TrialSample:
     def n_uncounted(self) -> int:
         return self.outcomes.count(None)
 
-    def is_enough(self, *, over: bool) -> bool:
-        """Return whether further trials of the counterexample change nothing.
+    def is_enough(self, *, has_conditions: bool) -> bool:
+        """Return whether no further trials are needed.
 
-        One scene that is right and wrong depends on the noise already. Otherwise it
-        takes `count_trials` that count.
+        If a single scene was predicted right and wrong, the verdict is certain: it
+        depends on the noise. Otherwise `count_trials` trials that count are needed.
 
         Args:
-            over: whether conditions vary.
+            has_conditions: whether conditions, such as the light, vary between trials.
         """
-        depends_on_noise = self.n_right > 0 and self.n_wrong > 0 and not over
-        return depends_on_noise or self.n_right + self.n_wrong == count_trials(
-            over=over
+        depends_on_noise = self.n_right > 0 and self.n_wrong > 0 and not has_conditions
+        n_counted = self.n_right + self.n_wrong
+        # Trials are added one at a time, so that the number is never exceeded.
+        return depends_on_noise or n_counted == count_trials(
+            has_conditions=has_conditions
         )
 
 
 @dataclass
 class ClaimTester:
-    """Tests the claims of a suite.
+    """Test the claims of a suite.
 
     Attributes:
         context: context of the run.
         suite: the suite.
-        start_time: when it began, by `time.perf_counter`.
-        warnings: gets what a reader has to know.
-        model_names: gets the names that loaded models have, by how they are asked for.
+        start_time: start of the test, by `time.perf_counter`.
+        warnings: sentences that a reader has to know; the tester appends to them.
+        model_names: names of loaded models, by the setting `model`; the tester adds
+            them.
     """
 
     context: RunContext[suites.SuiteConfig]
@@ -210,12 +217,12 @@ class ClaimTester:
 
     @property
     def elapsed_seconds(self) -> float:
-        """The seconds since it began."""
+        """The seconds since the start of the test."""
         return time.perf_counter() - self.start_time
 
     @property
     def time_limit(self) -> float:
-        """The seconds after which nothing more begins; infinite without a limit."""
+        """The seconds after which no further test begins; infinite without a limit."""
         return self.config.seconds or self.suite.seconds or math.inf
 
     @property
@@ -241,7 +248,7 @@ class ClaimTester:
     def _test_by_search(
         self, pending: ClaimResult, config: AttackConfig
     ) -> ClaimResult:
-        """Test by an attack the claim that nothing breaks a model.
+        """Test the claim that no search breaks a model, by an attack.
 
         The attack is a part of this run. The claim fails if the attack finds a verified
         adversarial scene.
@@ -279,10 +286,10 @@ class ClaimTester:
     def _find_search_picture(
         self, name: str, summary: workbench.AttackSummary
     ) -> str | None:
-        """Return the path inside the run of the picture that breaks the model.
+        """Return the path of an image that the model gets wrong, relative to the run.
 
-        It is the adversarial one, or the clean one if that is wrong already; None if
-        the search has not stored it.
+        It is the adversarial image; or the clean image, if the model is already wrong
+        there. None if the search has not stored it.
 
         Args:
             name: name of the claim, and of the part of the run.
@@ -303,7 +310,7 @@ class ClaimTester:
             "cluster": self.config.cluster,
             "seconds": seconds if math.isfinite(seconds) else None,
         }
-        # a copy has no Python objects: they are passed on
+        # A copy of settings loses their Python objects, which are added again.
         return config.model_copy(update=changes).with_python_only_parts(
             config.python_only_parts
         )
@@ -317,9 +324,9 @@ class ClaimTester:
         """Sample pictures until they decide a claim, or all of them are sampled.
 
         The claim is about the predictions of one model, or compares them with those of
-        another model, or with those on changed pictures. A confidence sequence stays
-        valid however often it is looked at, so sampling may stop as soon as the claim
-        is decided.
+        another model, or with those on changed images. A confidence sequence is valid
+        at all sample sizes at once, so that sampling may stop as soon as the claim is
+        decided.
 
         Args:
             pending: the result without a verdict, which is filled in.
@@ -327,8 +334,8 @@ class ClaimTester:
             config: settings of the pictures.
         """
         problem = self._load_problem(config)
-        # Only one bound is compared with the claim's limit, so the interval is
-        # one-sided.
+        # Each verdict depends on one bound only, so that a one-sided interval is
+        # enough.
         sequence = statistics.sequential.ConfidenceSequence(
             self.suite.confidence, sides=1
         )
@@ -413,13 +420,16 @@ class ClaimTester:
         """Open the workers that evaluate sampled pictures, of one or of two models.
 
         The other side is what the model is compared with: another model, or the same
-        model on changed pictures. A claim that pictures are right has none.
+        model on changed images. A claim that images are right has no other side.
 
         Args:
             name: name of the claim.
             claim: the claim.
-            config: settings of its pictures.
+            config: settings of its images.
             problem: problem of the model under test.
+
+        Yields:
+            The queries with their evaluations.
         """
         worker_call, worker_config = self._choose_worker(claim, config)
         other_problem, change = self._load_other_side(claim, config, problem)
@@ -436,13 +446,15 @@ class ClaimTester:
             worker_config, worker_call, self.progress
         ) as executor:
             if isinstance(claim, NoWorseClaim):
-                # Workers find the problem of a model by its index; see `claim_worker`.
+                # Workers of `claim_worker` find the model by its index, "0" or "1".
                 evaluator = workbench.ParallelEvaluator(problem, executor, "0")
                 other_evaluator = workbench.ParallelEvaluator(
                     other_problem, executor, "1"
                 )
             else:
                 evaluator = workbench.ParallelEvaluator(problem, executor)
+                # Changed images are predicted in this process, without workers. For a
+                # `RightClaim` this is not used.
                 other_evaluator = workbench.ParallelEvaluator(other_problem)
             journal = workbench.Journal(self.run, evaluator)
             other = None
@@ -454,7 +466,10 @@ class ClaimTester:
     def _choose_worker(
         self, claim: ShareClaim | NoWorseClaim, config: SceneConfig
     ) -> tuple[str, AttackConfig]:
-        """Return what workers call, and their settings, which name both models."""
+        """Return the function that workers call, and their settings.
+
+        If the claim is about two models, the settings name both.
+        """
         worker_config = AttackConfig.from_config(
             config, workers=self.config.workers, cluster=self.config.cluster
         )
@@ -466,11 +481,11 @@ class ClaimTester:
     def _load_other_side(
         self, claim: ShareClaim | NoWorseClaim, config: SceneConfig, problem: Problem
     ) -> tuple[Problem, ChangePicture | None]:
-        """Return the problem of the other side, and what makes its pictures.
+        """Return the problem of the other side, and the function that makes its images.
 
-        The other side is what the model is compared with. The function changes a
-        picture of the model under test. It is None if the other side needs renders of
-        its own.
+        The other side is what the model is compared with. The function changes an image
+        of the model under test. It is None if the other side renders its own images, or
+        if there is no other side: then the problem is that of the model under test.
 
         Args:
             claim: the claim.
@@ -489,10 +504,10 @@ class ClaimTester:
     def _make_change(
         self, claim: ChangeClaim, config: SceneConfig, problem: Problem
     ) -> ChangePicture:
-        """Return the function that changes the picture of a query as claimed.
+        """Return the function that changes the image of a query as the claim states.
 
         Args:
-            claim: a claim about predictions under a change, such as a blurred picture.
+            claim: a claim about predictions under a change, such as a blurred image.
             config: settings of the scene.
             problem: problem of the model under test.
         """
@@ -500,7 +515,7 @@ class ClaimTester:
             return lambda query, picture: workbench.change_image(
                 picture, claim.when, problem.model.cameras
             )
-        # a scene of its own, from which the object is taken out for good
+        # another scene, in which the object is always hidden
         without_object = self._load_problem(config)
         without_object.renderer.scene.assembly.is_object_hidden = True
         return lambda query, picture: without_object.picture(
@@ -519,12 +534,12 @@ class ClaimTester:
 
         Args:
             journal: evaluates the queries.
-            queries: what to evaluate.
+            queries: the queries.
             other_side: what the model is compared with, such as another model; None if
-                nothing.
+                there is no other side.
         """
-        # Without workers a batch has one query, so that a decided claim renders no more
-        # than it needs.
+        # Without workers a batch has one query, so that nothing more is rendered once
+        # the claim is decided.
         batch_size = 1
         if journal.evaluator.executor is not None:
             batch_size = BATCHES_AHEAD * (self.config.workers or CLUSTER_WORKERS)
@@ -550,18 +565,22 @@ class ClaimTester:
     ) -> ClaimResult:
         """Test a counterexample: the model should be right on it.
 
-        If its files or its scene have changed, or it does not suit the model, it stays
+        If its files or its scene have changed, or if it does not suit the model, it is
         undecided, with the reason.
 
         Args:
             pending: the result without a verdict, which is filled in.
             example: the counterexample.
-            config: settings that it is tested with.
+            config: settings with which it is tested.
         """
-        statement = f"{config.model} is right where it said {example.wrong_label}"
+        statement = (
+            f"{config.model} is right on a scene that was predicted as "
+            f"{example.wrong_label}"
+        )
         pending = pending.model_copy(update={"statement": statement})
         try:
             parts = workbench.load_parts(config)
+            # Trials need no derivatives.
             problem = workbench.make_problem(parts, differentiated=False)
         except InputError as error:
             reason = words.describe_unsuitable(str(error))
@@ -569,18 +588,17 @@ class ClaimTester:
         file = example.find_changed_file(config)
         if file:
             reason = (
-                f"the file {file} is another one now; put it back, or remove the "
-                "counterexample"
+                f"the file {file} has changed; restore it, or remove the counterexample"
             )
             return pending.model_copy(update={"reason": reason})
         if compute_scene_digest(parts.scene.description) != example.scene_digest:
             reason = (
-                "its scene is another one now; remove it, or add the adversarial "
-                "scene of a new run"
+                "its scene has changed; remove it, or add the adversarial scene of a "
+                "new run"
             )
             return pending.model_copy(update={"reason": reason})
         return self._test_by_trials(
-            pending, example, problem, over=varies_conditions(config)
+            pending, example, problem, has_conditions=varies_conditions(config)
         )
 
     def _test_by_trials(
@@ -589,7 +607,7 @@ class ClaimTester:
         example: Counterexample,
         problem: Problem,
         *,
-        over: bool,
+        has_conditions: bool,
     ) -> ClaimResult:
         """Test a counterexample by trials with fresh seeds.
 
@@ -597,13 +615,17 @@ class ClaimTester:
             pending: the result without a verdict.
             example: the counterexample.
             problem: problem of the model under test.
-            over: whether conditions vary. Then the clean scene is rendered under the
-                same conditions in each trial, and the trial does not count if the model
-                is wrong there.
+            has_conditions: whether conditions vary. Then the clean scene is rendered
+                under the same conditions in each trial, and the trial does not count if
+                the model is wrong there.
         """
-        sample = self._sample_trials(example, problem, over=over)
-        update = _trials_result(sample, problem.task.name, over=over)
-        is_late = self.out_of_time and not sample.is_enough(over=over)
+        sample = self._sample_trials(example, problem, has_conditions=has_conditions)
+        update = _trials_result(
+            sample, problem.task.name, has_conditions=has_conditions
+        )
+        is_late = self.out_of_time and not sample.is_enough(
+            has_conditions=has_conditions
+        )
         if is_late:
             reasons = [OUT_OF_TIME_REASON]
             if sample.outcomes:
@@ -617,7 +639,7 @@ class ClaimTester:
         return pending.model_copy(update=update)
 
     def _sample_trials(
-        self, example: Counterexample, problem: Problem, *, over: bool
+        self, example: Counterexample, problem: Problem, *, has_conditions: bool
     ) -> _TrialSample:
         """Make trials until further ones would change nothing, or the time is over.
 
@@ -626,24 +648,24 @@ class ClaimTester:
         Args:
             example: the counterexample.
             problem: problem of the model under test.
-            over: whether conditions vary; then the clean scene is rendered in each
-                trial, too.
+            has_conditions: whether conditions vary; then the clean scene is rendered in
+                each trial, too.
         """
-        # Offsets are stored with rounding, which may leave the budget by a little.
+        # Because of rounding, stored offsets may exceed the budget by a little.
         u = problem.domain.project(example.make_configuration(problem.domain.start))
-        # trials by which it is added are not repeated as trials of the suite
+        # With `add`, trials have other seeds than in later tests of the suite.
         prefix = "added " if self.config.add is not None else ""
         kind = f"{prefix}counterexample {example.name}"
         journal = workbench.Journal(self.run, workbench.ParallelEvaluator(problem))
-        max_renders = count_trials(over=over)
-        if over:
-            # Up to twice as many trials are made, as some may not count; each also
-            # renders the clean scene.
+        max_renders = count_trials(has_conditions=has_conditions)
+        if has_conditions:
+            # Twice as many trials as needed may be made, since some may not count. Each
+            # also renders the clean scene.
             max_renders *= 4
         self.progress.stage(example.name, max_renders, at_most=True)
         sample = _TrialSample()
         for query, trial, clean in self._run_trials(
-            journal, kind, u, example.spp, over=over
+            journal, kind, u, example.spp, has_conditions=has_conditions
         ):
             outcome = evaluate_trial(trial, clean)
             sample.outcomes.append(outcome)
@@ -653,54 +675,63 @@ class ClaimTester:
                 if not sample.label:
                     sample.label = trial.prediction.label
                     sample.picture = self._save_picture(example.name, problem, query)
-            if sample.is_enough(over=over):
+            if sample.is_enough(has_conditions=has_conditions):
                 break
         return sample
 
     def _run_trials(
-        self, journal: workbench.Journal, kind: str, u: Tensor, spp: int, *, over: bool
+        self,
+        journal: workbench.Journal,
+        kind: str,
+        u: Tensor,
+        spp: int,
+        *,
+        has_conditions: bool,
     ) -> Iterator[tuple[workbench.Query, tasks.Judgement, tasks.Judgement | None]]:
         """Yield the trials of a configuration, until the time is over.
 
+        There are twice as many trials as needed, since some may not count. The caller
+        stops when it has enough of them.
+
         Args:
-            journal: which evaluates and stores them.
+            journal: evaluates the trials, and stores them.
             kind: kind of their seeds and stored rows.
             u: (d,) the configuration.
             spp: samples per pixel.
-            over: whether the clean scene is evaluated as well, under the same
-                conditions.
+            has_conditions: whether conditions vary. Then the clean scene is evaluated
+                as well, under the same conditions.
 
         Yields:
             Query and judgement of the configuration, and the judgement of the clean
-            scene, None without `over`.
+            scene. The latter is None without varying conditions.
         """
         clean_u = journal.problem.domain.start
         queries = list[workbench.Query]()
-        # twice as many as are needed, as some may not count
-        for index in range(2 * count_trials(over=over)):
+        for index in range(2 * count_trials(has_conditions=has_conditions)):
             seed = seeds.stream(self.suite.seed, kind, index)
             query = workbench.Query(u, seed, kind, index, spp=spp)
             queries.append(query)
-            if over:
+            if has_conditions:
                 queries.append(replace(query, u=clean_u, kind=f"{kind}, clean"))
         evaluated = self._evaluate_pairs(journal, iter(queries))
         for query, trial, _ in evaluated:
-            if not over:
+            if not has_conditions:
                 yield query, trial.required_judgement, None
                 continue
-            # The next query is that of the clean scene; without it, the time is over.
+            # The next evaluation is that of the clean scene. It is missing if the time
+            # is over.
             clean_result = next(evaluated, None)
             if clean_result is None:
                 return
-            _, clean, _ = clean_result
+            _, clean, _ = clean_result  # query, evaluation, no other side
             yield query, trial.required_judgement, clean.required_judgement
 
     def _load_problem(self, config: SceneConfig) -> Problem:
-        """Load scene, model and task; what there is to remark becomes a warning."""
+        """Load scene, model and task, and add remarks on them to the warnings."""
         parts = workbench.load_parts(AttackConfig.from_config(config))
         _, model_warnings = parts.model_and_warnings
-        # A copy: making the problem adds the remarks of the task, which are part of the
-        # reason of each claim.
+        # `make_problem` appends remarks of the task to this list. The list is copied
+        # before, because the reason of each claim has these remarks already.
         remarks = list(model_warnings)
         problem = workbench.make_problem(parts, differentiated=False)
         self.model_names[config.model] = problem.model.name
@@ -731,12 +762,12 @@ def _evaluate_with_pictures(
     pictures: dict[int, Tensor | None] | None,
     queries: Sequence[workbench.Query],
 ) -> Iterator[policies.Evaluation]:
-    """Evaluate queries, and store their pictures by the index of the query.
+    """Evaluate queries, and store their images by the index of the query.
 
     Args:
-        journal: its evaluator renders and predicts them.
-        pictures: mapping to which the pictures are added; None if they are not needed.
-        queries: what to evaluate.
+        journal: its evaluator renders the images and predicts them.
+        pictures: mapping to which the images are added; None if they are not needed.
+        queries: the queries.
     """
     with_image = pictures is not None
     evaluations = journal.evaluator(
@@ -760,14 +791,15 @@ def _evaluate_batch(
         other_side: what the model is compared with.
         batch: the queries.
     """
+    # Images are stored only if the other side changes them.
     pictures: dict[int, Tensor | None] | None = {}
     if other_side.change is None:
         pictures = None
-    # All are evaluated at once, so that the pictures are there before they are changed.
+    # A list, so that all images are stored before they are changed.
     evaluations = list(
         journal.evaluate_all(batch, partial(_evaluate_with_pictures, journal, pictures))
     )
-    # The other side has rows of its own in the store.
+    # The other side has different rows in the store.
     other_queries = [replace(query, kind=f"{query.kind} beside") for query in batch]
     others = other_side.journal.evaluate_all(
         other_queries,
@@ -784,28 +816,31 @@ def _evaluate_other_side(
 ) -> Iterator[policies.Evaluation]:
     """Evaluate what the model under test is compared with.
 
-    That is a model on the same pictures after a change, such as blurring, or another
-    model on pictures of its own.
+    That is a model on the same images after a change, such as blurring; or another
+    model on its own images.
 
     Args:
-        other_side: the evaluator and, if pictures are changed, the change.
+        other_side: the evaluator and, if images are changed, the change.
         problem: problem of the model under test.
-        pictures: its pictures, by the index of the query.
-        queries: what to evaluate.
+        pictures: its images, by the index of the query; None if, and only if, there is
+            no change.
+        queries: the queries.
     """
     if other_side.change is None or pictures is None:
+        # The other side renders its own images.
         yield from other_side.journal.evaluator(queries)
         return
     other_problem = other_side.journal.evaluator.problem
     for query in queries:
-        # an evaluation that was read back has no picture
+        # There is no image if the evaluation was read from the store of a resumed run.
         picture = pictures.get(query.index)
         if picture is None:
             picture = problem.picture(query.u, query.seed, query.spp)
         changed_picture = other_side.change(query, picture)
-        judgement = other_problem.judge(
-            changed_picture, other_problem.add_conditions(query.u)
-        )
+        # Claims that are tested by images have no varying conditions, so that no seed
+        # is needed.
+        full_configuration = other_problem.add_conditions(query.u)
+        judgement = other_problem.judge(changed_picture, full_configuration)
         yield policies.Evaluation.from_judgement(judgement)
 
 
@@ -820,6 +855,7 @@ def claim_worker(values: dict[str, Any]) -> Callable[[Any], Any]:
     models = settings.split_names(str(values["model"]))
 
     def load_problem(model_index: str) -> Problem:
+        """Load the problem of a model by its index."""
         config = AttackConfig(**{**values, "model": models[int(model_index)]})
         return workbench.make_problem(
             workbench.load_parts(config), differentiated=False
@@ -831,10 +867,10 @@ def claim_worker(values: dict[str, Any]) -> Callable[[Any], Any]:
 def sample_queries(
     problem: Problem, kind: str, count: int, spp: int
 ) -> Iterator[workbench.Query]:
-    """Yield configurations sampled uniformly from the full space and budget.
+    """Yield configurations that are sampled uniformly from all allowed ones.
 
-    Each has its own seed of the noise. The samples depend on the kind and the index
-    alone, so that a resumed run samples the same.
+    Each has its own seed of the noise. The samples depend only on the kind and the
+    index, so that a resumed run has the same samples.
 
     Args:
         problem: problem of the model under test.
@@ -848,20 +884,21 @@ def sample_queries(
         )
         (u,) = problem.domain.sample(generator)
         seed = seeds.stream(problem.seed, kind, index)
+        # Values of parameters are stored with the row, except for large textures.
         values = {}
-        # Descriptions of large textures would make the stored rows large.
         if problem.domain.dim <= MAX_STORED_VALUES:
             values = problem.describe(u, seed)
+        # A search looks for a prediction, its success. Sampled images have none.
         yield workbench.Query(
             u, seed, kind, index, spp=spp, values=values, has_success=False
         )
 
 
 def threshold_mean(claim: ShareClaim | NoWorseClaim) -> float:
-    """Return what the mean of the scores, from 0 to 1, has to exceed.
+    """Return the threshold that the mean of the scores has to exceed, from 0 to 1.
 
-    Of two models, a mean of 1/2 is that both are equally good, and the mean falls by
-    1/2 if the model is right 100 percentage points less often.
+    For a claim about two models, a mean of 1/2 means that both are equally good. It is
+    less by 1/200 for each percentage point by which the model is right less often.
     """
     if isinstance(claim, ShareClaim):
         return claim.at_least
@@ -869,15 +906,15 @@ def threshold_mean(claim: ShareClaim | NoWorseClaim) -> float:
 
 
 def check_pictures(name: str, claim: AnyClaim, confidence: float) -> str:
-    """Check a claim's number of pictures; return a remark, or "" if it is enough.
+    """Check a claim's number of images; return a remark, or "" if it is enough.
 
-    With that number of pictures, a model that is always right has to be able to hold
-    the claim, and one that is always wrong to fail it. Otherwise the test is useless
-    whatever the model predicts. For a claim that compares two models there is a remark
-    if the pictures could not show that two models which predict alike are equally good.
+    With that number of images, the verdict has to be "held" for a model that is always
+    right, and "failed" for one that is always wrong. Otherwise the test is useless. For
+    a claim that compares two models there is a remark if the claim could not be held
+    for two models with the same predictions.
 
     Raises:
-        InputError: if no predictions of so many pictures could decide it both ways.
+        InputError: with that number of images, one of the two verdicts is impossible.
     """
     if not isinstance(claim, ShareClaim | NoWorseClaim):
         return ""
@@ -885,14 +922,13 @@ def check_pictures(name: str, claim: AnyClaim, confidence: float) -> str:
         statistics.sequential.count_needed_samples, confidence=confidence
     )
     threshold = threshold_mean(claim)
-    # to exceed the threshold, and to fall below it
+    # number of images to exceed the threshold, and number to fall below it
     needed = max(count_needed(threshold), count_needed(1.0 - threshold))
     if claim.pictures < needed:
         raise InputError(
-            f"claims.{name}.pictures: expected at least {needed}, as fewer cannot both "
-            "hold and fail this claim at a "
-            f"confidence of {wording.format_number(confidence)} whatever the model "
-            f"predicts, got {claim.pictures}"
+            f"claims.{name}.pictures: expected at least {needed}, since with fewer one "
+            "of the verdicts held and failed is impossible at a confidence of "
+            f"{wording.format_number(confidence)}, got {claim.pictures}"
         )
     if not isinstance(claim, NoWorseClaim):
         return ""
@@ -901,8 +937,8 @@ def check_pictures(name: str, claim: AnyClaim, confidence: float) -> str:
     if claim.pictures >= needed_if_equal:
         return ""
     return (
-        f"{name}: two models that predict alike are shown to be so by "
-        f"{needed_if_equal} pictures, and it takes {claim.pictures}."
+        f"{name}: for two models with the same predictions, this claim can be held "
+        f"with {needed_if_equal} images, and it has at most {claim.pictures}."
     )
 
 
@@ -911,12 +947,13 @@ def score_picture(
     evaluation: policies.Evaluation,
     other: policies.Evaluation | None,
 ) -> _PictureScore:
-    """Score a picture for a claim.
+    """Score an image for a claim.
 
-    The score is 1 if the model is right, or predicts as claimed, and 0 otherwise. For
-    two models it is 1 if only the first is right, 0 if only the other is, and 1/2 if
-    both are right or both are wrong. The score is None, and the picture does not count,
-    if the object is not visible.
+    The score is 1 if the model is right, or if its prediction under a change
+    (`ChangeClaim`, a kind of `ShareClaim`) is as claimed; and 0 otherwise. For two
+    models it is 1 if only the first is right, 0 if only the other is right, and 1/2 if
+    both are right or both are wrong. If the object is not visible, the score is None,
+    and the image does not count.
 
     Args:
         claim: what is claimed.
@@ -928,17 +965,19 @@ def score_picture(
     if prediction.is_out_of_view:
         return _PictureScore(None)
     if other is None:
-        # how wrong the model is; an infinite or undefined score sorts last
+        # The larger the score of a judgement, the more wrong is the model. The image
+        # with the largest score is reported, but not one with an infinite score or NaN.
         badness = judgement.score if math.isfinite(judgement.score) else -math.inf
         text = f"most wrong where it says {prediction.label}"
-        return _PictureScore(float(judgement.right), badness, text)
+        score = float(judgement.right)
+        return _PictureScore(score, badness, text)
     other_judgement = other.required_judgement
     other_prediction = other_judgement.prediction
     if isinstance(claim, ChangeClaim):
         text = f"{prediction.label} before and {other_prediction.label} after"
         is_as_claimed = workbench.meets_claim(claim.claim, prediction, other_prediction)
         return _PictureScore(float(is_as_claimed), text=text)
-    # pictures of two sizes need not show the same
+    # Images of different sizes may differ in whether the object is visible.
     if other_prediction.is_out_of_view:
         return _PictureScore(None)
     difference = int(judgement.right) - int(other_judgement.right)  # -1, 0 or 1
@@ -958,7 +997,8 @@ def _to_claim_scale(
     claim: ShareClaim | NoWorseClaim, *means: float
 ) -> tuple[float, ...]:
     """Convert means of scores to fractions, or to differences of two models."""
-    if isinstance(claim, NoWorseClaim):  # a mean of 1/2 is no difference
+    if isinstance(claim, NoWorseClaim):
+        # A mean of 1/2 is a difference of 0, a mean of 1 one of 1.
         return tuple(2.0 * mean - 1.0 for mean in means)
     return means
 
@@ -970,7 +1010,7 @@ def _describe_sample(
     example: str,
     task: str,
 ) -> str:
-    """Describe why sampled pictures decide a claim, or don't.
+    """Describe why sampled images decide a claim, or why they do not.
 
     Args:
         claim: what is claimed.
@@ -1013,16 +1053,20 @@ def _describe_sample(
     return reason
 
 
-def _trials_result(sample: _TrialSample, task: str, *, over: bool) -> dict[str, Any]:
-    """Return what trials decide: fields of a `ClaimResult`.
+def _trials_result(
+    sample: _TrialSample, task: str, *, has_conditions: bool
+) -> dict[str, Any]:
+    """Return the fields of a `ClaimResult` that follow from trials.
 
     Args:
         sample: the trials.
         task: name of the task.
-        over: whether conditions vary.
+        has_conditions: whether conditions vary.
     """
     total = sample.n_right + sample.n_wrong
-    verdict = decide_trials(sample.n_right, sample.n_wrong, over=over)
+    verdict = decide_trials(
+        sample.n_right, sample.n_wrong, has_conditions=has_conditions
+    )
     interval = None
     rate = None
     if total:
@@ -1036,7 +1080,7 @@ def _trials_result(sample: _TrialSample, task: str, *, over: bool) -> dict[str, 
         n_uncounted=sample.n_uncounted,
         label=sample.label,
         interval=interval,
-        over=over,
+        has_conditions=has_conditions,
         outcomes=wording.format_outcomes(outcome_counts, task),
     )
     return {
@@ -1049,7 +1093,7 @@ def _trials_result(sample: _TrialSample, task: str, *, over: bool) -> dict[str, 
 
 
 def _same_picture(_query: workbench.Query, picture: Tensor) -> Tensor:
-    """Return the picture without a change, for another model."""
+    """Return a copy of the image, for another model."""
     return picture.clone()
 
 

@@ -1,6 +1,6 @@
-"""Counterexamples: adversarial scenes of runs as files that a suite tests again.
+"""Store and read counterexamples: adversarial scenes of runs that a suite tests again.
 
-Each is a small file and a picture in a directory next to the suite.
+Each is a small file and a thumbnail in a directory next to the suite.
 """
 
 from __future__ import annotations
@@ -53,15 +53,16 @@ COARSE_STEP = 1.0 / 255.0
 """Limits of quantization.
 
 A block of up to `MAX_FINE_VALUES` values is stored in steps of `FINE_STEP`. A larger
-one, such as the texels of a texture, has one of `FORMS`, at best in steps of
-`COARSE_STEP`.
+block, such as the texels of a texture, is stored in one of `FORMS`; the finest of these
+has steps of `COARSE_STEP`.
 """
 
 FORMS = ((True, 4), (True, 2), (True, 1), (False, 1))
-"""How the values of a large block are stored, the smallest form first.
+"""Forms in which the values of a large block are stored, the smallest form first.
 
-A form is whether a value is only its sign (a step up, down or none), and the side of
-the squares of texels that share a value.
+A form is a pair. Its first element is whether only the sign of a value is stored (a
+step up, down or none). The second one is the side of the squares of texels that share a
+value, so that the file has fewer of them.
 """
 
 # suffix of the picture
@@ -72,25 +73,25 @@ THUMBNAIL_SIDE = 128
 MAX_SIZE = 1 << 24
 # maximum bytes of memory to decompress a block
 MAX_MEMORY = 1 << 27
-# fresh renders that test a scene
+# number of fresh renders that test a scene
 N_TRIALS_OF_SCENE = 6
-# fresh renders that test a scene under varying conditions
+# number of fresh renders that test a scene under varying conditions, such as light
 N_TRIALS_OVER_CONDITIONS = 20
 
 
-def count_trials(*, over: bool) -> int:
+def count_trials(*, has_conditions: bool) -> int:
     """Return the number of fresh renders that test a counterexample.
 
     Args:
-        over: whether conditions vary.
+        has_conditions: whether conditions vary.
     """
-    return N_TRIALS_OVER_CONDITIONS if over else N_TRIALS_OF_SCENE
+    return N_TRIALS_OVER_CONDITIONS if has_conditions else N_TRIALS_OF_SCENE
 
 
 MODEL_SETTINGS = ("model", "labels", "prompt", "value_range", "ask", "ensemble")
 """Settings of the network under test.
 
-They go together: if the suite names a model, all are the suite's.
+They belong together: if the suite names a model, all of them are those of the suite.
 """
 
 SUITE_SETTINGS = (
@@ -124,18 +125,21 @@ The samples of its verification are stored separately.
 """
 
 NOT_DECIDING = frozenset({*SUITE_SETTINGS, *SEARCH_SETTINGS, "ask"})
-"""The only settings of a run that are not stored with its adversarial scene.
+"""Settings of a run that are not stored with its adversarial scene.
 
-Every other one may decide a verdict; a new setting is stored unless it is listed here.
+Every other setting may decide a verdict, and is stored.
 """
 
 
 class _Block(BaseModel):
     """Quantized offsets of some values from the clean scene; see `FORMS`.
 
-    `numbers` is how many values there are, `step` the size of a quantization step,
-    `signs` whether a value is -1, 0 or 1 steps, `square` the side of the squares of
-    texels that share a value, and `offsets` the compressed steps as base 85.
+    Attributes:
+        numbers: number of values n.
+        step: size of a quantization step.
+        signs: whether each value is only -1, 0 or 1 steps.
+        square: side of the squares of texels that share a value.
+        offsets: steps of all values or squares, compressed (LZMA), as text in base 85.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -149,9 +153,9 @@ class _Block(BaseModel):
     def quantize(cls, values: Floats, signs: bool, square: int) -> _Block:
         """Quantize and compress offsets (n,) from the clean scene.
 
-        Offsets become integer multiples of a step. Large blocks, such as textures, may
-        store signs only, or one value for each square of texels, so that the file of a
-        counterexample stays small.
+        Offsets become integer multiples of a step. For large blocks, such as textures,
+        only signs or only one value for each square of texels may be stored, so that
+        the file of a counterexample is small.
 
         Args:
             values: the offsets.
@@ -165,7 +169,7 @@ class _Block(BaseModel):
         if is_small:
             step = FINE_STEP
         elif stores_signs:
-            # 1.0 where nothing differs: a step of 0 is none
+            # If all offsets are 0, the step may be any positive number.
             step = float(np.abs(values).max()) or 1.0
         # A texture has side * side texels of 3 values.
         side = isqrt(len(values) // 3)
@@ -191,11 +195,11 @@ class _Block(BaseModel):
         """Return the offsets, (n,) float32.
 
         Raises:
-            ValueError, LZMAError: if they are corrupt.
+            ValueError, LZMAError: the stored offsets are corrupt.
         """
         steps = self._decompress_steps()
         if self.square > 1:
-            # each step is of a square of texels
+            # Each step is repeated for all texels of its square.
             n_squares = isqrt(self.numbers // 3) // self.square  # along each side
             squares = steps.reshape(n_squares, n_squares, 3)
             texels = squares.repeat(self.square, axis=0).repeat(self.square, axis=1)
@@ -204,18 +208,20 @@ class _Block(BaseModel):
         return offsets
 
     def _decompress_steps(self) -> np.ndarray[Any, Any]:
-        """Return the stored values as integer multiples of the step (n / square^2,).
+        """Return the stored integer multiples of the step (n / square^2,).
+
+        There is one multiple for each square of square^2 texels and each color channel.
 
         Raises:
-            ValueError, LZMAError: if they are corrupt.
+            ValueError, LZMAError: the stored offsets are corrupt.
         """
         n_steps = self.numbers // self.square**2
-        n_bytes = 2 * n_steps
+        n_bytes = 2 * n_steps  # 16-bit integers
         if self.signs:
-            n_bytes = math.ceil(n_steps / 3)  # three in a byte
+            n_bytes = math.ceil(n_steps / 3)  # three values of -1, 0 or 1 in a byte
         decompressor = lzma.LZMADecompressor(memlimit=MAX_MEMORY)
-        # The file is not trusted: memory and size are limited. One byte more than
-        # expected is read, which shows that the data is another block's.
+        # The file is not trusted, so that memory and size are limited. The limit is at
+        # least one byte more than expected: longer data is detected by its length.
         max_bytes = 2 * n_steps + 1
         data = decompressor.decompress(base64.b85decode(self.offsets), max_bytes)
         if len(data) != n_bytes:
@@ -243,7 +249,9 @@ def _pack_signs(steps: np.ndarray[Any, Any]) -> bytes:
     """Pack three values from -1 to 1 into each byte, as digits of base 3."""
     n_missing = -len(steps) % 3  # to a multiple of three
     threes = np.pad(steps, (0, n_missing)).reshape(-1, 3)
-    packed = threes @ (9, 3, 1) + 13  # 13: adds 1 to each digit, so that none is -1
+    # 13 = 9 + 3 + 1 adds 1 to each digit: digits are 0, 1 and 2 in place of -1, 0 and
+    # 1.
+    packed = threes @ (9, 3, 1) + 13
     return bytes(packed.astype(np.uint8).tobytes())
 
 
@@ -257,10 +265,15 @@ def _unpack_signs(data: bytes, n_steps: int) -> np.ndarray[Any, Any]:
 class _File(BaseModel):
     """The content of a counterexample's file.
 
-    `run` is the name of the run, `said` the wrong prediction, `settings` those that
-    decide a verdict, `files` the SHA-256 of the files that these name, `scene` the
-    digest of the scene, `spp` the samples per pixel, and `blocks` the offsets from the
-    clean scene.
+    Attributes:
+        schema_: version of the format.
+        run: name of the run.
+        said: the wrong prediction.
+        settings: settings of the run that decide a verdict.
+        files: SHA-256 of the files in these settings, by name.
+        scene: digest of the scene.
+        spp: samples per pixel.
+        blocks: offsets from the clean scene.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -280,13 +293,13 @@ class Counterexample:
 
     Attributes:
         name: name of the file.
-        path: the file.
-        config: settings that it was found with.
+        path: path of the file.
+        config: settings of the run that found it.
         wrong_label: the wrong prediction.
-        files: SHA-256 of the files that its settings name, by name.
+        files: SHA-256 of the files in its settings, by name.
         scene_digest: digest of the scene.
-        spp: samples per pixel that it was verified with.
-        clean_offsets: offset (d,) float32 of each value from the clean scene's.
+        spp: samples per pixel of its verification.
+        clean_offsets: (d,) float32 offset of each value from that of the clean scene.
     """
 
     name: str
@@ -299,40 +312,48 @@ class Counterexample:
     clean_offsets: Floats
 
     def make_config(self, suite: Suite, changes: Mapping[str, object]) -> AttackConfig:
-        """Return the settings that test it: its own, with the suite's network.
+        """Return the settings with which the counterexample is tested.
 
-        If the suite or the changes name a model, all settings of the network are
-        replaced, otherwise none: settings of one network do not suit another. Settings
-        of the machine, such as the number of threads, are the defaults, updated by the
-        changes.
+        These are its own settings, except for two groups. Settings of how a run
+        computes (`SUITE_SETTINGS`), such as the number of threads, have their defaults.
+        Settings of the network (`MODEL_SETTINGS`) are those of the suite and the
+        command, if one of them names a model, or else its own. Settings of the command
+        come last. No other settings of the suite are used, since they describe its
+        claims.
 
         Args:
             suite: the suite.
-            changes: settings of the command line; None is no setting.
+            changes: settings of the command; None for a setting that is not changed.
 
         Raises:
-            InputError: if its settings do not suit that network.
+            InputError: its settings do not suit that network.
         """
         changed = {name: value for name, value in changes.items() if value is not None}
-        merged = {**suite.settings, **changed}
-        network = {
-            name: value for name, value in merged.items() if name in MODEL_SETTINGS
+        network_settings = {
+            name: value
+            for name, value in {**suite.settings, **changed}.items()
+            if name in MODEL_SETTINGS
         }
-        replaced = (*SUITE_SETTINGS, *MODEL_SETTINGS)
-        if "model" not in network:
-            network = {}
-            replaced = SUITE_SETTINGS
+        replaces_network = "model" in network_settings
+        # settings that are reset to their defaults
+        reset_names = {*SUITE_SETTINGS}
+        if replaces_network:
+            reset_names |= {*MODEL_SETTINGS}
+        else:
+            # Settings of one network do not suit another: none of them is used.
+            network_settings = {}
         defaults = {
             setting.name: setting.default
             for setting in settings.settings(AttackConfig)
-            if setting.name in replaced
+            if setting.name in reset_names
         }
+        # Later mappings take precedence.
         return AttackConfig(
-            **{**self.config.to_json(), **defaults, **network, **changed}
+            **{**self.config.to_json(), **defaults, **network_settings, **changed}
         )
 
     def find_changed_file(self, config: AttackConfig) -> str | None:
-        """Return the name of a file in its settings that has changed, if any."""
+        """Return the name of a file in its settings that has changed, or None."""
         return directory.summary.find_changed_file(
             self.files, select_deciding_settings(config)
         )
@@ -341,7 +362,7 @@ class Counterexample:
         """Return the configuration (d,) in [0, 1], from that of the clean scene.
 
         Raises:
-            InputError: if the scene has another number of values by now.
+            InputError: the scene has another number of values now.
         """
         if start.numel() != len(self.clean_offsets):
             raise InputError(
@@ -373,7 +394,10 @@ def compute_scene_digest(description: SceneDescription) -> str:
 
 
 def select_deciding_settings(config: AttackConfig) -> dict[str, Any]:
-    """Return the settings except the network that decide a verdict, for JSON."""
+    """Return the settings that decide a verdict, without those of the network.
+
+    They are JSON values.
+    """
     left_out = NOT_DECIDING | {*MODEL_SETTINGS}
     return {
         name: value for name, value in config.to_json().items() if name not in left_out
@@ -381,9 +405,10 @@ def select_deciding_settings(config: AttackConfig) -> dict[str, Any]:
 
 
 def make_paths_relative(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings with files relative to the working directory, if they are in it.
+    """Return settings in which paths of files are relative to the working directory.
 
-    So a suite can be moved with its files.
+    Paths of files outside of it are not changed. So a suite can be moved with its
+    files.
     """
     working_directory = os.getcwd()
     relative = dict(values)
@@ -401,8 +426,13 @@ def evaluate_trial(
 ) -> bool | None:
     """Return whether the model is right in a trial, None if the trial does not count.
 
-    It does not count if the object is out of view, or the model is wrong on the clean
-    scene under the same conditions.
+    It does not count if the object is out of view, or if the model is wrong on the
+    clean scene under the same conditions.
+
+    Args:
+        trial: judgement of the adversarial scene.
+        clean: judgement of the clean scene under the same conditions; None if
+            conditions do not vary.
     """
     if trial.prediction.is_out_of_view:
         return None
@@ -411,50 +441,52 @@ def evaluate_trial(
     return trial.right
 
 
-def decide_trials(n_right: int, n_wrong: int, *, over: bool) -> str:
+def decide_trials(n_right: int, n_wrong: int, *, has_conditions: bool) -> str:
     """Return the verdict of the trials that count.
 
-    Without conditions the counterexample is held if the model is right in all trials,
-    failed if it is wrong in all, and otherwise undecided, as the prediction depends on
-    the noise. Over conditions it is held if the model is right in 90 % of the trials,
-    which is the rate at which an attack counts as successful. It is failed if the model
-    is wrong in more than half with 95 % confidence.
+    If conditions do not vary, it is held if the model is right in all trials, failed if
+    it is wrong in all, and otherwise undecided, because the prediction depends on the
+    noise. If conditions vary, it is held if the model is right in at least 90 % of the
+    trials, the rate at which an attack counts as successful. It is failed if the lower
+    bound of the rate of wrong predictions is at least 50 % (95 % interval).
 
     Args:
         n_right, n_wrong: trials in which the model is right, and in which it is wrong.
-        over: whether conditions vary.
+        has_conditions: whether conditions vary.
     """
     total = n_right + n_wrong
-    if not over:
+    if not has_conditions:
         depends_on_noise = n_right > 0 and n_wrong > 0
         if total < N_TRIALS_OF_SCENE or depends_on_noise:
             return UNDECIDED
         return HELD if n_right else FAILED
     if total:
-        lower, _ = statistics.intervals.clopper_pearson(n_wrong, total)
-        if lower >= workbench.MIN_RATE:
+        lower_wrong_rate, _ = statistics.intervals.clopper_pearson(n_wrong, total)
+        if lower_wrong_rate >= workbench.MIN_RATE:  # 0.5
             return FAILED
     rule = workbench.OVER_CONDITIONS
-    if total >= rule.min_trials and n_right >= rule.count_percent(total):
+    n_required = rule.count_percent(total)  # 90 % of the trials
+    if total >= rule.min_trials and n_right >= n_required:
         return HELD
     return UNDECIDED
 
 
 def _is_wrong_on(
-    example: Counterexample, problem: Problem, trials: int, *, over: bool
+    example: Counterexample, problem: Problem, trials: int, *, has_conditions: bool
 ) -> bool:
     """Return whether the run's own model fails on the stored scene, with fresh seeds.
 
     Args:
         example: the counterexample as it is stored.
         problem: problem of the run.
-        trials: number of trials. Without `over`, the first right prediction ends them.
-        over: whether conditions vary; then the clean scene is rendered too, under the
-            same conditions.
+        trials: number of trials. If conditions do not vary, the first right prediction
+            ends them.
+        has_conditions: whether conditions vary; then the clean scene is rendered, too,
+            under the same conditions.
     """
     start = problem.domain.start
     u = problem.domain.project(example.make_configuration(start))
-    configurations = [u, start] if over else [u]
+    configurations = [u, start] if has_conditions else [u]
     outcomes = list[bool | None]()
     for index in range(trials):
         seed = seeds.stream(problem.seed, "kept", index)
@@ -465,26 +497,26 @@ def _is_wrong_on(
             judgements.append(problem.judge(picture, full_configuration))
         is_right = evaluate_trial(*judgements)
         outcomes.append(is_right)
-        # One right trial is enough: the scene cannot be failed any more.
-        if is_right and not over:
+        # After one right trial, the verdict of a single scene cannot be FAILED.
+        if is_right and not has_conditions:
             return False
     n_right = outcomes.count(True)
     n_wrong = outcomes.count(False)
-    return decide_trials(n_right, n_wrong, over=over) == FAILED
+    return decide_trials(n_right, n_wrong, has_conditions=has_conditions) == FAILED
 
 
 def add_counterexample(suite: str, run: str) -> Counterexample:
     """Store the adversarial scene of a run as a counterexample of a suite.
 
-    The offsets are stored in the smallest form in which the run's own model still fails
-    on the scene.
+    Its offsets from the clean scene are stored in the smallest form with which the
+    run's own model still fails.
 
     Args:
         suite: path of the suite's file.
         run: name or directory of the run of an attack.
 
     Raises:
-        InputError: if the run found nothing, or its scene is no counterexample.
+        InputError: the run found nothing, or its scene is no counterexample.
     """
     path = directory.find_run(run)
     summary = workbench.load_attack_summary(path)
@@ -509,7 +541,7 @@ def add_counterexample(suite: str, run: str) -> Counterexample:
     thumbnail = _make_thumbnail(path / "images" / "adversarial.png")
     writing.write_bytes(base.with_name(f"{base.name}{PICTURE_SUFFIX}"), thumbnail)
     return _write_smallest(
-        base, values, offsets, problem, over=varies_conditions(config)
+        base, values, offsets, problem, has_conditions=varies_conditions(config)
     )
 
 
@@ -525,7 +557,7 @@ def _make_values(
         config: settings of the run.
         path: directory of the run.
         summary: summary of the run.
-        parts: what the run loaded.
+        parts: loaded parts of the run.
     """
     verified = summary.verified
     assert verified is not None
@@ -534,13 +566,14 @@ def _make_values(
         for name, value in config.to_json().items()
         if name not in NOT_DECIDING
     }
-    # Those of the network are stored, but their files are not: the suite may replace
-    # them all.
+    # Digests of the files in the settings are stored, too, but not of files of the
+    # network, since the suite may replace the network.
     settings_with_files = make_paths_relative(select_deciding_settings(config))
     return {
         "schema": 1,
         "run": path.name,
-        "said": next(iter(verified.labels), ""),  # the most frequent one
+        # the most frequent wrong prediction
+        "said": next(iter(verified.labels), ""),
         "settings": make_paths_relative(stored_settings),
         "files": directory.summary.compute_file_digests(settings_with_files),
         "scene": compute_scene_digest(parts.scene.description),
@@ -554,34 +587,39 @@ def _write_smallest(
     offsets: Floats,
     problem: Problem,
     *,
-    over: bool,
+    has_conditions: bool,
 ) -> Counterexample:
     """Write the smallest form of a counterexample on which the model fails.
 
-    Forms store the offsets more or less finely, the coarsest first. Each is written,
-    read back and tried. The last and finest form is stored whatever the model predicts;
-    the suite's test then decides.
+    Forms store the offsets with different precision. They are tried from the smallest,
+    which is the coarsest: each is written, read back and rendered. The last and finest
+    form is stored whatever the model predicts, since the suite tests it afterwards.
 
     Args:
         base: path of the file without suffix.
         values: content of the file except for the blocks.
         offsets: offsets (d,) from the clean scene.
         problem: the problem of the run.
-        over: whether conditions vary.
+        has_conditions: whether conditions vary.
     """
     block_sizes = [block.size for block in problem.domain.blocks]
     blocks = np.split(offsets, np.cumsum(block_sizes)[:-1])
-    # Small blocks are always stored finely, so all forms would be the same.
+    *coarse_forms, finest_form = FORMS
+    # Small blocks are stored in the same way in all forms.
     has_large_block = max(block_sizes) > MAX_FINE_VALUES
-    *coarse_forms, finest_form = FORMS if has_large_block else FORMS[-1:]
-    trials = count_trials(over=over)
-    if not over:
-        trials *= 2  # one scene is tested twice as often as the suite will test it
-    for signs, square in coarse_forms:
-        example = _write_form(base, values, blocks, signs, square)
-        if _is_wrong_on(example, problem, trials, over=over):
+    if not has_large_block:
+        coarse_forms = []
+    trials = count_trials(has_conditions=has_conditions)
+    if not has_conditions:
+        # Twice as many trials as the suite makes, so that the model will most likely
+        # fail there, too.
+        trials *= 2
+    for stores_signs, square in coarse_forms:
+        example = _write_form(base, values, blocks, stores_signs, square)
+        if _is_wrong_on(example, problem, trials, has_conditions=has_conditions):
             return example
-    return _write_form(base, values, blocks, *finest_form)
+    stores_signs, square = finest_form
+    return _write_form(base, values, blocks, stores_signs, square)
 
 
 def _write_form(
@@ -607,7 +645,10 @@ def _write_form(
 
 
 def _name_counterexample(run: Path) -> str:
-    """Name the counterexample of a run; that of a part begins with the full run's."""
+    """Return the name of the counterexample of a run.
+
+    If the run is a part of another run, the name begins with that of the other run.
+    """
     parent = run.parent.parent
     if run == RunDirectory.locate_part(parent, run.name):
         return _make_name(parent.name, run.name)
@@ -615,7 +656,10 @@ def _name_counterexample(run: Path) -> str:
 
 
 def _make_name(*names: str) -> str:
-    """Return a name for a file: ``mug-texture-001`` of the run ``mug-texture-001``."""
+    """Return a name for a file from names of runs.
+
+    It has small letters, digits and hyphens: ``mug-texture-001``.
+    """
     words = [Path(names[0]).stem, *names[1:]]
     name = re.sub(r"[^a-z0-9]+", "-", "-".join(words).lower()).strip("-")
     return name[:80] or "attack"
@@ -625,7 +669,7 @@ def _make_thumbnail(path: Path) -> bytes:
     """Return a small JPEG of a PNG picture.
 
     Raises:
-        FileFormatError: if the picture is corrupt.
+        FileFormatError: the image is corrupt.
     """
     buffer = io.BytesIO()
     try:
@@ -660,7 +704,7 @@ def _read(path: Path) -> Counterexample:
     """Read a counterexample.
 
     Raises:
-        FileFormatError: if the file is missing or corrupt.
+        FileFormatError: the file is missing or corrupt.
     """
     content, offsets = _read_content(path)
     try:
@@ -683,7 +727,7 @@ def _read_content(path: Path) -> tuple[_File, Floats]:
     """Read the content of a counterexample's file, and its offsets (d,).
 
     Raises:
-        FileFormatError: if the file is missing or corrupt.
+        FileFormatError: the file is missing or corrupt.
     """
     try:
         text = stored_files.read_text(path, "a counterexample", MAX_SIZE)
@@ -703,7 +747,7 @@ def _read_content(path: Path) -> tuple[_File, Floats]:
         ) from None
 
 
-# file of the accepted verdicts of claims that are not held
+# file with the expected verdicts of claims that are not expected to be held
 EXPECTED_FILE = "expected.json"
 
 
@@ -713,7 +757,7 @@ def read_expected(suite: str) -> dict[str, str]:
     The file is optional: without it all claims are expected to be held.
 
     Raises:
-        FileFormatError: if the file is corrupt.
+        FileFormatError: the file is corrupt.
     """
     path = counterexample_directory(suite) / EXPECTED_FILE
     if not path.is_file():
@@ -756,5 +800,5 @@ def write_expected(suite: str, verdicts: Mapping[str, str]) -> list[str]:
 
 
 def varies_conditions(config: SceneConfig) -> bool:
-    """Return whether settings vary conditions."""
+    """Return whether settings vary conditions, such as the light, in each trial."""
     return bool(getattr(config, "over", {}))

@@ -1,4 +1,4 @@
-"""Settings of claims and counterexamples that a run of `test` noted, for `report`."""
+"""Read the settings of claims and counterexamples that a run of `test` has stored."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import Any
 from advsearch.extend import Store
 from advsearch.questions.test.result import Cause, SuiteResult
 
-# note of a run's store with the suite and its seed, so that a resumed run repeats it
+# key of the suite and its seed in the store of a run, so that a resumed run repeats it
 SUITE_NOTE = "suite"
-# note with the settings of counterexamples by name
+# key of the settings of counterexamples by name
 SETTINGS_NOTE = "counterexamples"
 
 
@@ -26,7 +26,7 @@ def read_noted_settings(
 
     Args:
         run: directory of the run.
-        result: result of the run, which tells what was tested.
+        result: result of the run, which states what was tested.
     """
     with Store.open_to_read(run) as store:
         suite = store.read_json_note(SUITE_NOTE)
@@ -37,7 +37,7 @@ def read_noted_settings(
         if claim.cause not in (Cause.COUNTEREXAMPLE_FAILED, Cause.NOT_REACHED)
     }
     settings: dict[str, dict[str, Mapping[str, Any]]] = {}
-    # These are the errors that a corrupt suite raises.
+    # These are the errors that a corrupt suite causes.
     with suppress(KeyError, AttributeError, TypeError, ValueError):
         settings["claim"] = {
             name: values

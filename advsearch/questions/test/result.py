@@ -44,7 +44,7 @@ EXIT_STATUS = {HELD: 0, FAILED: 1, UNDECIDED: 2}
 
 
 class Cause(str, Enum):
-    """Why a claim is undecided other than by its pictures."""
+    """Why a claim is undecided, unless its images are the reason."""
 
     COUNTEREXAMPLE_FAILED = "counterexample failed"
     INTERRUPTED = "interrupted"
@@ -55,43 +55,48 @@ class Cause(str, Enum):
 class ClaimResult(results.Fields):
     """The result of a claim or of a counterexample."""
 
-    name: str = Field(description="in the suite; of a counterexample, its file's")
+    name: str = Field(
+        description="name of the claim in the suite, or of a counterexample's file"
+    )
     kind: str = Field(
         description="`right`, `not_broken`, `no_worse`, `must_change`, "
         "`must_not_change` or `counterexample`"
     )
     statement: str = Field(description="what is claimed, in words")
     verdict: str = Field(description="`held`, `failed` or `undecided`")
-    reason: str = Field(description="why, with the numbers")
+    reason: str = Field(description="reason of the verdict, with numbers")
     expected: str = Field(
-        HELD, description="what it said when `update` was given last; absent for `held`"
+        HELD,
+        description="expected verdict, stored by the last `update`; absent for `held`",
     )
-    pictures: int = Field(0, description="that it took; absent if none")
+    pictures: int = Field(
+        0, description="number of images of the test; absent if there are none"
+    )
     rate: results.JsonFloat | None = results.optional_field(
-        "share of right predictions, or of pictures as claimed; of two models the "
-        "difference; absent of a search"
+        "fraction of right predictions, or of images as claimed; for two models the "
+        "difference of their fractions; absent for a search"
     )
     interval: results.Interval | None = results.optional_field(
-        "of it: each end holds at all times together, at the suite's confidence; of a "
-        "counterexample that "
-        "of Clopper and Pearson, 95 %"
+        "interval of `rate`: each bound is valid at all sample sizes at once, at the "
+        "suite's confidence; for a counterexample, the 95 % interval of Clopper and "
+        "Pearson"
     )
     spp: int | None = results.optional_field(
-        "samples a pixel of the pictures; absent of a search"
+        "samples per pixel of the images; absent for a search"
     )
     picture: str | None = results.optional_field(
-        "a picture that the model gets wrong, in the run's folder"
+        "an image that the model gets wrong: a file in the run's folder"
     )
     part: str | None = results.optional_field(
-        "the run in `parts` that has the search; absent without one"
+        "name of the search among the runs in `parts`; absent if there is no search"
     )
     repeat: str = Field(
-        "", description="the command that repeats it; absent where there is none"
+        "", description="command that repeats the test; absent if there is none"
     )
-    seconds: results.JsonFloat = Field(0.0, description="that it took")
+    seconds: results.JsonFloat = Field(0.0, description="duration of the test")
     cause: Cause | None = results.optional_field(
-        "`counterexample failed`, `interrupted`, `not reached` or `out of time`: why "
-        "it is undecided; absent elsewhere"
+        "why the claim is undecided: `counterexample failed`, `interrupted`, `not "
+        "reached` or `out of time`; absent in all other cases"
     )
 
     @property
@@ -105,23 +110,23 @@ class SuiteResult(views.InNotebook, RunResult):
 
     command: ClassVar[str] = "test"
 
-    suite: str = Field(description="its file")
-    title: str = Field(description="what it is about")
-    object: str = Field(description="of all claims, with commas between them")
+    suite: str = Field(description="path of the suite's file")
+    title: str = Field(description="title of the suite")
+    object: str = Field(description="objects of all claims, separated by commas")
     model: str = Field(description="the model that the claims are about")
     verdict: str = Field(
-        description="`failed` if a claim is that was not expected to be, else "
-        "`undecided` likewise, else `held`"
+        description="`failed` if a claim is unexpectedly failed, else `undecided` if a "
+        "claim is unexpectedly undecided, else `held`"
     )
     confidence: float = Field(
-        description="of each claim that is decided by drawn pictures"
+        description="confidence of each claim that sampled images decide"
     )
     claims: list[ClaimResult]
     added: str | None = results.optional_field(
-        "the file of the counterexample that was added; only with `add`"
+        "file of the counterexample that was added; only with `add`"
     )
     changes: list[str] = Field(
-        [], description="what is expected from now on; only with `update`"
+        [], description="changes of expected verdicts; only with `update`"
     )
     warnings: list[str] = Field(description="sentences that a reader has to know")
 
@@ -153,15 +158,15 @@ def combine_verdicts(claims: list[ClaimResult]) -> str:
 TABLE_HEADS = ("claim", "verdict", "pictures", "why")
 
 READING_NOTE = (
-    "Held and failed are shown at the stated confidence, by one end of an interval, "
-    "each of which holds however often "
-    "it is looked at. A search that finds nothing is no proof."
+    "The verdicts held and failed have the stated confidence. They are decided by one "
+    "bound of an interval, which is valid at all sample sizes at once. A search that "
+    "finds nothing is no proof."
 )
 
 OUT_OF_TIME_REASON = "the time of the suite was over"
 INTERRUPTED_REASON = "it was interrupted"
-NOT_TESTED = "not tried, since a counterexample failed"
-NOT_TESTED_YET = "not tried yet"
+NOT_TESTED = "not tested, since a counterexample failed"
+NOT_TESTED_YET = "not tested yet"
 
 
 def make_view(result: SuiteResult) -> ShownResult:
@@ -180,8 +185,9 @@ def make_view(result: SuiteResult) -> ShownResult:
         )
     ]
     for claim in result.claims:
-        # These were not tested, so there is nothing to tell about them.
-        if claim.verdict == HELD or claim.cause is Cause.COUNTEREXAMPLE_FAILED:
+        # There is no section for a claim that is held, nor for one that was not tested.
+        was_not_tested = claim.cause is Cause.COUNTEREXAMPLE_FAILED
+        if claim.verdict == HELD or was_not_tested:
             continue
         pictures = []
         if claim.picture:
@@ -230,7 +236,7 @@ def describe_claim(claim: AnyClaim, config: SceneConfig) -> str:
     budget = ""
     if isinstance(epsilon, float):
         budget = f" within {wording.format_number(epsilon)}"
-    elif epsilon is not None:  # several, as the text that was set
+    elif epsilon is not None:  # multiple budgets, as a text with commas
         budget = f" within {epsilon}"
     return f"no search finds a picture that {model} gets wrong: {subject}{budget}"
 
@@ -252,10 +258,9 @@ def describe_fraction(
         n_right: number of pictures for which it is true.
         n_pictures: number of all pictures.
         interval: bounds of the fraction, from a confidence sequence: they are valid at
-            all sample sizes together.
-        worst: text about the picture that most contradicts the claim; empty if none
-            does.
-        outcomes: the outcomes of a detector in the other pictures, or empty.
+            all sample sizes at once.
+        worst: text about the image that contradicts the claim most; empty if none does.
+        outcomes: the outcomes of a detector in the other images, or empty.
     """
     reason = "no picture"
     if n_pictures:
@@ -307,7 +312,7 @@ def describe_difference(
 
 
 class SearchVerdict(NamedTuple):
-    """What a search shows about a claim that nothing breaks a model.
+    """What a search shows about the claim that no search breaks a model.
 
     Attributes:
         verdict: HELD, FAILED or UNDECIDED.
@@ -323,20 +328,21 @@ class SearchVerdict(NamedTuple):
 def evaluate_search(
     summary: workbench.AttackSummary, config: AttackConfig
 ) -> SearchVerdict:
-    """Return the verdict of a search about a claim that nothing breaks a model.
+    """Return the verdict of a search on the claim that no search breaks a model.
 
-    The claim fails if the clean scene is wrong already, or a wrong prediction is
-    verified. It is undecided if what was found is wrong in some trials only, or the
-    search is not finished; else it is held.
+    The claim is failed if the model is already wrong on the clean scene, or if a wrong
+    prediction is verified. It is undecided if the scene that was found is wrong only in
+    some trials, or if the search is not finished. Otherwise it is held.
 
     Args:
         summary: summary of the search.
-        config: settings of the search; `steps` is the number that was planned, which is
-            more than were done if the time ended the search.
+        config: settings of the search; `steps` is the planned number of steps. If the
+            time ended the search, fewer steps were made.
     """
     verified = summary.verified
     if summary.ending == "already wrong":
-        return SearchVerdict(FAILED, _clean_reason(summary))
+        return SearchVerdict(FAILED, _describe_wrong_clean(summary))
+    # A search that has found something has verified it.
     if summary.ending == "found" and verified is not None:
         prediction = describe_wrong_prediction(summary.task, verified)
         interval = wording.format_interval(verified.interval)
@@ -349,8 +355,8 @@ def evaluate_search(
         return SearchVerdict(UNDECIDED, INTERRUPTED_REASON, Cause.INTERRUPTED)
     if verified is not None and verified.successes:
         reason = (
-            f"what it found is wrong in {verified.successes} of {verified.trials} "
-            "trials, by noise"
+            f"the scene that it found is wrong in {verified.successes} of "
+            f"{verified.trials} trials: it depends on the noise"
         )
         return SearchVerdict(UNDECIDED, reason)
     max_steps = config.steps
@@ -358,15 +364,17 @@ def evaluate_search(
     if has_time_limit and max_steps is not None and summary.steps < max_steps:
         reason = f"{OUT_OF_TIME_REASON} after {summary.steps} of {max_steps} steps"
         return SearchVerdict(UNDECIDED, reason, Cause.OUT_OF_TIME)
+    # The baseline is a random search with as many renders.
     baseline = "" if summary.baseline is None else ", nor by as many random renders"
     steps = wording.format_count(summary.steps, "step")
     reason = f"not broken by {steps} of {summary.policy}{baseline}; this is no proof"
     return SearchVerdict(HELD, reason)
 
 
-def _clean_reason(summary: workbench.AttackSummary) -> str:
-    """Describe that the model is wrong on the clean scene."""
+def _describe_wrong_clean(summary: workbench.AttackSummary) -> str:
+    """Describe that the model is already wrong on the clean scene."""
     reason = "wrong on the clean scene already"
+    # Trials of the clean scene are the control group of the verification.
     clean_trials = summary.clean.control
     if clean_trials is None:
         return reason
@@ -378,7 +386,10 @@ def _clean_reason(summary: workbench.AttackSummary) -> str:
 
 
 def describe_wrong_prediction(task: str, verified: results.VerifiedRate) -> str:
-    """Return the most frequent wrong prediction, as the end of a sentence."""
+    """Return the most frequent wrong prediction, as the end of a sentence.
+
+    For a detector, return the counts of its outcomes.
+    """
     label = next(iter(verified.labels), "")
     if verified.outcomes:
         return f": {wording.format_outcomes(verified.outcomes, task)}"
@@ -387,7 +398,7 @@ def describe_wrong_prediction(task: str, verified: results.VerifiedRate) -> str:
 
 def describe_unsuitable(error: str) -> str:
     """Describe that a counterexample's settings do not suit the model."""
-    return f"its own settings do not fit to this model: {error}"
+    return f"its own settings do not suit this model: {error}"
 
 
 def describe_trials(
@@ -398,7 +409,7 @@ def describe_trials(
     n_uncounted: int,
     label: str,
     interval: tuple[float, float] | None,
-    over: bool,
+    has_conditions: bool,
     outcomes: str = "",
 ) -> str:
     """Describe why a counterexample is held, failed or undecided.
@@ -406,16 +417,18 @@ def describe_trials(
     Args:
         verdict: HELD, FAILED or UNDECIDED.
         n_right, n_wrong: trials in which the model is right, and in which it is wrong.
-        n_uncounted: trials that do not count, as the object is not visible or, over
-            conditions, the clean scene is predicted wrong.
+        n_uncounted: trials that do not count, because the object is not visible or, if
+            conditions vary, the clean scene is predicted wrong.
         label: the first wrong prediction.
         interval: interval of the fraction of right trials; None if no trial counts.
-        over: whether conditions vary.
+        has_conditions: whether conditions vary.
         outcomes: the outcomes of a detector in the wrong trials, or empty.
     """
     if interval is None:
-        return _describe_uncounted(n_uncounted, over=over)
-    trials = "conditions in which the clean scene is right" if over else "trials"
+        return _describe_uncounted(n_uncounted, has_conditions=has_conditions)
+    trials = (
+        "conditions in which the clean scene is right" if has_conditions else "trials"
+    )
     if not n_wrong:
         interval_text = wording.format_interval(interval)
         reason = f"right in {n_right} of {n_right} {trials} (interval {interval_text})"
@@ -428,26 +441,26 @@ def describe_trials(
         )
         reason += f": {outcomes}" if outcomes else f", {wording.add_article(label)}"
     if verdict == UNDECIDED and n_right and n_wrong:
-        cause = "conditions" if over else "noise"
+        cause = "conditions" if has_conditions else "noise"
         reason += f": it depends on the {cause}"
     if n_uncounted:
         why = "the object is not to be seen"
-        if over:
+        if has_conditions:
             why = "the clean scene is wrong, or the object not to be seen"
         reason += f"; {n_uncounted} more are not counted, as {why}"
     return reason
 
 
-def _describe_uncounted(n_uncounted: int, *, over: bool) -> str:
-    """Describe why a counterexample is undecided of which no trial counts.
+def _describe_uncounted(n_uncounted: int, *, has_conditions: bool) -> str:
+    """Describe why a counterexample is undecided if no trial counts.
 
     Args:
-        n_uncounted: trials that do not count; without any, the time was over.
-        over: whether conditions vary.
+        n_uncounted: number of trials; if it is 0, the time was over before the first.
+        has_conditions: whether conditions vary.
     """
     if not n_uncounted:
         return OUT_OF_TIME_REASON
-    if not over:
+    if not has_conditions:
         return "nothing of the object is to be seen"
     return (
         f"none of {n_uncounted} conditions counts: the clean scene is wrong, "
@@ -473,7 +486,9 @@ def make_table_rows(result: SuiteResult) -> list[list[str]]:
 def describe_suite(result: SuiteResult) -> str:
     """Describe the result of a suite in a sentence."""
     if result.added is not None:
-        return f"Kept as {result.added}."
+        # A counterexample was added, and nothing else was tested.
+        return f"Stored as {result.added}."
+    # claims whose failed or undecided verdict is no worse than expected
     n_expected = sum(
         claim.verdict != HELD and claim.accepted for claim in result.claims
     )
@@ -499,7 +514,7 @@ def list_facts(result: SuiteResult) -> dict[str, str]:
 
 
 def list_claims(result: SuiteResult) -> Iterator[views.Claim]:
-    """Yield what the result of each claim says, for `advsearch report`."""
+    """Yield the result of each claim, for `advsearch report`."""
     for tested in result.claims:
         text = (
             f"{tested.name}: that {tested.statement} is {tested.verdict}: "
@@ -513,8 +528,8 @@ def list_claims(result: SuiteResult) -> Iterator[views.Claim]:
         else:
             confidence = wording.percent(result.confidence)
             text += (
-                f" Each end of the interval is a confidence sequence at {confidence}, "
-                "in place of Clopper-Pearson's."
+                f" Each bound of the interval is a confidence sequence at {confidence} "
+                "and not a bound of Clopper and Pearson."
             )
         yield views.Claim(kind=kind, statement=text, extent=None)
 
@@ -522,18 +537,19 @@ def list_claims(result: SuiteResult) -> Iterator[views.Claim]:
 SARIF_SCHEMA = "https://docs.oasis-open.org/sarif/sarif/v2.1.0/errata01/os/schemas/sarif-schema-2.1.0.json"
 
 KIND_DESCRIPTIONS = {
-    "right": "The model is right in at least a share of the pictures that some "
-    "controls span.",
+    "right": "The model is right in at least a fraction of the images in the ranges of "
+    "some controls.",
     "not_broken": "No search finds a configuration within a budget that the model gets "
     "wrong.",
-    "no_worse": "The model is right at most so many points less often than another "
-    "one, on the same pictures.",
-    "must_change": "The model says something else where there is nothing left to see.",
-    "must_not_change": "The model says the same where a change means nothing.",
+    "no_worse": "The model is right less often than another one by at most some "
+    "percentage points, on the same images.",
+    "must_change": "The prediction changes if the object is not visible any more.",
+    "must_not_change": "The prediction stays the same under a change that does not "
+    "alter the object.",
     "counterexample": "The model is right on the adversarial scene of an earlier "
     "search.",
 }
-"""What a claim of each kind states; the rules of SARIF."""
+"""What a claim of each kind states. The kinds are the rules in SARIF."""
 
 
 def format_junit(result: SuiteResult) -> str:
@@ -574,7 +590,7 @@ def _add_test_case(
     """Add the test case of a claim to a test suite of JUnit.
 
     Args:
-        suite: element of the test suite, which the test case is added to.
+        suite: element of the test suite, to which the test case is added.
         result: result of the full suite.
         claim: result of the claim.
     """
@@ -591,9 +607,9 @@ def _add_test_case(
         output = ElementTree.SubElement(case, "system-out")
         output.text = _escape_xml(f"{claim.statement}\n{claim.reason}")
         return
-    # "error" of a claim without a verdict
+    # An undecided claim is an "error".
     tag = "failure" if claim.verdict == FAILED else "error"
-    if claim.accepted:  # as it was expected to be
+    if claim.accepted:  # its verdict is as expected
         tag = "skipped"
     message = _escape_xml(f"{claim.verdict}: {claim.reason}")
     outcome = ElementTree.SubElement(case, tag, {"message": message})
@@ -687,7 +703,10 @@ def _find_line(name: str, suite_lines: Sequence[str]) -> int:
 
 
 def format_markdown(result: SuiteResult) -> str:
-    """Return a Markdown table of the claims, and commands to repeat those not held."""
+    """Return a Markdown table of the claims.
+
+    It is followed by the commands that repeat the claims that are not held.
+    """
     fact_texts = [
         f"{name} {_escape_markdown(value)}"
         for name, value in list_facts(result).items()

@@ -26,7 +26,7 @@ powers = settings.powers
 
 
 class SuiteConfig(Config):
-    """Settings of `test`: which suite, which of its claims, and on which model."""
+    """Settings of `test`: the suite, the claims that are tested, and the model."""
 
     # fmt: off
     command: ClassVar[str] = "test"
@@ -38,40 +38,40 @@ class SuiteConfig(Config):
     clashes: ClassVar[tuple[settings.Clash, ...]] = (
         *SceneConfig.clashes,
         settings.Clash("fresh", lambda config: config.seed is not None,
-              "draws a seed, and `seed` says one; leave one of the two out"),
+              "samples a seed, and `seed` sets one; leave one of the two out"),
         settings.Clash("update", lambda config: config.add is not None,
-              "renews what claims are expected to say; first `add`, then it"),
+              "updates expected verdicts of claims; run `add` first, then `update`"),
         settings.Clash("only", lambda config: config.add is not None,
-              "names claims, and `add` tries the new counterexample alone; leave one "
+              "names claims, and `add` tests only the new counterexample; leave one "
               "of the two out"),
     )
 
-    suite: str = setting(..., "test", "the claims", "a YAML file")
+    suite: str = setting(..., "test", "file with the claims", "a YAML file")
     only: str | None = setting(
-        None, "test", "claims or counterexamples that are tried, separated by commas; "
-                      "counterexamples: all of these",
+        None, "test", "claims or counterexamples that are tested, separated by commas; "
+                      "`counterexamples` stands for all of these",
         "names in the suite", otherwise="all",
     )
     add: str | None = setting(
-        None, "test", "keep the adversarial scene of this run as a counterexample "
-                      "beside the suite, and try it",
+        None, "test", "store the adversarial scene of this run as a counterexample of "
+                      "the suite, and test it",
         "the name or the folder of a run of attack", otherwise="nothing is added",
         power=powers.describe_suite_change,
     )
     update: bool = setting(
-        False, "test", "expect from now on what the claims say today, and show what "
+        False, "test", "store the verdicts as expected from now on, and report what "
                        "changes", power=powers.describe_suite_change
     )
-    all: bool = setting(False, "test", "go on with the other claims where a "
-                                       "counterexample fails")
-    fresh: bool = setting(False, "test", "draw a new seed, which is told, in place of "
-                                         "the suite's")
+    all: bool = setting(False, "test", "test the claims even if a counterexample fails")
+    fresh: bool = setting(False, "test", "sample a new seed, which is reported, in "
+                                         "place of the suite's")
     seconds: float | None = setting(
-        None, "test", "begin nothing more after this time; what is left is undecided",
-        otherwise="what the suite says, or no limit", unit="seconds", gt=0.0, le=1e9,
+        None, "test", "time after which no further test begins; remaining claims are "
+                      "undecided",
+        otherwise="that of the suite, or no limit", unit="seconds", gt=0.0, le=1e9,
     )
     model: str | None = setting_as_in(
-        SceneConfig, "model", default=None, otherwise="what the suite says, or "
+        SceneConfig, "model", default=None, otherwise="that of the suite, or "
                                                       "reference"
     )
     junit: str | None = setting(
@@ -83,17 +83,18 @@ class SuiteConfig(Config):
         otherwise="none", power=powers.describe_file,
     )
     markdown: str | None = setting(
-        None, "files", "write a Markdown table, for the summary of a job", "a file",
+        None, "files", "write a Markdown table, such as for the summary of a CI job",
+        "a file",
         otherwise="none", power=powers.describe_file,
     )
     seed: int | None = setting_as_in(
-        SceneConfig, "seed", default=None, otherwise="what the suite says, or 0"
+        SceneConfig, "seed", default=None, otherwise="that of the suite, or 0"
     )
     threads: int | None = setting_as_in(SceneConfig, "threads")
     deterministic: bool = setting_as_in(SceneConfig, "deterministic")
     workers: int | None = setting_as_in(
-        AttackConfig, "workers", description="worker processes that share the pictures "
-                                             "of each claim"
+        AttackConfig, "workers", description="worker processes among which the images "
+                                             "of each claim are divided"
     )
     cluster: str | None = setting_as_in(AttackConfig, "cluster")
     twins: str | None = setting_as_in(AttackConfig, "twins", group="test")
@@ -143,18 +144,18 @@ SUITE_ONLY_SETTINGS = (
 )
 """Settings that the suite or its command sets for all claims."""
 
-# default and limit of the pictures of a claim
+# default and maximum number of images of a claim
 DEFAULT_PICTURES = 400
 MAX_PICTURES = 1_000_000
-# stands for all counterexamples; no claim may have this name
+# name that stands for all counterexamples; no claim may have it
 ALL_COUNTEREXAMPLES = "counterexamples"
 Settings = dict[str, object]
 
 EXPECTED_VALUES = {
     "claim": "right, not_broken, no_worse, must_change or must_not_change",
-    "claims": "names with a claim each, such as `right-around: {claim: right, "
+    "claims": "a mapping of names to claims, such as `right-around: {claim: right, "
     "at_least: 0.9}`",
-    "at_least": "a share over 0 and under 1, such as 0.95",
+    "at_least": "a fraction over 0 and under 1, such as 0.95",
     "points": "percentage points over 0 and under 100, such as 2",
     "pictures": f"a whole number from 1 to {MAX_PICTURES}",
     "when": (
@@ -182,7 +183,7 @@ class _YamlModel(BaseModel):
     @field_validator(*NUMBER_FIELDS, mode="before", check_fields=False)
     @classmethod
     def _no_number_from_bool(cls, value: Any, info: Any) -> Any:
-        """Reject true for a number: YAML's `pictures: yes` is a slip, not 1."""
+        """Reject a boolean for a number, such as `pictures: yes` in YAML."""
         if isinstance(value, bool):
             raise ValueError(
                 f"expected {EXPECTED_VALUES[info.field_name]}, got {value}"
@@ -198,7 +199,7 @@ class _Claim(_YamlModel):
 
 
 class _PicturesClaim(_Claim):
-    """A claim that sampled pictures decide, `pictures` of them at most."""
+    """A claim that is decided by at most `pictures` sampled images."""
 
     config_type: ClassVar[type[SceneConfig]] = SampledConfig
     pictures: Annotated[int, Field(ge=1, le=MAX_PICTURES)] = DEFAULT_PICTURES
@@ -212,7 +213,7 @@ class ShareClaim(_PicturesClaim):
     @field_validator("at_least", mode="before")
     @classmethod
     def _per_cent(cls, value: Any) -> Any:
-        """Accept ``95 %``."""
+        """Convert a text such as ``95 %`` to a fraction."""
         if not isinstance(value, str):
             return value
         percentage = re.fullmatch(r"\s*(\d+(?:\.\d+)?) ?%\s*", value)
@@ -226,10 +227,10 @@ class RightClaim(ShareClaim):
 
 
 class MustChangeClaim(ShareClaim):
-    """The prediction changes if nothing of the object is left to see.
+    """The prediction changes if the object is not visible any more.
 
-    A model whose prediction does not change ignores the object. `when` is what is done
-    to the picture, a name of `SweepConfig.blind_changes`.
+    A model whose prediction does not change ignores the object. `when` is the change of
+    the image, one of `SweepConfig.blind_changes`.
     """
 
     claim: Literal["must_change"]
@@ -237,9 +238,9 @@ class MustChangeClaim(ShareClaim):
 
 
 class MustNotChangeClaim(ShareClaim):
-    """The prediction stays the same under a change without meaning.
+    """The prediction stays the same under a change that does not alter the object.
 
-    `when` is a name of `SweepConfig.harmless_changes`.
+    `when` is the change of the image, one of `SweepConfig.harmless_changes`.
     """
 
     claim: Literal["must_not_change"]
@@ -278,12 +279,12 @@ class Suite(_YamlModel):
     """The content of a suite's file.
 
     Attributes:
-        title: what it is about.
+        title: title of the suite.
         settings: settings of all claims, as for `attack`; those of a claim override
             them.
         seed: root of all random numbers.
-        confidence: confidence of each claim that sampled pictures decide.
-        seconds: after which nothing more begins, None for no limit.
+        confidence: confidence of each claim that sampled images decide.
+        seconds: time after which no further test begins; None for no limit.
         claims: claims by name.
     """
 
@@ -318,10 +319,10 @@ class Suite(_YamlModel):
         Args:
             name: name of the claim.
             **changes: settings of the command, which override those of the claim; None
-                leaves them.
+                for a setting that is not changed.
 
         Raises:
-            InputError: if a setting is unknown, impossible, or belongs to the suite.
+            InputError: a setting is unknown, invalid, or belongs to the suite.
         """
         claim = self.claims[name]
         for where, claim_settings in (
@@ -332,8 +333,8 @@ class Suite(_YamlModel):
             for known in claim_settings:
                 if known in SUITE_ONLY_SETTINGS:
                     raise InputError(
-                        f"{where}: {known} is said for the whole suite; leave it out "
-                        "there"
+                        f"{where}: {known} is a setting of the full suite; leave it "
+                        "out there"
                     )
         changed = {key: value for key, value in changes.items() if value is not None}
         merged = {**self.settings, **claim.settings, "seed": self.seed, **changed}
@@ -347,7 +348,7 @@ def read_suite(path: str | Path) -> Suite:
     """Read the suite of a YAML file.
 
     Raises:
-        FileFormatError: if the file describes none.
+        FileFormatError: the file does not describe a suite.
     """
     return parse_suite(settings.read_yaml(path), str(path))
 
@@ -356,7 +357,7 @@ def parse_suite(data: Mapping[str, object], where: str) -> Suite:
     """Parse the content of a suite's file; `where` names the file in messages.
 
     Raises:
-        FileFormatError: with what is missing, unknown, or of another type.
+        FileFormatError: something is missing, unknown, or of another type.
     """
     values = {
         name: value for name, value in data.items() if name not in ("schema", "command")
@@ -365,7 +366,7 @@ def parse_suite(data: Mapping[str, object], where: str) -> Suite:
         return Suite(**values)
     except ValidationError as error:
         problems = error.errors(include_url=False)
-        # a typing error in a name explains other problems, so it is reported first
+        # An unknown name is reported first: a misspelling often causes other problems.
         unknown_names = [
             problem for problem in problems if problem["type"] == "extra_forbidden"
         ]
@@ -381,15 +382,19 @@ def _describe_error(error: Any) -> str:
             "ctx".
     """
     kind = error["type"]
-    # pydantic puts the kind of a claim into its path
+    # The location is a path of names, such as ["claims", "right-around", "at_least"].
+    # pydantic adds the kind of the claim to it, which is left out.
     location = [str(part) for part in error["loc"] if part not in CLAIM_KINDS]
     got = settings.format_value(error["input"])
-    if location[-1] == "[key]":  # a name that is a number
+    # pydantic's location of a wrong key of a mapping ends with "[key]".
+    is_number_as_name = location[-1] == "[key]"
+    if is_number_as_name:
         return (
             f"{location[0]}: expected names of small letters, digits and hyphens, got "
             f"{got}; put it in quotes"
         )
-    if kind.startswith("union_tag"):  # the field `claim`, which tells the kind
+    # The field `claim`, which states the kind of a claim, is missing or wrong.
+    if kind.startswith("union_tag"):
         location.append("claim")
         got = "nothing"
         if kind != "union_tag_not_found":
@@ -403,9 +408,11 @@ def _describe_error(error: Any) -> str:
         return f"{where}: {str(error['msg']).removeprefix('Value error, ')}"
     if kind == "missing":
         got = "nothing"
-    elif kind == "too_short":
+    elif kind == "too_short":  # an empty mapping of claims
         got = "none"
-    return f"{where}: expected {EXPECTED_VALUES.get(name, CLAIM_EXAMPLE)}, got {got}"
+    # Other names are those of claims, at which a claim is expected.
+    expected = EXPECTED_VALUES.get(name, CLAIM_EXAMPLE)
+    return f"{where}: expected {expected}, got {got}"
 
 
 def _describe_unknown_name(name: str, *, in_claim: bool) -> str:

@@ -251,7 +251,7 @@ def test_a_counterexample_is_kept_small_tried_first_and_fails_fast(attacked: Pat
     ],
 )  # fmt: skip
 def test_what_trials_say_of_a_counterexample(right: int, wrong: int, over: bool, verdict: str) -> None:
-    assert decide_trials(right, wrong, over=over) == verdict
+    assert decide_trials(right, wrong, has_conditions=over) == verdict
 
 
 @pytest.mark.medium
