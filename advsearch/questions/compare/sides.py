@@ -181,8 +181,8 @@ def read_sweep_sides(path: Path, *, is_only_sweep: bool) -> Iterator[Side]:
     model_index = rows["step"] % len(models)
     rows["number"] = rows["step"] // len(models)
     rows["correct"] = rows["correct"] == 1
-    is_any_scene = rows["number"] >= 0  # true for all rows
-    scene_masks = [is_any_scene]
+    # A mask selects the rows of one scene. Without an attack it selects all rows.
+    scene_masks = [rows["number"] >= 0]
     if sweep.config.adversarial_of:
         # The second half of the images are of the adversarial scene.
         n_images = sweep.summary.planned // len(models)
