@@ -30,25 +30,29 @@ class PhotographedRendering(results.Fields):
     """What one model predicts of a rendering and of the photographs aligned with it."""
 
     rendering: str = Field(
-        description="its name: the number of a sweep's picture, or "
+        description="name of the rendering: the number of a sweep's picture, or "
         "adversarial, clean, ..."
     )
     model: str
-    label: str = Field(description="what the model predicts of the rendering")
-    rendering_right: bool = Field(description="whether that is right")
+    label: str = Field(description="what the model predicts about the rendering")
+    rendering_right: bool = Field(description="whether that prediction is right")
     photos: int
-    photos_right: int = Field(description="photographs in which the model is right")
+    photos_right: int = Field(
+        description="number of photographs in which the model is right"
+    )
     agreeing: int = Field(
-        description="photographs that are right where the rendering "
-        "is, or wrong where it is"
+        description="number of photographs that are right like the rendering, or wrong "
+        "like it"
     )
     interval: results.Interval = Field(
-        description="95 % Clopper-Pearson interval of the share that agrees"
+        description="95 % Clopper-Pearson interval of the fraction that agrees"
     )
     labels: list[str] = Field(
-        description="what the model predicts of each photograph, in their order"
+        description="what the model predicts about each photograph, in their order"
     )
-    files: list[str] = Field(description="their files in images/photos/, likewise")
+    files: list[str] = Field(
+        description="files of the photographs in images/photos/, in the same order"
+    )
 
 
 class PhotoAgreement(results.Fields):
@@ -70,7 +74,7 @@ class PhotoAgreement(results.Fields):
         description="wrong in the rendering, wrong in the photograph"
     )
     agreement: float | None = Field(
-        description="share of the photographs that agree; null where there are none"
+        description="fraction of the photographs that agree; null without photographs"
     )
     interval: results.Interval | None = Field(
         description="95 % Clopper-Pearson interval of the agreement, as if all "
@@ -213,8 +217,8 @@ def make_align_page(
 
     Args:
         run: name of the run.
-        renderings: names of its renderings, of which the page shows the first.
-        table: counts of agreement, which the page has at its end.
+        renderings: names of its renderings. The page begins with the first.
+        table: counts of agreement, which stand at the end of the page.
         key: key that the server expects with a photograph.
         phone_address: address by which another device opens the page; None if none can.
     """
@@ -233,10 +237,11 @@ def make_align_page(
     data = []
     scripts: tuple[str, ...] = ()
     if renderings:
-        first_rendering = list(renderings[:1])
-        page_data = {"key": key, "names": first_rendering}
+        # The script takes a list, of the renderings to lay over the camera's image.
+        page_data = {"key": key, "names": [renderings[0]]}
         data = [markup.make_data_script(page_data, "photographing")]
         scripts = ("make.js", "align.js")
+    # `connects` lets the script send the photograph to the server.
     return markup.make_document(
         f"{run}, photographs", header, main, data=data, scripts=scripts, connects=True
     )
@@ -245,7 +250,7 @@ def make_align_page(
 def _align_section(renderings: Sequence[str]) -> markup.Html:
     """Return the section with the camera image and a rendering over it.
 
-    Without renderings it tells why there are none. The script of the page fills the
+    Without renderings it states why there are none. The script of the page fills the
     element "align".
     """
     if not renderings:

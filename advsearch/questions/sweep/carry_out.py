@@ -412,10 +412,6 @@ def _check_config(config: SweepConfig) -> None:
                 f"{setting}: expected `run` beside it, the folder that keeps "
                 f"{files}; name one"
             )
-            raise InputError(
-                f"{setting}: expected `run` beside it, the folder that keeps "
-                f"{stored}; name one"
-            )
 
 
 def _run_config(

@@ -986,7 +986,6 @@ def compute_detection_distance(rows: Sequence[AxisRow]) -> DetectionDistance:
     ]
     first = max(indices_beyond_dips, default=0)
     falling = _fit_falling(k[first:], n[first:])  # the fitted fractions
-    is_above_half = bool(falling[-1] >= HALF)  # the last one is the smallest
     falling = _fit_falling(k[first:], n[first:])
     # n images that are all right differ from one half if 2**-n < significance.
     min_images: int | None = math.floor(-math.log2(significance)) + 1
@@ -1004,7 +1003,7 @@ def compute_detection_distance(rows: Sequence[AxisRow]) -> DetectionDistance:
         loose_counts=_count_loose(rows),
         image_counts=tuple(n.tolist()),
         dips=dips,
-        is_above_half=is_above_half,
+        is_above_half=bool(falling[-1] >= HALF),  # the last one is the smallest
     )
 
 
