@@ -477,14 +477,15 @@ class Drives:
         longest_gap = np.array([tracked.gap for tracked in tracked_drives], dtype=float)
         n_frames = len(self.times)
         seconds_bounds = (0.0, n_frames * self._frame_interval)
-        switches_bounds = (0.0, n_frames - 1.0)  # at most one after each frame but one
+
         return TrackRates(
             tracker=str(getattr(tracker, "__name__", type(tracker).__name__)),
             lost=summarize_drives(lost, max, drive_of_value=drive),
             # frames that are lost, but would not be if less overlap were enough
             loose=summarize_drives(lost - lost_loosely, max, drive_of_value=drive),
+            # at most one switch between two frames
             switches=summarize_drives(
-                switches, max, bounds=switches_bounds, drive_of_value=drive
+                switches, max, bounds=(0.0, n_frames - 1.0), drive_of_value=drive
             ),
             longest_gap=summarize_drives(
                 longest_gap * self._frame_interval,
