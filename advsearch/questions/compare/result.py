@@ -21,7 +21,7 @@ class ComparedSide(results.CountedPredictions):
     model: str
     adversarial_run: str = Field(
         default="",
-        description="the run whose adversarial scene was swept; empty for a clean "
+        description="the run whose adversarial scene was swept; absent for a clean "
         "scene",
     )
     seconds: results.JsonFloat = Field(
@@ -39,7 +39,7 @@ class CountOf(results.Fields):
     share: float | None = Field(
         default=None,
         description="fraction of the pairs; where pairs share draws, the mean over draws "
-        "of the fraction in each; null in older runs",
+        "of the fraction in each; absent in older runs",
     )
 
     @property
@@ -60,7 +60,7 @@ class PairCounts(results.Fields):
     shares: tuple[float, float] | None = Field(
         default=None,
         description="accuracy of the first and of the second; where pairs share draws, "
-        "means over draws of the fraction in each; null in older runs",
+        "means over draws of the fraction in each; absent in older runs",
     )
     difference: float = Field(
         description="accuracy of the second minus that of the first"
@@ -129,7 +129,7 @@ class ComparedPair(PairCounts):
     units: int | None = Field(
         default=None,
         description="number of draws of the pairs, such as [drives](drives.md), if some "
-        "pairs share one; null if none do",
+        "pairs share one; absent if none do",
     )
     unit: str = Field(
         default="drive",
