@@ -316,7 +316,8 @@ class SweepSummary(CountedPredictions, RunResult):
     )
     phantoms_out_of_view: int = Field(
         default=0,
-        description="number of these in which a detector still finds the object",
+        description="number of these in which a detector still finds the object; "
+        "absent if there are none",
     )
     not_finite: int = Field(
         description="number of outputs that were not numbers; they do not count as right"
@@ -372,7 +373,7 @@ class SweepSummary(CountedPredictions, RunResult):
     )
     surface: SurfaceMap | None = optional_field(
         "which parts of the [surface](sweeps.md#the-surface), when visible, go with "
-        "wrong predictions; null if not requested"
+        "wrong predictions; absent if not requested"
     )
     shared: results.SharedWork | None = optional_field(
         "the [workers](cluster.md) that shared the work; absent without workers"
