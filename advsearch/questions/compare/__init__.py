@@ -282,13 +282,13 @@ def find_comparison_warnings(sides: Sequence[Side], differ: Sequence[str]) -> li
     if len(differ) > 1:
         names = f"{', '.join(differ[:-1])} and {differ[-1]}"
         warnings.append(
-            f"The sweeps differ in {names}: what is told here is of all of "
-            "that together."
+            f"The sweeps differ in {names}: a difference between the sides may come "
+            "from any of these."
         )
     if not differ:
         warnings.append(
-            "The sweeps have the same settings: what differs is in files, "
-            "in versions, or in the machine."
+            "The sweeps have the same settings: a difference comes from files, "
+            "versions, or the machine."
         )
     rows = sides[0].rows
     # Rows of one unit, such as the frames of one drive, are not independent.
@@ -296,13 +296,12 @@ def find_comparison_warnings(sides: Sequence[Side], differ: Sequence[str]) -> li
     if len(rows) > 1 and is_of_single_unit:
         unit_name = rows.attrs["unit name"]
         warnings.append(
-            f"All pairs are of one {unit_name}: the shares are of this one, and "
-            "nothing is shown of others."
+            f"All pairs are of one {unit_name}: the fractions are those of this one, "
+            "and show nothing about others."
         )
     tasks = {side.sweep.summary.task for side in sides}
     if len(tasks) > 1:
         warnings.append(
-            "What counts as right is judged by different tasks: "
-            f"{', '.join(sorted(tasks))}."
+            f"Different tasks decide what counts as right: {', '.join(sorted(tasks))}."
         )
     return warnings

@@ -275,7 +275,7 @@ def describe_exclusive_pairs(pair: ComparedPair) -> str:
         return "Both are right about the same pictures."
     reservation = ""
     if pair.p > SIGNIFICANCE:
-        reservation = ". That there is a difference is not shown"
+        reservation = ". This does not show a difference"
     p_text = f"= {pair.p:.2g}" if pair.p >= 0.0001 else "< 0.0001"
     # without units, pairs are independent
     test = "exact McNemar test" if pair.units is None else f"by {pair.unit}"

@@ -84,13 +84,13 @@ class PhotoAgreement(results.Fields):
 
 
 MAX_PIXELS = 50_000_000
-"""Limit of a photograph as it is sent; the largest phones take 50 million."""
+"""Maximum number of pixels of a photograph that is sent; phones take up to 50 million."""
 MAX_SIZE = 1024
-"""Longer side, in pixels, of a photograph that is stored."""
+"""Maximum length in pixels of the longer side of a stored photograph."""
 N_NAMED_RENDERINGS = 8
-"""Renderings that the page names, beside the last one."""
+"""Number of renderings that the page names, in addition to the last one."""
 JPEG_QUALITY = 95
-"""Of its JPEG file, 1 to 95."""
+"""Quality of stored photographs, 1 to 95."""
 _NAME = re.compile(r"[0-9]{1,12}|clean|adversarial|verification-[0-9]{2}")
 _PHOTO = re.compile(rf"(?:{_NAME.pattern})-[0-9]{{4,9}}\.jpg")
 
@@ -123,7 +123,7 @@ def list_renderings(run: Path) -> tuple[str, ...]:
 
     Those of an attack are in alphabetical order, but "adversarial" comes first.
     """
-    stored_images = markup.find_thumbnails(run)  # of a sweep
+    stored_images = markup.find_thumbnails(run)  # only a sweep has them
     if stored_images is not None:
         return tuple(map(str, stored_images.numbers))
     names = [
@@ -151,11 +151,11 @@ def sanitize_photo(data: bytes, shape: tuple[int, int]) -> bytes:
 
     Args:
         data: a file in JPEG, PNG or WebP.
-        shape: (width, height) whose aspect ratio it is cut to. The longer side is at
-            most `MAX_SIZE` pixels.
+        shape: (width, height) with the aspect ratio to which the photograph is cropped.
+            The longer side of the result has at most `MAX_SIZE` pixels.
 
     Raises:
-        InputError: it is too large, or no such image.
+        InputError: the data is too large, or no image of these formats.
     """
     if len(data) > markup.MAX_BODY_BYTES:
         raise InputError(
@@ -261,7 +261,7 @@ def _align_section(renderings: Sequence[str]) -> markup.Html:
         return markup.make_element(
             "p", reason, markup.make_element("code", "keep_pictures=all"), "."
         )
-    # the first ones, and the last one
+    # The page names the first renderings, and the last one.
     names = ", ".join(renderings[:N_NAMED_RENDERINGS])
     if len(renderings) > N_NAMED_RENDERINGS:
         names += f", ... {renderings[-1]}"
@@ -377,7 +377,7 @@ def _rendering_table(renderings: Sequence[PhotographedRendering]) -> markup.Html
 def _photographs_cell(rendering: PhotographedRendering) -> markup.Html:
     """Return in how many photographs the model is right, with a link to each.
 
-    The text of a link is what the model predicts of the photograph.
+    The text of a link is what the model predicts about the photograph.
     """
     links = []
     for label, file in zip(rendering.labels, rendering.files, strict=True):

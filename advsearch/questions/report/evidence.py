@@ -390,8 +390,8 @@ def describe_exposure(
             lines.append(_describe_weighted(axis, rows, weights))
         else:
             lines.append(
-                f"Weighted by {axis}: not told, as predictions share draws "
-                "(frames of a drive do)."
+                f"Weighted by {axis}: not computed, as predictions are not independent "
+                "(frames of a drive are not)."
             )
     return lines
 
@@ -582,10 +582,10 @@ RULES = (
     "Each claim is about the run's own model, object, environment, label and settings, "
     "and about nothing else.",
     "`found`: fresh renders confirm a configuration that a search found; how many "
-    "others there are is not known.",
-    "`not found`: a search of so many renders found none; another policy or more "
-    "renders may find one.",
-    "`measured`: a share of what was counted; its interval has 95 % confidence "
+    "others there are is unknown.",
+    "`not found`: a search with the stated number of renders found none; another policy "
+    "or more renders may find one.",
+    "`measured`: a fraction of what was counted; its interval has 95 % confidence "
     "(Clopper-Pearson's; where predictions "
     "share a draw, as frames of a drive do, one over draws, by bets) and holds for the "
     "distribution that was drawn "
@@ -681,10 +681,14 @@ def warn_of_different_models(
 NOT_NOTED = "not noted"
 # name of the environment of a scene with lights of its own
 NO_ENVIRONMENT_MAP = "none"
-NO_CLAIM = "The run carries no claim; it is listed so that it is not left out unseen."
-WEIGHTED = "How common the conditions are is what the weights say, of their axes alone."
+NO_CLAIM = (
+    "The run carries no claim; it is listed so that the list of runs is complete."
+)
+WEIGHTED = (
+    "How common the conditions are is stated by the weights, for their axes only."
+)
 NOT_WEIGHTED = (
-    "Nothing is said of how common the conditions are: no weights were given."
+    "Nothing is stated about how common the conditions are: no weights were given."
 )
 
 
@@ -1353,7 +1357,7 @@ def _describe_limits(
     lines = [f"{photographed} compared with renderings: all else is about renderings."]
     fixed = [name for name, part in domain.items() if part.variation is Variation.FIXED]
     if fixed:
-        lines.append(f"Nothing is said of other values of: {', '.join(fixed)}.")
+        lines.append(f"Nothing is shown about other values of: {', '.join(fixed)}.")
     lines.append(WEIGHTED if is_weighted else NOT_WEIGHTED)
     return lines
 
@@ -1367,7 +1371,7 @@ def _describe_searched_by_claims(
         claims: the settings of each claim by its name; None if they cannot be read.
     """
     if claims is None:
-        return ["as the claims of its suite say, which cannot be read any more"]
+        return ["what the claims of its suite state, which cannot be read any more"]
     names_of_line = defaultdict[str, list[str]](list)
     for name, claim_settings in claims.items():
         controls = claim_settings.get("controls") or {}

@@ -251,8 +251,8 @@ READING = (
     "How often it is right at each value, over all others, with the 95 % interval:"
 )
 BAR_LENGTH = 20  # number of characters
-# A text lists an axis with at most so many values. Of a longer axis it lists half as
-# many: those where the model is right least often.
+# A text lists all values of an axis up to this number. Of a longer axis it lists half
+# this number: the values where the model is right least often.
 # values of an axis that a text lists; of more, half as many: those where the model is
 # worst
 MAX_TEXT_ROWS = 24
@@ -280,7 +280,7 @@ AXIS_COLUMNS: dict[str, Column] = {
     "accuracy": lambda row: percent(row.accuracy),
     "95 % interval": lambda row: wording.format_interval(row.interval),
 }
-CHANGES_TITLE = "Shown again, changed:"
+CHANGES_TITLE = "Predictions about changed pictures:"
 CHANGE_COLUMNS: dict[str, Column] = {
     "model": "{0.model}",
     "what it says": lambda rates: rates.claim.replace("_", " "),
@@ -486,7 +486,7 @@ def _make_surface_parts(surface: SurfaceMap) -> Iterator[ResultPart]:
     for table in surface.tables:
         if table.strongest:
             names = f"{shorten_name(table.object)}, {shorten_name(table.model)}"
-            title = f"{names}: the {table.part}s that are told most clearly"
+            title = f"{names}: the {table.part}s with the clearest difference"
             yield ResultPart.make_table(
                 table.strongest, SURFACE_COLUMNS, title=title, folded=True
             )
@@ -636,17 +636,17 @@ def _describe_population(result: SweepSummary) -> tuple[str, str]:
         if result.drives:
             population = _name_frames(result.drives)
         note = (
-            " How these were chosen is not known; the interval takes them as a sample."
+            " How these were selected is unknown; the interval takes them as a sample."
         )
     elif not is_sampled:
         population = "points of the grid"
         if result.drives:
             frames = _name_frames(result.drives)
-            population = f"{frames}, whose ways and moments are given"
+            population = f"{frames}, whose paths and times were selected"
         note = (
-            " Nothing is said of what lies between or beside these points, and another "
-            "grid gives another share; the "
-            "interval takes them as a sample."
+            " This states nothing about what lies between or outside of these points, "
+            "and another grid gives another fraction; the interval takes the points as "
+            "a sample."
         )
     elif result.drives:
         # The frames are the grid; what else differs between drives is sampled.
@@ -663,7 +663,7 @@ def _describe_population(result: SweepSummary) -> tuple[str, str]:
             population += " at each point of a grid"
         note = " The interval is that of independent draws, which these are not."
     else:
-        population = "configurations drawn by chance from the ranges that are named"
+        population = "configurations drawn at random from the stated ranges"
         note = ""
     return population, note
 

@@ -431,8 +431,7 @@ def _make_sight(
             depths; None if it is unknown.
         model_size: (height, width) of the result.
     """
-    from advsearch.extend import tasks  # imports torch
-    from advsearch.extend import tasks
+    from advsearch.extend import tasks  # loads the tasks only when one is needed
 
     def scale(values: Tensor) -> Tensor:
         """Scale values of pixels (h, w) to the model's size, by the nearest pixel."""
