@@ -403,8 +403,7 @@ def _add_prediction(
     judgement = evaluator.evaluate(rendering, object_name, cut_photo)
     row = workbench.add_judgement(row, judgement)
     # The payload of the prediction, such as boxes, becomes a part of the row's payload.
-    payload = {"photo": dict(stored_photo), "answer": row.payload}
-    return replace(row, payload=payload)
+    return replace(row, payload={"photo": dict(stored_photo), "answer": row.payload})
 
 
 @dataclass(frozen=True)

@@ -136,14 +136,16 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
         InputError, UnknownNameError: the name or the values cannot be used.
     """
     where = f"`grid` {name}"
-    # An instance may stand on either side: KIND:INSTANCE.PARAMETER, or
-    # KIND.PARAMETER:INSTANCE. `rest` is what follows the first dot.
+    # An instance may follow the kind, as in KIND:INSTANCE.PARAMETER, or the parameter,
+    # as in KIND.PARAMETER:INSTANCE.
     control_name, _, rest = name.partition(".")
-    kind, first_colon, first_instance = control_name.partition(":")
-    parameter_name, last_colon, last_instance = rest.partition(":")
+    kind, kind_colon, kind_instance = control_name.partition(":")
+    parameter_name, parameter_colon, parameter_instance = rest.partition(":")
     instance = control_name
     if control_name not in instances:
-        instance = families.make_instance_name(kind, last_instance or first_instance)
+        instance = families.make_instance_name(
+            kind, parameter_instance or kind_instance
+        )
     # Names such as "model" are settings and no controls.
     if name in _LISTED_SETTINGS:
         raise InputError(
@@ -162,7 +164,7 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
         )
     # A colon without a name after it is rejected.
     families.check_instance_name(
-        where, last_instance or first_instance, last_colon or first_colon
+        where, parameter_instance or kind_instance, parameter_colon or kind_colon
     )
     if parameter_name not in parameters:
         raise UnknownNameError(
@@ -473,6 +475,7 @@ def add_grid_axes(
         scene: the scene, which decides the default ranges of a control.
     """
     control_by_name = {control.name: control for control in controls}
+    # Axes of one control have the same `instance`, the name of that control.
     for instance in dict.fromkeys(axis.instance for axis in axes):
         instance_axes = [axis for axis in axes if axis.instance == instance]
         sampled = control_by_name.get(instance)
@@ -943,8 +946,8 @@ class Points:
             # a uniform number of exactly 1 belongs to the last option
             option = np.minimum(np.floor(uniform * block.options), block.options - 1)
             return np.asarray((option + 0.5) / block.options)
-        is_box = block.norm != "l2" or block.epsilon is None
-        if is_box:
+        # Only a ball has an epsilon; the type checker needs the second condition.
+        if block.norm != "l2" or block.epsilon is None:
             lower = self._lower[sampled.coordinates].astype(np.float64)
             upper = self._upper[sampled.coordinates].astype(np.float64)
             return np.asarray(lower + (upper - lower) * uniform)
