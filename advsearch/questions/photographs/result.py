@@ -1,11 +1,11 @@
 """The table of agreement between renderings and photographs, and its page.
 
-A rendering is named as its file is: a sweep's by the number of its picture, an attack's
-``adversarial``, ``clean`` or ``verification-00``. A photograph comes from a browser, so
-it is not trusted: its size is checked before it is decoded, it is cut to the
-rendering's shape, and written again without metadata (coordinates, names of cameras).
-The page lays a rendering, translucent or its edges, over the camera's picture, after
-the phone app of 3DB (Leclerc et al. 2021, appendix D).
+A rendering has the name of its file: the number of a picture for a sweep, or
+``adversarial``, ``clean`` or ``verification-00`` for an attack. A photograph comes from
+a browser, so it is not trusted: its size is checked before it is decoded, it is cropped
+to the aspect ratio of the rendering, and written again without metadata (coordinates,
+names of cameras). The page lays a rendering, translucent or its edges, over the
+camera's picture, as the phone app of 3DB does (Leclerc et al. 2021, appendix D).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ LOOSE_PHOTO = "loose photo"
 
 
 class PhotographedRendering(results.Fields):
-    """What one model predicts of a rendering and of the photographs aligned with it."""
+    """Predictions of a model about a rendering and the photographs aligned with it."""
 
     rendering: str = Field(
         description="name of the rendering: the number of a sweep's picture, or "

@@ -444,7 +444,21 @@ Cells = Mapping[str, Sequence[ClusteredFraction]]
 
 
 class RatesOptions(Options):
-    """Options of a figure of rates; docs/recipes.md describes them."""
+    """Options of a figure of rates; see docs/recipes.md.
+
+    Attributes:
+        by: column whose values have a row each.
+        series: column whose values have a bar or a line each; None for none.
+        form: what is drawn.
+        bins: number of bins of a numeric column; None for a row of each value.
+        range: range of the bins; None takes that of the values.
+        names: names in the figure, by value.
+        wrong: whether wrong predictions are counted instead of right ones.
+        beside: part that all others are compared with; None for none.
+        away_from: value whose distance from the column's is used instead; None uses the
+            column itself.
+        turn: period of the values, such as 360 degrees; None for none.
+    """
 
     by: str
     series: str | None = None
@@ -459,7 +473,10 @@ class RatesOptions(Options):
 
     @property
     def required_parts(self) -> tuple[str, ...]:
-        """The parts of the recipe that the figure needs; empty for all."""
+        """The parts of the recipe that the figure needs; empty for all.
+
+        The part `beside` is needed in addition to those in `of`.
+        """
         if self.beside and self.of:
             return (*self.of, self.beside)
         return self.of

@@ -249,7 +249,7 @@ def _find_attack_run(
     """Return the run of an attack.
 
     Raises:
-        InputError: the attack was not kept in a run directory.
+        InputError: the attack was not stored in a run directory.
     """
     if not isinstance(adversarial_of, AttackResult):
         return adversarial_of

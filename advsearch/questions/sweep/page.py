@@ -208,7 +208,7 @@ def _describe_images(
 ) -> tuple[JsonObject, Html | None]:
     """Describe for the explorer where the thumbnails of a sweep are.
 
-    They are in a folder beside the page, or embedded in it. A page embeds only as many
+    They are in a folder next to the page, or embedded in it. A page embeds only as many
     as fit.
 
     Args:

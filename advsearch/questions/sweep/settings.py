@@ -94,7 +94,7 @@ class SweepConfig(SceneConfig):
     model: str = setting_as_in(
         SceneConfig,
         "model",
-        description="the network under test; several, separated by commas, are shown "
+        description="the network under test; several, separated by commas, are run on "
         "the same pictures",
     )
     grid: Grid = setting(

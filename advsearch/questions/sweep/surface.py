@@ -187,7 +187,7 @@ def _compute_comparison(counts: PartCounts, parts: Int64Array) -> Float64Array:
     k = counts.wrong_counts[parts]
     n = counts.visible_counts[parts]
     k = counts.wrong_counts[parts]
-    difference, low, high = _compute_newcombe_interval(
+    difference, low, high = _compare_rates(
         k, n, other_k=counts.n_failures - k, other_n=counts.n_images - n
     )
     share_draws = counts.permuted_failures is not None
@@ -266,7 +266,7 @@ def _compute_likelihood_ratio(
     return np.asarray(2.0 * log_ratio)
 
 
-def _compute_newcombe_interval(
+def _compare_rates(
     k: Int64Array, n: Int64Array, other_k: Int64Array, other_n: Int64Array
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Compute the difference k/n - other_k/other_n with its 95 % interval.
