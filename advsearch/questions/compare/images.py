@@ -48,7 +48,6 @@ class PairImages:
         """Yield pairs in which only one prediction is right, largest differences first.
 
         The difference is that of the margins. The setting `pictures` limits the number
-        of pairs in favor of each side. Their images are stored in the run. If one image
         of pairs in favor of each side. Their images are stored in the run. A pair whose
         images could not all be stored is yielded without images.
 

@@ -222,7 +222,7 @@ def make_compare_view(result: CompareResult) -> ShownResult:
         "time a prediction": lambda side: format_prediction_time(side.seconds),
     }
     # Only detectors have outcomes of wrong predictions, such as "missed".
-    # Only detectors have outcomes, such as "missed".
+
     if any(side.outcomes for side in result.sides):
         columns["the others"] = lambda side: wording.format_outcomes(
             side.outcomes, result.task

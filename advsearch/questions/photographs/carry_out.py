@@ -470,7 +470,6 @@ class _PhotoEvaluator:
             InputError: the results have no row of a sweep's rendering.
         """
         is_of_sweep = rendering.isdecimal()
-        is_of_sweep = rendering.isdecimal()
         if is_of_sweep:
             # Rows are numbered by image, then by model.
             step = int(rendering) * self.n_models + self.index

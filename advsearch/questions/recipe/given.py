@@ -812,7 +812,6 @@ def _compare_margins(margins: Mapping[str, Float64Array]) -> str:
     """Describe for which ingredient the mean margin is smallest, and for which largest.
 
     The margin is by how much the right label leads the next one. The two ingredients
-    The margin is by how much the right label leads the next one. The two ingredients
     were selected as extremes among all, so their intervals are widened (Bonferroni)
     before they are compared.
 

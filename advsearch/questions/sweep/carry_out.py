@@ -166,12 +166,7 @@ def sweep(
     default_model = defaults.get("model", "reference")
     networks = _make_list(default_model if model is None else model)
     controls = controls or defaults.get("controls", ())
-    # A task that is passed as "classification" cannot be distinguished from the
-    # default: it is replaced by that of the attack, too.
-    if task == "classification":
-        task = defaults.get("task", task)
-    if callable(task):  # a function, not a `Task`
-        task = make_task(task)
+    task = _resolve_task(task, defaults)
     loaded = _name_loaded_scenes(scenes)
     set_options = _drop_unset(settings)
     # The settings as `run.yaml` states them, with names in place of objects.
@@ -206,6 +201,20 @@ def sweep(
         tracker=tracker,
         progress=progress,
     )
+
+
+def _resolve_task(task: AnyTask, defaults: Mapping[str, Any]) -> AnyTask:
+    """Return the task to use; a function is made a `Task`.
+
+    Args:
+        task: task as the caller passed it.
+        defaults: settings of the attack; empty without one.
+    """
+    # A task that is passed as "classification" cannot be distinguished from the
+    # default: it is replaced by that of the attack, too.
+    if task == "classification":
+        task = defaults.get("task", task)
+    return make_task(task) if callable(task) else task
 
 
 def _drop_unset(settings: Mapping[str, object]) -> dict[str, Any]:

@@ -1,7 +1,6 @@
 """The view and the claims of the result of `sweep`.
 
 The *detection distance* of an object is the distance at which half of a sweep's images
-The *detection distance* of an object is the distance at which half of a sweep's images
 are detected: where a falling line through the fractions (isotonic regression, Ayer et
 al. 1955, linear in the logarithm of the distance) crosses one half. Its interval is
 exact: each of m fractions is compared with one half by the binomial test at 0.025 / m
@@ -938,8 +937,6 @@ def find_detection_distance(summary: SweepSummary) -> DetectionDistance | None:
     # A task may have options, as in "detection=..."
     task_name = summary.task.partition("=")[0]
     is_detection = task_name == "detection"
-    rows = [row for row in summary.axes if row.axis == DISTANCE and row.configurations]
-    is_detection = summary.task.partition("=")[0] == "detection"
     # names of several objects or models stand with commas
     is_single = "," not in summary.object and "," not in summary.model
     is_comparison = summary.arms is not None
@@ -979,14 +976,8 @@ def compute_detection_distance(rows: Sequence[AxisRow]) -> DetectionDistance:
     significance = 0.025 / len(rows)
     low, high = _bound_distance(np.array(distances), k, n, significance)
     dips = find_dips(distances, k, n)
-    # The line is fitted to the distances beyond the last significant dip: nearer ones
-    # contradict a falling line.
-    indices_beyond_dips = [
-        distances.index(dip.distance) + 1 for dip in dips if dip.is_significant
-    ]
-    first = max(indices_beyond_dips, default=0)
+    first = _find_first_beyond_dips(distances, dips)
     falling = _fit_falling(k[first:], n[first:])  # the fitted fractions
-    falling = _fit_falling(k[first:], n[first:])
     # n images that are all right differ from one half if 2**-n < significance.
     min_images: int | None = math.floor(-math.log2(significance)) + 1
     if (n >= min_images).any():
@@ -1005,6 +996,18 @@ def compute_detection_distance(rows: Sequence[AxisRow]) -> DetectionDistance:
         dips=dips,
         is_above_half=bool(falling[-1] >= HALF),  # the last one is the smallest
     )
+
+
+def _find_first_beyond_dips(distances: Sequence[float], dips: Sequence[Dip]) -> int:
+    """Return the index of the first distance beyond the last significant dip.
+
+    The falling line is fitted from there on, since nearer distances contradict it. It
+    is 0 without a significant dip.
+    """
+    indices_beyond_dips = [
+        distances.index(dip.distance) + 1 for dip in dips if dip.is_significant
+    ]
+    return max(indices_beyond_dips, default=0)
 
 
 def _bound_distance(
@@ -1144,7 +1147,6 @@ def _interval_clause(estimate: DetectionDistance, unit: str) -> str:
     elif high is not None:
         bounds = f"at most {high} {unit}"
     else:
-        bounds = "no bound"
         bounds = "no bound"
     clause = f"{bounds} with 95 % confidence"
     if estimate.min_images is not None:

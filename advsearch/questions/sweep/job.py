@@ -250,11 +250,10 @@ class Job:
         Controls that the adversarial configuration of the scene fixes are left out.
 
         Args:
+            scene: index of the scene.
             model: index of the model.
             environment: name of the environment that replaces that of the scene; None
                 if the scene keeps its own.
-            model: index of the model.
-            environment: name of the environment that replaces that of the scene.
             values: values of the controls.
         """
         named_scene = self.scenes[scene]

@@ -282,7 +282,6 @@ class Sweep:
         # Thumbnails are of the first model's images.
         height, width = self.job.image_sizes[0]
         # A thumbnail is at most THUMBNAIL_SIZE wide and high, and never enlarged.
-        # A thumbnail is at most THUMBNAIL_SIZE wide and high, and never enlarged.
         scale = min(1.0, thumbnails.THUMBNAIL_SIZE / max(height, width))
         n_pixels = scale**2 * height * width
         size_fraction = n_pixels / thumbnails.THUMBNAIL_SIZE**2

@@ -185,8 +185,6 @@ def _compute_comparison(counts: PartCounts, parts: Int64Array) -> Float64Array:
     """
     n = counts.visible_counts[parts]
     k = counts.wrong_counts[parts]
-    n = counts.visible_counts[parts]
-    k = counts.wrong_counts[parts]
     difference, low, high = _compare_rates(
         k, n, other_k=counts.n_failures - k, other_n=counts.n_images - n
     )
@@ -906,9 +904,7 @@ def _draw_panels(panels: Sequence[Panel], figure: Any) -> None:
         len(panels), 2, squeeze=False, width_ratios=(1.0, VIEWS_WIDTH)
     )
     for (map_axes, view_axes), panel in zip(axes, panels, strict=True):
-        is_grey = np.isnan(panel.difference)[:, None]
-        scale_colors = scale.to_rgba(panel.difference)[:, :3]
-        cell_colors = np.where(is_grey, panel.grey_colors, scale_colors)
+        cell_colors = _color_cells(panel, scale)
         map_axes.imshow(
             # Row 0 of the cells is at v = 1, the top of the image.
             cell_colors.reshape(MAP_SIZE, MAP_SIZE, 3),
@@ -930,6 +926,18 @@ def _draw_panels(panels: Sequence[Panel], figure: Any) -> None:
         for color, label in GREY_LABELS.items()
     ]
     figure.legend(handles=patches, loc="outside lower center", ncols=2)
+
+
+def _color_cells(panel: Panel, scale: Any) -> Float64Array:
+    """Return the color (cells, 3) of each cell of a map.
+
+    Args:
+        panel: panel of the figure; cells without a significant difference are gray.
+        scale: matplotlib's map from differences to colors.
+    """
+    is_grey = np.isnan(panel.difference)[:, None]
+    scale_colors = scale.to_rgba(panel.difference)[:, :3]
+    return np.where(is_grey, panel.grey_colors, scale_colors)
 
 
 def _find_scale_limit(panels: Sequence[Panel]) -> float:
