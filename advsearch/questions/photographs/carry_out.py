@@ -292,7 +292,6 @@ class Photographs:
             rendering: name of the rendering that it was aligned with, if any.
             data: the image file.
             source: name of the file that it came from; empty if a browser sent it.
-            source: name of the file that it came from; empty if a browser sent it.
         """
         if rendering is None:
             self._add_loose(run, data, source)

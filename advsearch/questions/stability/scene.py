@@ -464,7 +464,6 @@ def measure_inward_slope(
     Returns:
         The derivative from the gradient, and the derivative from one-sided finite
         differences of second order, since a bound has no other side.
-        since a bound has no other side.
     """
     linear = renderer.copy_with(transfer="linear")
     u = renderer.start

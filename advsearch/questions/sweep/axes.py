@@ -536,7 +536,6 @@ class SampledNumber:
         same_in_all_scenes: whether `parts` are the same in every scene.
         part_of_bin: for each bin the index of its part, if options have weights; else
             empty, and each part has one bin.
-            else empty.
     """
 
     name: str

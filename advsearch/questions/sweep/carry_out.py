@@ -758,7 +758,6 @@ def _load_models_and_tasks(
     shared_task = make_task(task)
     _check_distinct_names([get_model_name(model) for model in models])
     networks, warnings = load_models(models, shared_task, config)
-    # A file or a function may return a model that has the name of another one.
     # Several files or functions may return models of the same name.
     _check_distinct_names([network.name for network in networks])
     scenes = [named_scene.scene for named_scene in named_scenes]

@@ -252,8 +252,6 @@ READING = (
 BAR_LENGTH = 20  # number of characters
 # A text lists all values of an axis up to this number. Of a longer axis it lists half
 # this number: the values where the model is right least often.
-# values of an axis that a text lists; of more, half as many: those where the model is
-# worst
 MAX_TEXT_ROWS = 24
 # number of values up to which a page lists an axis as a table
 MAX_PAGE_ROWS = 96

@@ -181,8 +181,8 @@ class Job:
 
         Returns:
             The queries by ascending number, each as (name of the problem, None, query).
-            The problem's name is the scene's number. A work item may name a
-            configuration in place of None; here the query has it.
+            The problem's name is the scene's number. None is in place of the
+            configuration, which the query has.
         """
         scene = numbers.start // self.images_per_scene
         images_before = scene * self.images_per_scene  # those of the scenes before
@@ -595,7 +595,7 @@ class SweptScene:
         images = {
             size: self._make_images(size, queries) for size in self.points_of_size
         }
-        judgements = self._evaluate_judgements(queries, images)
+        judgements = self._make_judgements(queries, images)
         # queries are numbered by image, then by model
         wrong_images = {
             row_number // n_models
@@ -658,7 +658,7 @@ class SweptScene:
             evaluations.append(evaluation)
         return evaluations
 
-    def _evaluate_judgements(
+    def _make_judgements(
         self,
         queries: Sequence[Query],
         images: Mapping[ImageSize, Mapping[int, SweptImage]],
@@ -744,7 +744,6 @@ class SweptScene:
             size: (height, width) of its images.
             queries: n queries.
             images: (n, H, W, 3) images of the queries.
-            images: (n, H, W, 3).
             judgements: judgements of the unchanged images.
         """
         judgements = list(judgements)
