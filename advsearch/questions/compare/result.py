@@ -38,8 +38,8 @@ class CountOf(results.Fields):
     interval: results.Interval = Field(description="95 % interval of the fraction")
     share: float | None = Field(
         default=None,
-        description="fraction of the pairs; where pairs share draws, the mean over draws "
-        "of the fraction in each; absent in older runs",
+        description="fraction of the pairs; where pairs share draws, the mean over "
+        "draws of the fraction in each; absent in older runs",
     )
 
     @property
@@ -128,8 +128,8 @@ class ComparedPair(PairCounts):
     second: str = Field(description="name of the second side")
     units: int | None = Field(
         default=None,
-        description="number of draws of the pairs, such as [drives](drives.md), if some "
-        "pairs share one; absent if none do",
+        description="number of draws of the pairs, such as [drives](drives.md), if "
+        "some pairs share one; absent if none do",
     )
     unit: str = Field(
         default="drive",
@@ -147,8 +147,8 @@ class ComparedPair(PairCounts):
         description="rules where only the second is right; null if not searched for"
     )
     parts: list[PairPart] = Field(
-        description="counts by the values of each parameter, whose ranges are divided as "
-        "in the sweep's tables"
+        description="counts by the values of each parameter, whose ranges are divided "
+        "as in the sweep's tables"
     )
     discordant_pictures: list[PairPicture] = Field(
         description="pairs that only one side gets right, largest difference of the "

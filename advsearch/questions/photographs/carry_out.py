@@ -475,8 +475,8 @@ class _PhotoEvaluator:
             row = store.read_row("sweep", step)
             if row is not None:
                 return bool(row.correct), row.label or "", row.values
-        # A sweep stores its renderings as JPEG, an attack as PNG. So this is a rendering
-        # of a sweep without a row.
+        # A sweep stores its renderings as JPEG, an attack as PNG. So this is a
+        # rendering of a sweep without a row.
         if file.suffix != ".png":
             raise InputError(
                 f"rendering: the results have no row for {file.stem}; it "

@@ -84,7 +84,7 @@ class PhotoAgreement(results.Fields):
 
 
 MAX_PIXELS = 50_000_000
-"""Maximum number of pixels of a photograph that is sent; phones take up to 50 million."""
+"""Maximum number of pixels of a photograph; those of phones have up to 50 million."""
 MAX_SIZE = 1024
 """Maximum length in pixels of the longer side of a stored photograph."""
 N_NAMED_RENDERINGS = 8

@@ -71,8 +71,8 @@ FIGURES: Mapping[str, tuple[type[Options], Any]] = {
 """The options of each kind of figure, and the function that makes the figure."""
 
 COMPARES_MODELS = ("agreement", "scaling", "surface")
-"""Kinds of figures that show all models together. Of other kinds there is one figure for
-each model.
+"""Kinds of figures that show all models together. Of other kinds there is one figure
+for each model.
 """
 
 # options of figures that name columns

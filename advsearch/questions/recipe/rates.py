@@ -725,7 +725,7 @@ def _describe_series(
 
 
 def _describe_mean_errors(cells: Cells, models: Sequence[str]) -> Iterator[str]:
-    """Yield a sentence with the mean corruption error (mCE) of each model but the first.
+    """Yield the mean corruption error (mCE) of each model but the first, as sentences.
 
     That is the mean over rows of the model's error divided by the first model's. Rows
     in which the first model has no errors are left out.

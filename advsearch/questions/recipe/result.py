@@ -49,7 +49,9 @@ class RecipeConfig(Config):
         ..., "recipe", "the experiment to run",
         "the name of a recipe, which advsearch recipe list shows, or a YAML file",
     )
-    quick: bool = setting(False, "recipe", "use few and small pictures, for a first look")
+    quick: bool = setting(
+        False, "recipe", "use few and small pictures, for a first look"
+    )
     photographs: str | None = setting(
         None, "recipe", "photographs to compare with renderings, in a folder for each "
                         "object, named after it", "a folder",

@@ -188,7 +188,7 @@ def _has_value(value: float | str, axis_value: workbench.AxisValue) -> bool:
 
 
 def list_triggering_conditions(result: results.Result) -> list[str]:
-    """Return the rules under which the model is wrong more often, if the result has any."""
+    """Return the rules, if any, under which the model is wrong more often."""
     triggering = workbench.get_experiment(result.command).triggering
     return [] if triggering is None else list(triggering(result))
 
@@ -583,8 +583,8 @@ RULES = (
     "and about nothing else.",
     "`found`: fresh renders confirm a configuration that a search found; how many "
     "others there are is unknown.",
-    "`not found`: a search with the stated number of renders found none; another policy "
-    "or more renders may find one.",
+    "`not found`: a search with the stated number of renders found none; another "
+    "policy or more renders may find one.",
     "`measured`: a fraction of what was counted; its interval has 95 % confidence "
     "(Clopper-Pearson's; where predictions "
     "share a draw, as frames of a drive do, one over draws, by bets) and holds for the "

@@ -57,8 +57,8 @@ class EvidenceRun(results.Fields):
         "photographs that agree with their rendering; absent without photographs",
     )
     twins: results.TwinEvidence | None = results.optional_field(
-        "how far the verdict holds for photographs, from a run of twins; absent without "
-        "one"
+        "how far the verdict holds for photographs, from a run of twins; absent "
+        "without one"
     )
     domain: dict[str, str] = Field(
         {}, description="the operational design domain in words, by its parts"

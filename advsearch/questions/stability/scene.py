@@ -1,5 +1,5 @@
-"""Small scenes for cases: an image, its gradient compared with finite differences, and a
-search.
+"""Small scenes for cases: an image, its gradient compared with finite differences, and
+a search.
 """
 
 from __future__ import annotations
@@ -40,7 +40,8 @@ SPP = 8
 REFERENCE_SPP = 64
 # maximum relative error of the mean of a gradient that its noise does not explain
 MAX_GRADIENT_ERROR = 0.1
-# maximum noise of a comparison, as a fraction of the derivative; with more it is useless
+# maximum noise of a comparison, as a fraction of the derivative; with more it is
+# useless
 MAX_NOISE = 0.4
 # logits of the searched model per unit of the linear loss
 LOGIT_SCALE = 20.0

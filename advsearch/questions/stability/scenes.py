@@ -1,4 +1,4 @@
-"""Cases of scenes that break naive code: light, surfaces, meshes, positions and views."""
+"""Cases of scenes that break naive code: light, surfaces, meshes, poses and views."""
 
 from __future__ import annotations
 
@@ -719,8 +719,8 @@ register_cases(
 def million() -> CaseOutcome:
     """Finite, right, and like the coarse mesh of the same shape.
 
-    The mesh is a sphere of a million triangles. `check_scene` checks the gradient by its
-    texture; the gradient by a shift has to be finite.
+    The mesh is a sphere of a million triangles. `check_scene` checks the gradient by
+    its texture; the gradient by a shift has to be finite.
     """
     # 1000 columns and 501 rows give about 2 * 1000 * 500 triangles.
     fine_mesh = assets.normalise_mesh(workbench.make_sphere(501, 1000))
@@ -913,8 +913,8 @@ def select_cases(names: Sequence[str] = (), groups: Sequence[str] = ()) -> list[
 
 # ---- Controls whose scales differ by a million, and noise
 # A search works in the unit box, so that units of controls do not matter. What matters
-# is how strongly the objective depends on each value there: its curvatures. The ratio of
-# the largest to the smallest (the condition number) is reported.
+# is how strongly the objective depends on each value there: its curvatures. The ratio
+# of the largest to the smallest (the condition number) is reported.
 
 # factor on an objective that must not change a search
 RATIO = 1e6

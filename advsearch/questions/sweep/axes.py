@@ -41,8 +41,8 @@ FULL_TURN = 360.0  # degrees after which a periodic parameter repeats
 MAX_RANGE_PARTS = 10
 MIN_RANGE_PARTS = 2
 MIN_CELL_DRAWS = 5
-"""A cell of the map over two sampled parameters has at least this many draws on average,
-if the sweep has enough images.
+"""A cell of the map over two sampled parameters has at least this many draws on
+average, if the sweep has enough images.
 """
 # numbers of a group up to which Sobol points are used; larger ones (a texture) are
 # sampled pseudo-randomly

@@ -357,8 +357,8 @@ def _make_text_sections(
     yield ResultPart.make_table(
         summary.changes or [], CHANGE_COLUMNS, title=CHANGES_TITLE
     )
-    # The axis "answer" has the clean scene and the adversarial one: `_make_arms_table` shows
-    # these.
+    # The axis "answer" has the clean scene and the adversarial one: `_make_arms_table`
+    # shows these.
     if axes.keys() - {"answer"}:
         introduction = READING
         if summary.arms:
@@ -1173,7 +1173,8 @@ def _dips_sentences(estimate: DetectionDistance, unit: str) -> list[str]:
     if significant:
         clauses = "; ".join(_dip_clause(dip, unit) for dip in significant)
         return [f"No one distance from which on it is seen: right in {clauses}."]
-    # The estimate states that up to this distance at least half of the images are right.
+    # The estimate states that up to this distance at least half of the images are
+    # right.
     detected_until = estimate.distance or 0.0
     if estimate.is_above_half:
         detected_until = estimate.distances[-1]

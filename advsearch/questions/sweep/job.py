@@ -336,7 +336,8 @@ class Job:
 
         Args:
             named_scene: the scene.
-            values: values of its controls by name; empty if the task does not need them.
+            values: values of its controls by name; empty if the task does not need
+                them.
         """
         return make_facts(
             named_scene.scene.description,

@@ -53,8 +53,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MAX_EMBEDDED_BYTES = 3_000_000
-"""Maximum number of bytes of thumbnails in a page that needs no other file. Those of the
-worst predictions come first.
+"""Maximum number of bytes of thumbnails in a page that needs no other file. Those of
+the worst predictions come first.
 """
 # Maximum number of rows in such a page; `advsearch dashboard` shows more.
 MAX_EMBEDDED_ROWS = 200_000

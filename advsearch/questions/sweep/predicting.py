@@ -76,7 +76,8 @@ class Groups:
     Args:
         grid: grid of the sweep.
         samples: number of samples at each point of the grid.
-        within: for each axis of the grid, whether images of a group may differ along it.
+        within: for each axis of the grid, whether images of a group may differ along
+            it.
         is_sampled: whether images of a group may differ in what is sampled. If not,
             they differ along no axis but `frames`, since other images have other draws.
         frames: the index of the axis with the frames of a drive, which have one draw;

@@ -29,8 +29,8 @@ BLIND = {
     "covered": "the camera is covered (one even colour, the picture's mean)",
     "away": "the object is taken away",
 }
-"""Changes after which nothing of the object is visible. A model that looks at the object
-predicts something else then.
+"""Changes after which nothing of the object is visible. A model that looks at the
+object predicts something else then.
 """
 
 HARMLESS = {

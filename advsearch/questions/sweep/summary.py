@@ -102,8 +102,8 @@ class SurfacePart(Fields):
     visible: CountedPredictions = Field(description="pictures that show the part")
     hidden: CountedPredictions = Field(description="pictures that do not show it")
     difference: float = Field(
-        description="fraction of wrong predictions where the part is visible, minus that "
-        "where it is not"
+        description="fraction of wrong predictions where the part is visible, minus "
+        "that where it is not"
     )
     interval: Interval = Field(
         description="95 % interval of the difference, for this part alone; null if "
@@ -150,8 +150,8 @@ class SurfaceMap(Fields):
     file: str = Field(description="file with the counts, in the run directory")
     cells: int = Field(description="number of cells along each side of the map")
     min_pictures: int = Field(
-        description="number of pictures with a part, and of pictures without it, that a "
-        "comparison needs"
+        description="number of pictures with a part, and of pictures without it, that "
+        "a comparison needs"
     )
     tables: list[SurfaceTable] = Field(
         description="a table for every object, model and kind of part"
@@ -198,8 +198,8 @@ class OverDrives(Fields):
 
     mean: float = Field(description="mean over drives")
     interval: Interval | None = Field(
-        description="95 % interval of the mean over drives; null for a single drive, or "
-        "if the range of the value is unknown"
+        description="95 % interval of the mean over drives; null for a single drive, "
+        "or if the range of the value is unknown"
     )
     worst: float = Field(description="value of the worst drive")
 
@@ -229,8 +229,8 @@ class TrackRates(Fields):
         description="fraction of the frames with the object in which no track is on it"
     )
     loose: OverDrives = Field(
-        description="fraction of the frames with the object in which no track is on it, "
-        "but one overlaps it loosely"
+        description="fraction of the frames with the object in which no track is on "
+        "it, but one overlaps it loosely"
     )
     switches: OverDrives = Field(
         description="number of frames in which the track on the object has another "
@@ -275,7 +275,8 @@ class DriveRates(Fields):
         description="changes between right and wrong per second"
     )
     tracks: TrackRates | None = optional_field(
-        "results of a [tracker](drives.md#tracks) on the boxes; absent without a detector"
+        "results of a [tracker](drives.md#tracks) on the boxes; absent without a "
+        "detector"
     )
     per_drive: list[DriveRecord] = Field(
         default=[], description="values of each of the first 1,000 drives"
@@ -320,15 +321,16 @@ class SweepSummary(CountedPredictions, RunResult):
         "absent if there are none",
     )
     not_finite: int = Field(
-        description="number of outputs that were not numbers; they do not count as right"
+        description="number of outputs that were not numbers; they do not count as "
+        "right"
     )
     answers: dict[str, int] = Field(
         description="counts of the 20 most frequent wrong predictions"
     )
     axes: list[AxisRow] = Field(description="a row for every value of every axis")
     cells: SweepMap | None = Field(
-        description="map over the first two axes with several values; null if there are "
-        "fewer axes, or more than 4096 pairs of values"
+        description="map over the first two axes with several values; null if there "
+        "are fewer axes, or more than 4096 pairs of values"
     )
     arms: ArmComparison | None = optional_field(
         "the clean scene compared with [an adversarial "
@@ -344,8 +346,8 @@ class SweepSummary(CountedPredictions, RunResult):
     )
     units: int | None = optional_field(
         "number of independent draws of the configurations, such as "
-        "[drives](drives.md), over which the intervals are; absent if no configurations "
-        "share a draw"
+        "[drives](drives.md), over which the intervals are; absent if no "
+        "configurations share a draw"
     )
     grid: dict[str, int] = Field(
         description="number of values of each axis of the grid"
@@ -368,8 +370,8 @@ class SweepSummary(CountedPredictions, RunResult):
     )
     transport: results.LinearTransport | None = optional_field(
         "whether [basis pictures](transport.md#light) or [light on "
-        "surfaces](surface-light.md#sweeps) predicted pictures; absent if neither light "
-        "nor camera moves"
+        "surfaces](surface-light.md#sweeps) predicted pictures; absent if neither "
+        "light nor camera moves"
     )
     surface: SurfaceMap | None = optional_field(
         "which parts of the [surface](sweeps.md#the-surface), when visible, go with "

@@ -663,7 +663,7 @@ def parse_frames(text: str | None) -> Callable[[str], bool]:
 
 
 def make_row_name(number: int, model_index: int) -> str:
-    """Return the key of a stored row, which is about an object and one of the models."""
+    """Return the key of a stored row, which is about one object and one model."""
     return f"twin {number} {model_index}"
 
 

@@ -23,7 +23,7 @@ Box = tuple[float, float, float, float]  # x, y, width and height
 def make_table(
     rows: Sequence[TwinRow], surroundings: Sequence[str], task: str
 ) -> list[results.TwinAgreement]:
-    """Return the agreement by model and surroundings: in all, by object, by condition."""
+    """Return the agreement by model and surroundings: total, by object, by condition."""
     table = []
     for model in dict.fromkeys(row.model for row in rows):
         of_model = [row for row in rows if row.model == model]

@@ -137,8 +137,8 @@ def read_photographs(path: Path) -> Listing:
     # A missing photograph of a list is an error, so `n_missing` is that of a directory.
     if not listing.objects:
         raise InputError(
-            f"photographs: {path} names {listing.n_missing} objects in photographs, and "
-            "none of these photographs is in it; copy them, or name another folder"
+            f"photographs: {path} names {listing.n_missing} objects in photographs, "
+            "and none of these photographs is in it; copy them, or name another folder"
         )
     # The function puts the limit into the text.
     stored_files.check_most(

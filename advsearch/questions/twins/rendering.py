@@ -35,8 +35,8 @@ MIN_FILM = 64  # minimum length of a film's longer side in pixels
 MAX_FILM = 512
 FILM_STEP = 32  # films of similar windows get the same size
 MIN_SILHOUETTE = 4.0  # minimum length of a silhouette's longer side in pixels
-# from camera coordinates of OpenCV (+x to the right, +y down) to those of our scenes (+x
-# to the left, +y up)
+# from camera coordinates of OpenCV (+x to the right, +y down) to those of our scenes
+# (+x to the left, +y up)
 FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
@@ -151,7 +151,7 @@ def choose_window(
 
 
 def _center_within(center: float, length: int, limit: int) -> int:
-    """Return the begin of an interval, as near a center as it fits between 0 and limit."""
+    """Return the start of an interval in [0, limit], as near to a center as possible."""
     return min(max(round(center - length / 2.0), 0), limit - length)
 
 
@@ -450,8 +450,8 @@ def _make_sight(
 def choose_film(windows: Sequence[PhotoWindow], pixel_aspect: float) -> tuple[int, int]:
     """Return the (height, width) of a film for windows of one shape, in pixels.
 
-    Pixels of a film are square in angles. Those of a photograph are not if its two focal
-    lengths differ.
+    Pixels of a film are square in angles. Those of a photograph are not if its two
+    focal lengths differ.
 
     Args:
         windows: the windows, at least one.
@@ -572,7 +572,7 @@ def read_front(
 
 
 def load_mask(path: Path, window: PhotoWindow) -> Tensor:
-    """Read a window (h, w) bool of a mask: an image that is over 1/2 inside the mask."""
+    """Read a window (h, w) bool of a mask; its file is an image, over 1/2 inside."""
     values = reading.pictures.read_image(path, None, is_raw=True)
     mask = cut_window(torch.from_numpy(values[..., 0] > 0.5), window)
     if tuple(mask.shape) != (window.height, window.width):
@@ -599,7 +599,7 @@ def measure_pose(
 
 
 def _find_box(covered: Tensor, window: PhotoWindow) -> counting.Box:
-    """Return the box around covered pixels (h, w) bool of a window, in the photograph."""
+    """Return the box in the photograph around covered pixels (h, w) of a window."""
     columns = covered.any(dim=0).nonzero().flatten()
     rows = covered.any(dim=1).nonzero().flatten()
     left = window.x + float(columns[0])

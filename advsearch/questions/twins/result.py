@@ -26,7 +26,8 @@ COMPOSED = results.IN_PHOTOGRAPH
 HOLE = results.WITHOUT_OBJECT
 CLASSIFIER_MARGIN = 0.25
 DETECTOR_MARGIN = 1.5
-"""How far a window reaches beyond the object's box, as a fraction of its longer side."""
+"""How far a window extends beyond the object's box, as a fraction of its longer side.
+"""
 MAX_TEXT_PAIRS = 5  # number of pairs that a terminal lists
 
 
@@ -201,8 +202,8 @@ class TwinRow(results.Fields):
     )
     size: float = Field(description="square root of the silhouette's area in pixels")
     brightness: float = Field(
-        description="mean of the twin minus that of the photograph, where the object is; "
-        "in sRGB, from -1 to 1"
+        description="mean of the twin minus that of the photograph, where the object "
+        "is; in sRGB, from -1 to 1"
     )
     contrast: float = Field(
         description="standard deviation of the photograph around the object, in sRGB"
@@ -264,8 +265,8 @@ class TwinsResult(views.InNotebook, results.RunResult):
     )
     low_overlaps: int = Field(description="number of pairs with an overlap below 0.8")
     factors: list[FactorPart] = Field(
-        description="how often twins in the photograph disagree, by properties that may "
-        "explain it"
+        description="how often twins in the photograph disagree, by properties that "
+        "may explain it"
     )
     pairs: list[TwinPair]
     renders: int
