@@ -883,9 +883,8 @@ def _choose_color_range(
     if normalised and by_margin:
         lower = min(values)
     if normalised or by_margin:
-        upper = max(
-            [*values, 1e-9]
-        )  # not 0, so that the range of fractions has a width
+        # The smallest bound is above 0, so that the range of fractions has a width.
+        upper = max([*values, 1e-9])
     return lower, upper
 
 
