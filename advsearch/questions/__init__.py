@@ -1,6 +1,5 @@
-"""Questions that are rooms: each folder is the command, and holds the settings, what
-carries it out, and the result.
+"""Experiments: each directory is a command, with its settings, code and result.
 
-`advsearch.registry` finds them; a folder that is deleted is a question that nobody can
-ask.
+`advsearch.registry` finds the directories. Without its directory, a command does not
+exist.
 """

@@ -15,14 +15,15 @@ from advsearch.runs.results import RenderResult
 
 
 def make_view(result: RenderResult) -> ShownResult:
-    """Return the file that was written, and what the model predicts in each view."""
+    """Return the view of a result: the files, and the predictions in each view."""
     height, width = result.size
     headline = f"{result.out}: {width} x {height} pixels"
-    if result.answered:
+    if result.answered:  # a second file
         headline += f"\n{result.answered}: with the predictions drawn in"
-    if len(result.views) > 1:
+    has_several_views = len(result.views) > 1
+    if has_several_views:
         return ShownResult(headline, [_make_table_of_views(result)])
-    (view,) = result.views
+    view = result.views[0]
     predictions = [
         format_image_prediction_cells(result.task, answer) for answer in view.answers
     ]
@@ -31,9 +32,9 @@ def make_view(result: RenderResult) -> ShownResult:
         things = format_thing_rows(
             {name: vars(thing) for name, thing in view.things.items()}
         )
-        sections.append(
-            ResultPart("In the picture", heads=("", *VISIBLE_HEADS), rows=things)
-        )
+        # The first column has the names of the things, and no head.
+        heads = ("", *VISIBLE_HEADS)
+        sections.append(ResultPart("In the picture", heads=heads, rows=things))
     return ShownResult(headline, sections)
 
 

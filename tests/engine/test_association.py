@@ -7,8 +7,8 @@ from scipy.stats import chi2_contingency
 from advsearch.questions.sweep.surface import (
     N_PERMUTATIONS,
     PartCounts,
-    _likelihood_ratio,
-    _newcombe,
+    _compare_rates,
+    _compute_likelihood_ratio,
     compare_parts,
     permute_draws,
 )
@@ -16,14 +16,14 @@ from advsearch.questions.sweep.surface import (
 
 def test_the_interval_of_a_difference_is_newcombe_s() -> None:
     # Newcombe (1998), table II, method 10: 56/70 - 48/80 and 9/10 - 3/10
-    difference, low, high = _newcombe(np.array([56, 9]), np.array([70, 10]), np.array([48, 3]), np.array([80, 10]))
+    difference, low, high = _compare_rates(np.array([56, 9]), np.array([70, 10]), np.array([48, 3]), np.array([80, 10]))
     assert difference == pytest.approx([0.2, 0.6])
     assert low == pytest.approx([0.0524, 0.1705], abs=1e-4) and high == pytest.approx([0.3339, 0.8090], abs=1e-4)
 
 
 def test_the_statistic_is_that_of_the_likelihood_ratio() -> None:
     k, n = np.array([7, 0, 12]), np.array([20, 5, 12])
-    found = _likelihood_ratio(k, n, 15, 50)
+    found = _compute_likelihood_ratio(k, n, 15, 50)
     for one, (wrong, seen) in zip(found, zip(k, n, strict=True), strict=True):
         table = [[wrong, seen - wrong], [15 - wrong, 35 - seen + wrong]]
         expected = chi2_contingency(table, correction=False, lambda_="log-likelihood").statistic

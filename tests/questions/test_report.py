@@ -145,5 +145,5 @@ def test_predictions_of_several_models_to_the_same_pictures_are_not_counted_toge
 def test_a_criterion_is_that_of_right_predictions_whatever_the_words_are() -> None:
     counted = [Extent.from_count("right ones", 3, 4, (0.2, 0.9), counts_right=is_right) for is_right in (False, True)]
     claims = [Claim(kind="measured", statement="3 of 4", extent=extent) for extent in counted]
-    assert len(evidence._criterion_of_claims(claims, 0.5, [])) == 1
+    assert len(evidence._describe_criterion_of_claims(claims, 0.5, [])) == 1
     assert "counts_right" not in counted[1].model_dump()

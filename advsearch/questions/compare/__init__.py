@@ -42,7 +42,7 @@ STORED_SWEEP_SETTINGS = (
     "run",
     "overwrite",
 )
-"""The settings that mean something for stored sweeps, too."""
+"""The settings that also apply where stored sweeps are compared."""
 
 
 class CompareConfig(SweepConfig):
@@ -72,20 +72,20 @@ class CompareConfig(SweepConfig):
     # fmt: off
     compared: str = setting(
         ..., "compare",
-        "what is compared, separated by commas: sweeps that are stored (one of several "
-        "models, or several of the same "
-        "draws), or models, where `object` says what they are shown",
+        "what is compared, separated by commas: stored sweeps (one sweep of several "
+        "models, or several sweeps of the same draws); or, if `object` is set, models "
+        "that are swept over that object first",
         "names or folders of runs of sweep, or models",
     )
     pictures: int = setting(
-        6, "compare", "pictures of what one side alone gets right that are shown, for "
-                      "each side; 0 for none",
+        6, "compare", "number of pictures to show, for each side, that only this side "
+                      "gets right; 0 for none",
         unit="pictures", ge=0, le=1000,
     )
     object: str = setting_as_in(
         SweepConfig, "object", default="",
-        description="the object that models are shown, where models are compared; "
-                    "several, separated by commas",
+        description="the object that models are compared on; several, separated by "
+                    "commas",
     )
     # fmt: on
     keep_pictures: Literal["all", "wrong", "none"] = setting_as_in(
@@ -101,19 +101,20 @@ class CompareConfig(SweepConfig):
     @field_validator("object", mode="wrap")
     @classmethod
     def _accept_no_object(cls, value: Any, read: ValidatorFunctionWrapHandler) -> Any:
-        """Accept no object, which files store as an empty string."""
+        """Accept a missing object, which files store as an empty string."""
         return "" if value in ("", None) else read(value)
 
     @model_validator(mode="after")
     def _check_settings(self) -> CompareConfig:
         """Reject settings that do not belong to what is compared.
 
-        Without an `object` stored sweeps are compared, which takes no settings of a new
-        sweep; with one, models, of which there have to be two.
+        Without an `object`, stored sweeps are compared. They take no settings of a new
+        sweep. With an `object`, models are compared; at least two are needed.
         """
         compares_stored_sweeps = not self.object
         if compares_stored_sweeps:
             for declared in settings.settings(type(self)):
+                # `field` is the name in Python, `name` the one that users type.
                 is_set = getattr(self, declared.field) != declared.default
                 if is_set and declared.field not in STORED_SWEEP_SETTINGS:
                     raise InputError(
@@ -134,7 +135,7 @@ class CompareConfig(SweepConfig):
         return "-".join(Path(name).stem for name in names), self.command
 
     def make_sweep_config(self) -> SweepConfig:
-        """Return the sweep of the models that has to be made first."""
+        """Return the settings of the sweep of the models, which has to run first."""
         return SweepConfig.from_config(self, model=self.compared, trials=0)
 
 
@@ -170,7 +171,7 @@ def compare(context: RunContext[CompareConfig]) -> CompareResult:
 
     config = context.config
     sides, n_sweep_renders = load_sides(context)
-    if not sides:
+    if not sides:  # the sweep of the models was interrupted
         context.ending = results.INTERRUPTED
     differ = find_different_settings(sides) if sides else []
     warnings = find_comparison_warnings(sides, differ)
@@ -182,7 +183,8 @@ def compare(context: RunContext[CompareConfig]) -> CompareResult:
         context.progress.stage("counting pairs")
         try:
             pair = compare_sides(sides[0], side, config.seed)
-        except InputError as error:  # the library that finds rules is missing
+        except InputError as error:
+            # scikit-learn, which finds rules, is not installed (`compare_sides`)
             warnings.append(f"Where one side is worse was not looked for: {error}")
             pair = compare_sides(sides[0], side, config.seed, with_rules=False)
         examples = list(images.list_examples(sides[0], side, number))
@@ -202,8 +204,8 @@ def load_sides(context: RunContext[CompareConfig]) -> tuple[list[Side], int]:
     """Read the sides of stored sweeps, or of a new sweep of models.
 
     Returns:
-        The sides, none if the new sweep was interrupted; and the images that it
-        rendered.
+        The sides, and the number of images that a new sweep rendered. There are no
+        sides if the new sweep was interrupted.
     """
     from advsearch.questions.compare.sides import read_sides  # imports pandas
 
@@ -212,9 +214,11 @@ def load_sides(context: RunContext[CompareConfig]) -> tuple[list[Side], int]:
         context.progress.stage("reading rows")
         names = settings.split_names(config.compared)
         return read_sides([directory.find_run(name) for name in names]), 0
+    # Models that exist only in Python are not in the settings, and passed along.
     sweep = context.run_part(
         "sweep", config.make_sweep_config().with_python_parts_of(config)
     )
+    # `run_part` returns the result of any command; that of a sweep has `renders`.
     n_renders = sum(getattr(sweep, "renders", {}).values())
     if sweep.is_unfinished:
         return [], n_renders
@@ -222,7 +226,10 @@ def load_sides(context: RunContext[CompareConfig]) -> tuple[list[Side], int]:
 
 
 def describe_sweeps(config: CompareConfig, sides: Sequence[Side]) -> dict[str, Any]:
-    """Return what the compared sweeps are of; without sides yet, from the settings."""
+    """Return the fields of the result that describe the compared sweeps.
+
+    Without sides, since the sweep was interrupted, they follow from the settings.
+    """
     if not sides:
         return {
             "environment": config.environment_name,
@@ -277,13 +284,13 @@ def find_comparison_warnings(sides: Sequence[Side], differ: Sequence[str]) -> li
     if len(differ) > 1:
         names = f"{', '.join(differ[:-1])} and {differ[-1]}"
         warnings.append(
-            f"The sweeps differ in {names}: what is told here is of all of "
-            "that together."
+            f"The sweeps differ in {names}: a difference between the sides may come "
+            "from any of these."
         )
     if not differ:
         warnings.append(
-            "The sweeps have the same settings: what differs is in files, "
-            "in versions, or in the machine."
+            "The sweeps have the same settings: a difference comes from files, "
+            "versions, or the machine."
         )
     rows = sides[0].rows
     # Rows of one unit, such as the frames of one drive, are not independent.
@@ -291,13 +298,12 @@ def find_comparison_warnings(sides: Sequence[Side], differ: Sequence[str]) -> li
     if len(rows) > 1 and is_of_single_unit:
         unit_name = rows.attrs["unit name"]
         warnings.append(
-            f"All pairs are of one {unit_name}: the shares are of this one, and "
-            "nothing is shown of others."
+            f"All pairs are of one {unit_name}: the fractions are those of this one, "
+            "and show nothing about others."
         )
     tasks = {side.sweep.summary.task for side in sides}
     if len(tasks) > 1:
         warnings.append(
-            "What counts as right is judged by different tasks: "
-            f"{', '.join(sorted(tasks))}."
+            f"Different tasks decide what counts as right: {', '.join(sorted(tasks))}."
         )
     return warnings

@@ -48,8 +48,8 @@ class PairImages:
         """Yield pairs in which only one prediction is right, largest differences first.
 
         The difference is that of the margins. The setting `pictures` limits the number
-        of pairs in favor of each side. Their images are stored in the run. If one image
-        of a pair cannot be stored, the pair has none.
+        of pairs in favor of each side. Their images are stored in the run. A pair whose
+        images could not all be stored is yielded without images.
 
         Args:
             first, second: the sides, with rows in the same order.
@@ -57,16 +57,21 @@ class PairImages:
         """
         run = self.context.run
         rows = select_examples(first, second, self.context.config.pictures)
-        sides = {"a": first, "b": second}
+        side_of_letter = {"a": first, "b": second}
         is_same_sweep = first.sweep.folder == second.sweep.folder
-        # Two models of one sweep have the same image.
-        if is_same_sweep and first.rows["number"].equals(second.rows["number"]):
-            sides = {"a": first}
+        has_same_images = is_same_sweep and first.rows["number"].equals(
+            second.rows["number"]
+        )
+        if has_same_images:  # two models of one sweep
+            side_of_letter = {"a": first}
         files = {
-            row: [f"images/pair-{pair_number}-{row}-{letter}.jpg" for letter in sides]
+            row: [
+                f"images/pair-{pair_number}-{row}-{letter}.jpg"
+                for letter in side_of_letter
+            ]
             for row in rows
         }
-        self._save_images(rows, sides, files, run)
+        self._save_images(rows, list(side_of_letter.values()), files, run)
         for row in rows:
             right_side = first if first.is_right[row] else second
             is_complete = all((run.path / file).is_file() for file in files[row])
@@ -81,25 +86,28 @@ class PairImages:
     def _save_images(
         self,
         rows: Sequence[int],
-        sides: Mapping[str, Side],
+        sides: Sequence[Side],
         files: Mapping[int, Sequence[str]],
         run: Any,
     ) -> None:
         """Store the images of rows: thumbnails of the sweeps, or else renderings.
 
+        If the user interrupts, the remaining images are not stored.
+
         Args:
             rows: indices of the pairs whose images are stored.
-            sides: those with images of their own, by the letter in the file's name.
-            files: files of each row, one for each of these sides.
+            sides: sides with images of their own.
+            files: for each row its files, in the order of `sides`.
             run: the run directory.
         """
         missing = []
         with self.context.until_interrupted():
             for row in rows:
-                for side, file in zip(sides.values(), files[row], strict=True):
+                for side, file in zip(sides, files[row], strict=True):
                     number = int(side.rows["number"][row])
                     stored = side.sweep.find_thumbnail(number)
                     if stored is not None:
+                        # Copying is cheap, so an existing file is written again.
                         run.write_file(file, stored.read_bytes())
                     elif not (run.path / file).is_file():
                         missing.append(MissingImage(side, number, file))
@@ -111,7 +119,7 @@ class PairImages:
             self.context.progress.stage(
                 "rendering pictures again",
                 len(missing),
-                hint="`pictures` says how many",
+                hint="`pictures` limits how many",
             )
         for image in sorted(
             missing, key=lambda image: (str(image.side.sweep.folder), image.number)
@@ -150,21 +158,23 @@ def _round_values(side: Side, row: int) -> dict[str, str | float]:
 
 
 def select_examples(first: Side, second: Side, limit: int) -> list[int]:
-    """Return the indices of the pairs in which only one side is right.
+    """Return the row labels of the pairs in which only one side is right.
 
     There are at most `limit` pairs for each side. The largest differences of the
     margins come first; an unknown difference counts as 0.
     """
+    # The margin is positive where a prediction is right, and so the difference is
+    # positive where only the first side is right and negative where only the second is.
     margin_gap = (first.rows["margin"] - second.rows["margin"]).fillna(0.0)
-    only_first = first.is_right & ~second.is_right
-    only_second = ~first.is_right & second.is_right
+    only_first_right = first.is_right & ~second.is_right
+    only_second_right = ~first.is_right & second.is_right
     return [
-        *find_smallest(-margin_gap[only_first], limit),
-        *find_smallest(margin_gap[only_second], limit),
+        *find_smallest(-margin_gap[only_first_right], limit),
+        *find_smallest(margin_gap[only_second_right], limit),
     ]
 
 
 def find_smallest(values: pd.Series, limit: int) -> list[int]:
-    """Return the indices of the smallest values, in rising order."""
+    """Return the row labels of the smallest values, in ascending order."""
     indices: list[int] = values.sort_values(kind="stable").index[:limit].tolist()
     return indices

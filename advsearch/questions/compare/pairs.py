@@ -14,8 +14,8 @@ from advsearch.extend import rules, seeds, statistics
 from advsearch.questions.compare.result import ComparedPair, CountOf, PairPart, PairRule
 from advsearch.questions.compare.sides import Side, has_same_values
 
-# Different numbers of a parameter, beyond which it has no table unless the sweep says
-# how it is cut
+# A parameter with more different numbers has no table, unless the sweep defines how
+# its range is divided.
 MAX_VALUES = 64
 
 BoolArray = npt.NDArray[np.bool_]
@@ -27,15 +27,16 @@ def compare_sides(
 ) -> ComparedPair:
     """Count the pairs of two sides, and test whether they differ.
 
-    A side is what is compared, such as the predictions of one model. `worse` of the
-    result has rules under which only the first side is right, and `better` those for
-    the second. Both are None if rules are not sought. `shown` has no examples yet.
+    A side is a set of predictions, such as those of one model. In the result, `worse`
+    has the rules under which only the first side is right, and `better` those for the
+    second. Both are None if rules are not sought. `discordant_pictures` is empty: the
+    caller fills it.
 
     Args:
         first, second: sides with the same sampled scenes, in the same order.
-        seed: seed of the split in halves: rules are found in one half of the pairs and
+        seed: seed that splits the pairs in halves: rules are found in one half and
             counted in the other, so that the counts are not biased.
-        with_rules: whether to look for rules.
+        with_rules: whether to search for rules.
 
     Raises:
         InputError: rules are sought and scikit-learn is missing.
@@ -47,19 +48,22 @@ def compare_sides(
         if name in second.rows.attrs["units"]
         and has_same_values(first.rows[name], second.rows[name])
     ]
-    # the unit of each pair, such as the drive that a frame is of
+    # The unit of a pair is what it is independent by, such as the drive of a frame.
     unit_of_pair = first.rows["unit"].to_numpy()
     n_units = len(np.unique(unit_of_pair))
     has_single_pairs = n_units == len(unit_of_pair)
+    # only the p-value: `count_pairs` returns the difference and its interval
     _, _, p_value = statistics.clustered.compare_paired(
         first.is_right, second.is_right, unit_of_pair
     )
-    worse = None
-    better = None
+    first_rules = None
+    second_rules = None
     if with_rules:
         table = rules.make_table(first.rows, shared_parameters)
-        worse = find_pair_rules(table, first.is_right & ~second.is_right, seed)
-        better = find_pair_rules(table, ~first.is_right & second.is_right, seed)
+        only_first_right = first.is_right & ~second.is_right
+        only_second_right = ~first.is_right & second.is_right
+        first_rules = find_pair_rules(table, only_first_right, seed)
+        second_rules = find_pair_rules(table, only_second_right, seed)
     parts = list[PairPart]()
     for name in shared_parameters:
         parts += count_by_parameter(first, second, name)
@@ -70,8 +74,8 @@ def compare_sides(
         unit=first.rows.attrs["unit name"],
         **count_pairs(first.is_right, second.is_right, unit_of_pair),
         p=p_value,
-        worse=worse,
-        better=better,
+        worse=first_rules,
+        better=second_rules,
         parts=parts,
         discordant_pictures=[],
     )
@@ -110,18 +114,20 @@ def count_pairs(
         unit_of_pair: the unit of each pair (n,), such as the drive that a frame is of;
             pairs of one unit are not independent.
     """
+    # The p-value is computed once for all pairs (`compare_sides`) and not for parts.
     difference, interval, _ = statistics.clustered.compare_paired(
         first_right, second_right, unit_of_pair
     )
     n_pairs_of_unit = statistics.clustered.sum_per_unit(
         np.ones(len(unit_of_pair)), unit_of_pair
     )
-    accuracies = [
-        statistics.clustered.mean_rate(
-            statistics.clustered.sum_per_unit(is_right, unit_of_pair), n_pairs_of_unit
+    # The accuracy is the mean over units of the fraction of right pairs in each.
+    accuracies = []
+    for is_right in (first_right, second_right):
+        n_right_of_unit = statistics.clustered.sum_per_unit(is_right, unit_of_pair)
+        accuracies.append(
+            statistics.clustered.mean_rate(n_right_of_unit, n_pairs_of_unit)
         )
-        for is_right in (first_right, second_right)
-    ]
     return {
         "both": int((first_right & second_right).sum()),
         "first_only": int((first_right & ~second_right).sum()),
@@ -138,15 +144,17 @@ def split_by_value(
 ) -> Iterator[tuple[Any, BoolArray]]:
     """Yield the values of a parameter, or parts of its range, with masks of their rows.
 
-    Each name, or each of a few different numbers, is a value. Many different numbers
-    are divided at the edges; without edges nothing is yielded. A mask is (n,).
+    Each name is a value. Numbers are divided at the edges, if there are any. Without
+    edges each number is a value, or nothing is yielded if there are more than
+    `MAX_VALUES` different ones. A mask is (n,).
 
     Args:
         column: value of the parameter in each row (n,).
         edges: ascending bounds of the parts of the range, as the sweep defines them;
             None if it defines none.
     """
-    if column.dtype == "category":
+    has_names = column.dtype == "category"
+    if has_names:
         for name in column.cat.categories:
             yield name, np.asarray(column == name)
     elif edges is not None:
@@ -174,11 +182,16 @@ def find_pair_rules(
         table: table of pairs, as `rules.make_table` makes it.
         is_only_right: whether, in each pair, the one side is right and the other is
             wrong (n,).
-        seed: seed of the split in halves: one finds the rules, the other counts them.
+        seed: seed that splits the pairs in halves: one finds the rules, the other
+            counts them.
     """
-    # Rules say where `correct` is rare: here where that side alone is right.
+    # `rules.find_rules` searches where `correct` is rarely true. So `correct` is set to
+    # false in the pairs that the rules describe: those that only the one side gets
+    # right.
     table = table.assign(correct=~is_only_right)
-    if len(table) < rules.MIN_ROWS or not table.attrs["units"]:
+    parameters = table.attrs["units"]
+    if len(table) < rules.MIN_ROWS or not parameters:
+        return None
         return None
     choosing, counting = rules.split_in_halves(table, seed)
     found_rules = rules.find_rules(choosing, counting, seeds.stream(seed, "compare"))
@@ -189,7 +202,7 @@ def find_pair_rules(
             PairRule(
                 conditions=[condition.row for condition in rule.conditions],
                 elsewhere=count_exceptions(rule.elsewhere),
-                **vars(inside),
+                **vars(inside),  # count, total, interval and share
             )
         )
     return pair_rules

@@ -1,4 +1,4 @@
-"""The result of `compare`, and what is shown of it."""
+"""The result of `compare`, and its view and claims."""
 
 from __future__ import annotations
 
@@ -13,59 +13,59 @@ from advsearch.extend import ResultPart, RunResult, ShownResult, results, views,
 
 
 class ComparedSide(results.CountedPredictions):
-    """One of the things that are compared, and how often the model is right with it."""
+    """The predictions of one side of a comparison, with their counts."""
 
-    name: str = Field(description="what tells it from the others")
-    run: str = Field(description="folder of the sweep that has its rows")
+    name: str = Field(description="distinguishes the side from the others")
+    run: str = Field(description="directory of the sweep that the rows are from")
     object: str
     model: str
     adversarial_run: str = Field(
         default="",
-        description="the run whose adversarial scene was swept; absent without",
+        description="the run whose adversarial scene was swept; absent for a clean "
+        "scene",
     )
     seconds: results.JsonFloat = Field(
-        description="of a picture and its predictions, shared evenly among the models "
-        "that saw it"
+        description="time of a picture and its predictions, divided evenly among the "
+        "models that were run on it"
     )
 
 
 class CountOf(results.Fields):
-    """How many of some pairs."""
+    """A number of pairs out of a total."""
 
     count: int
-    total: int = Field(alias="of", description="pairs")
-    interval: results.Interval = Field(description="of the share, 95 %")
+    total: int = Field(alias="of", description="number of pairs")
+    interval: results.Interval = Field(description="95 % interval of the fraction")
     share: float | None = Field(
         default=None,
-        description="of all; where pairs share draws, the mean over draws of the share "
-        "of each; absent of older runs",
+        description="fraction of the pairs; where pairs share draws, the mean over "
+        "draws of the fraction in each; absent in older runs",
     )
 
     @property
     def text(self) -> str:
-        """The share with its interval and what it is of: ``12 % (9 to 16) of 340``."""
+        """The fraction with its interval and total: ``12 % (9 to 16) of 340``."""
         return wording.format_fraction_of(
             self.count, self.total, self.interval, self.share
         )
 
 
 class PairCounts(results.Fields):
-    """Pairs by what both sides say of them."""
+    """Pairs by which of the two sides are right."""
 
     both: int = Field(description="pairs that both get right")
-    first_only: int = Field(description="that the first alone gets right")
-    second_only: int = Field(description="that the second alone gets right")
-    neither: int = Field(description="that none gets right")
+    first_only: int = Field(description="pairs that only the first gets right")
+    second_only: int = Field(description="pairs that only the second gets right")
+    neither: int = Field(description="pairs that neither gets right")
     shares: tuple[float, float] | None = Field(
         default=None,
         description="accuracy of the first and of the second; where pairs share draws, "
-        "means over draws of the share "
-        "of each; absent of older runs",
+        "means over draws of the fraction in each; absent in older runs",
     )
     difference: float = Field(
-        description="accuracy of the second less that of the first"
+        description="accuracy of the second minus that of the first"
     )
-    interval: results.Interval = Field(description="of that difference, 95 %, of pairs")
+    interval: results.Interval = Field(description="95 % interval of the difference")
 
     @property
     def pairs(self) -> int:
@@ -85,11 +85,15 @@ class PairCounts(results.Fields):
 class PairRule(CountOf):
     """Values under which only one side is right more often than elsewhere.
 
-    They are counted on pairs that did not choose them.
+    The rule was found in other pairs than those that it is counted on.
     """
 
-    conditions: list[results.ConditionRow] = Field(description="all of which hold")
-    elsewhere: CountOf = Field(description="pairs under no rule so far")
+    conditions: list[results.ConditionRow] = Field(
+        description="conditions that all have to hold"
+    )
+    elsewhere: CountOf = Field(
+        description="pairs under neither this rule nor one before"
+    )
 
 
 class PairPart(PairCounts):
@@ -103,72 +107,72 @@ class PairPart(PairCounts):
 
 
 class PairPicture(results.Fields):
-    """A pair that one side alone gets right."""
+    """A pair that only one side gets right."""
 
-    number: int = Field(description="of the pair, from 0")
-    values: dict[str, str | float] = Field(description="of the parameters")
-    right: str = Field(description="the side that is right")
+    number: int = Field(description="number of the pair, from 0")
+    values: dict[str, str | float] = Field(description="values of the parameters")
+    right: str = Field(description="name of the side that is right")
     answers: tuple[str, str] = Field(
-        description="what is said of the first side, and of the second"
+        description="predictions of the first side and of the second"
     )
     pictures: list[str] = Field(
-        description="files in the run's folder: of each side, "
-        "or one that both were shown"
+        description="files in the run directory: one for each side, or a single one if "
+        "both have the same picture"
     )
 
 
 class ComparedPair(PairCounts):
     """Two sides, pair by pair."""
 
-    first: str = Field(description="name of the side")
-    second: str = Field(description="name of the other")
+    first: str = Field(description="name of the first side")
+    second: str = Field(description="name of the second side")
     units: int | None = Field(
         default=None,
-        description="draws that the pairs are of, such as [drives](drives.md), where "
-        "some share one; absent where none "
-        "do",
+        description="number of draws of the pairs, such as [drives](drives.md), if "
+        "some pairs share one; absent if none do",
     )
     unit: str = Field(
         default="drive",
         description="what such a draw is: a drive, a picture or a configuration",
     )
     p: float = Field(
-        description="how likely a split so uneven of the pairs that one alone gets "
-        "right is where both are right "
-        "equally often (two-sided; McNemar's exact test, or where pairs share draws a "
-        "bound by bets)"
+        description="probability of a split at least as uneven of the pairs that only "
+        "one side gets right, if both were right equally often (two-sided; McNemar's "
+        "exact test, or where pairs share draws a bound by bets)"
     )
     worse: list[PairRule] | None = Field(
-        description="where the first alone is right; null where it was not looked for"
+        description="rules where only the first is right; null if not searched for"
     )
     better: list[PairRule] | None = Field(
-        description="where the second alone is right; null likewise"
+        description="rules where only the second is right; null if not searched for"
     )
     parts: list[PairPart] = Field(
-        description="by the values of each parameter, cut as the sweep's tables are"
+        description="counts by the values of each parameter, whose ranges are divided "
+        "as in the sweep's tables"
     )
     discordant_pictures: list[PairPicture] = Field(
-        description="pairs that one side alone gets right, the farthest apart first"
+        description="pairs that only one side gets right, largest difference of the "
+        "margins first"
     )
 
 
 class CompareResult(views.InNotebook, RunResult):
-    """Two sides or more on the same pictures; of more than two, each with the first."""
+    """Two or more sides on the same pictures; each is compared with the first."""
 
     command: ClassVar[str] = "compare"
 
     object: str
     model: str
-    task: str = Field(description="what judges the predictions")
+    task: str = Field(description="the task that evaluates the predictions")
     differ: list[str] = Field(description="the settings in which the sweeps differ")
     sides: list[ComparedSide] = Field(
-        description="in the order in which they were named; empty if interrupted before"
+        description="sides in the order of the arguments; empty if interrupted before"
     )
     pairs: list[ComparedPair] = Field(
         description="the first side with each of the others"
     )
-    renders: int = Field(description="pictures that were rendered now")
-    warnings: list[str] = Field(description="sentences that a reader has to know")
+    renders: int = Field(description="number of pictures that were rendered now")
+    warnings: list[str] = Field(description="remarks that limit what the result shows")
 
     @property
     def brief(self) -> str:
@@ -198,11 +202,11 @@ UNITS_NOTE = (
 )
 
 SIGNIFICANCE = 0.05
-"""A p-value up to this is called a difference."""
+"""Up to this p-value, the sides are said to differ."""
 MAX_TABLES = 4
-"""Parameters that a terminal shows; the page has all."""
+"""Number of parameters whose tables a terminal shows; the page shows all."""
 MAX_PICTURES = 3
-"""Pairs of each side that a terminal shows; the page has all."""
+"""Number of pairs that a terminal shows for each side; the page shows all."""
 
 
 def make_compare_view(result: CompareResult) -> ShownResult:
@@ -211,13 +215,14 @@ def make_compare_view(result: CompareResult) -> ShownResult:
     It has a table of all sides, then sections for each pair.
     """
     columns: dict[str, views.Column] = {
-        "": "{0.name}",
-        "right in": "{0.correct} of {0.configurations}",
+        "": lambda side: side.name,
+        "right in": lambda side: f"{side.correct} of {side.configurations}",
         "accuracy": lambda side: wording.percent(side.accuracy),
         "95 % interval": lambda side: wording.format_interval(side.interval),
         "time a prediction": lambda side: format_prediction_time(side.seconds),
     }
-    # Only detectors have outcomes, such as "missed".
+    # Only detectors have outcomes of wrong predictions, such as "missed".
+
     if any(side.outcomes for side in result.sides):
         columns["the others"] = lambda side: wording.format_outcomes(
             side.outcomes, result.task
@@ -226,17 +231,18 @@ def make_compare_view(result: CompareResult) -> ShownResult:
         ResultPart.make_table(result.sides, columns, title="How often each is right")
     ]
     for pair in result.pairs:
-        sections += _pair_sections(pair, has_others=len(result.pairs) > 1)
+        sections += _make_pair_sections(pair, has_others=len(result.pairs) > 1)
     summary = "Interrupted before anything was compared."
     if result.pairs:
         summary = summarize_difference(result.pairs[0])
     sweeps = ", ".join(dict.fromkeys(side.run for side in result.sides))
     facts = {"sweeps": sweeps, "they differ in": ", ".join(result.differ)}
+    # Without pairs, the summary already says that the run was interrupted.
     return ShownResult(summary, sections, facts, says_interrupted=not result.pairs)
 
 
 def format_prediction_time(seconds: float) -> str:
-    """Return the time of a prediction; empty where it is not known."""
+    """Return the time of a prediction; empty if it is unknown."""
     if math.isnan(seconds):
         return ""
     if seconds < 0.1:
@@ -269,7 +275,7 @@ def describe_exclusive_pairs(pair: ComparedPair) -> str:
         return "Both are right about the same pictures."
     reservation = ""
     if pair.p > SIGNIFICANCE:
-        reservation = ". That there is a difference is not shown"
+        reservation = ". This does not show a difference"
     p_text = f"= {pair.p:.2g}" if pair.p >= 0.0001 else "< 0.0001"
     # without units, pairs are independent
     test = "exact McNemar test" if pair.units is None else f"by {pair.unit}"
@@ -279,7 +285,9 @@ def describe_exclusive_pairs(pair: ComparedPair) -> str:
     )
 
 
-def _pair_sections(pair: ComparedPair, *, has_others: bool) -> Iterator[ResultPart]:
+def _make_pair_sections(
+    pair: ComparedPair, *, has_others: bool
+) -> Iterator[ResultPart]:
     """Yield the sections about one pair of sides.
 
     Args:
@@ -296,9 +304,10 @@ def _pair_sections(pair: ComparedPair, *, has_others: bool) -> Iterator[ResultPa
         [f"{pair.first} right", str(pair.both), str(pair.first_only)],
         [f"{pair.first} wrong", str(pair.second_only), str(pair.neither)],
     ]
-    note = (
-        MCNEMAR_NOTE if pair.units is None else UNITS_NOTE.format(units=f"{pair.unit}s")
-    )
+    note = MCNEMAR_NOTE
+    if pair.units is not None:
+        # `units` is their number and `unit` what one is, such as "drive".
+        note = UNITS_NOTE.format(units=f"{pair.unit}s")
     yield ResultPart(
         f"{pair.first} and {pair.second}, pair by pair",
         text=sentences,
@@ -306,21 +315,22 @@ def _pair_sections(pair: ComparedPair, *, has_others: bool) -> Iterator[ResultPa
         rows=rows,
         note=note,
     )
-    yield ResultPart("Where one is worse", [*_rule_texts(pair)])
-    yield from _parameter_tables(pair)
+    yield ResultPart("Where one is worse", [*_describe_rules(pair)])
+    yield from _make_parameter_tables(pair)
     for name in (pair.first, pair.second):
-        yield from _pictures_of(name, pair)
+        yield from _make_picture_parts(name, pair)
 
 
-def _parameter_tables(pair: ComparedPair) -> Iterator[ResultPart]:
+def _make_parameter_tables(pair: ComparedPair) -> Iterator[ResultPart]:
     """Yield a table for each parameter.
 
-    The page has all tables. A terminal has those of the `MAX_TABLES` parameters over
-    whose values the difference varies most, and a sentence about the rest.
+    A page shows all tables. A terminal shows those of the `MAX_TABLES` parameters over
+    whose values the difference varies most, and a sentence that the page has more.
     """
     parts_by_title: dict[str, list[PairPart]] = {}
     for part in pair.parts:
-        has_unit = part.unit not in ("", "1", "name")  # "1" of numbers, "name" of names
+        # The unit is "1" for plain numbers and "name" for names.
+        has_unit = part.unit not in ("", "1", "name")
         title = f"{part.parameter}, {part.unit}" if has_unit else part.parameter
         parts_by_title.setdefault(title, []).append(part)
     titles_in_terminal = _find_most_varying(parts_by_title)
@@ -334,7 +344,8 @@ def _parameter_tables(pair: ComparedPair) -> Iterator[ResultPart]:
         f"{pair.second} alone",
     ]
     for title, parts in parts_by_title.items():
-        rows = [_part_cells(part) for part in parts]
+        rows = [_make_part_cells(part) for part in parts]
+        # An empty `only` shows the table on the page and in a terminal.
         only = "" if title in titles_in_terminal else "page"
         yield ResultPart(title, heads=heads, rows=rows, only=only)
     if len(titles_in_terminal) < len(parts_by_title):
@@ -357,7 +368,7 @@ def _find_most_varying(parts_by_title: Mapping[str, Sequence[PairPart]]) -> list
     return descending[:MAX_TABLES]
 
 
-def _part_cells(part: PairPart) -> list[str]:
+def _make_part_cells(part: PairPart) -> list[str]:
     """Return the cells of a row of a parameter's table."""
     first_accuracy, second_accuracy = map(wording.percent, part.accuracies)
     difference = f"{100.0 * part.difference:+.0f}"
@@ -372,17 +383,18 @@ def _part_cells(part: PairPart) -> list[str]:
     ]
 
 
-def _rule_texts(pair: ComparedPair) -> Iterator[str]:
-    """Yield the rules under which either side is worse."""
-    yield from _worse_texts(
+def _describe_rules(pair: ComparedPair) -> Iterator[str]:
+    """Yield the rules under which either side is worse than the other."""
+    # `pair.worse` has the rules under which the second side is worse.
+    yield from _describe_where_worse(
         pair.worse, pair.first_only, better_side=pair.first, worse_side=pair.second
     )
-    yield from _worse_texts(
+    yield from _describe_where_worse(
         pair.better, pair.second_only, better_side=pair.second, worse_side=pair.first
     )
 
 
-def _worse_texts(
+def _describe_where_worse(
     rules: Sequence[PairRule] | None,
     n_exclusive: int,
     *,
@@ -403,7 +415,7 @@ def _worse_texts(
     if not rules:
         yield f"{beginning} no values stand out from chance."
     for index, rule in enumerate(rules):
-        # A rule is counted on the pairs that no rule before it covers.
+        # `elsewhere` leaves out the pairs of earlier rules.
         rest = "elsewhere" if index == 0 else "in what no rule before covers"
         conditions = wording.format_conditions(rule.conditions)
         yield (
@@ -412,7 +424,7 @@ def _worse_texts(
         )
 
 
-def _values_text(example: PairPicture) -> str:
+def _format_values(example: PairPicture) -> str:
     """Return the values of a pair's parameters: ``elevation 12.3, object mug``."""
     texts = []
     for name, value in example.values.items():
@@ -421,7 +433,7 @@ def _values_text(example: PairPicture) -> str:
     return ", ".join(texts)
 
 
-def _captions(example: PairPicture, pair: ComparedPair) -> list[str]:
+def _make_captions(example: PairPicture, pair: ComparedPair) -> list[str]:
     """Return what each side predicts, and which is right."""
     captions = []
     for side, answer in zip((pair.first, pair.second), example.answers, strict=True):
@@ -430,7 +442,7 @@ def _captions(example: PairPicture, pair: ComparedPair) -> list[str]:
     return captions
 
 
-def _pictures_of(name: str, pair: ComparedPair) -> Iterator[ResultPart]:
+def _make_picture_parts(name: str, pair: ComparedPair) -> Iterator[ResultPart]:
     """Yield the images of pairs that only one side gets right.
 
     The part for a terminal has a line for each of the first pairs, with the paths of
@@ -442,31 +454,32 @@ def _pictures_of(name: str, pair: ComparedPair) -> Iterator[ResultPart]:
         pair: pair of both sides.
     """
     title = f"Only {name} gets right:"
-    lines: list[list[str]] = []
+    text_rows: list[list[str]] = []
     lines_without_pictures: list[str] = []
     groups: list[list[views.Picture]] = []
     for example in pair.discordant_pictures:
         if example.right != name:
             continue
-        line = "; ".join([*_captions(example, pair), _values_text(example)])
-        lines.append([line, *example.pictures])
+        line = "; ".join([*_make_captions(example, pair), _format_values(example)])
+        text_rows.append([line, *example.pictures])
         if example.pictures:
             groups.append(_group_pictures(example, pair))
         else:
             lines_without_pictures.append(line)
-    if groups and all(len(group) == 1 for group in groups):
+    has_single_images = groups and all(len(group) == 1 for group in groups)
+    if has_single_images:
         groups = [[group[0] for group in groups]]
-    yield ResultPart(title, rows=lines[:MAX_PICTURES], only="text")
+    yield ResultPart(title, rows=text_rows[:MAX_PICTURES], only="text")
     yield ResultPart(title, lines_without_pictures, pictures=groups, only="page")
 
 
 def _group_pictures(example: PairPicture, pair: ComparedPair) -> list[views.Picture]:
     """Return the images of a pair with captions; values are with the first one."""
-    captions = _captions(example, pair)
+    captions = _make_captions(example, pair)
     is_shared_image = len(example.pictures) == 1
     if is_shared_image:
         captions = ["; ".join(captions)]
-    captions[0] += f"; {_values_text(example)}"
+    captions[0] += f"; {_format_values(example)}"
     return [
         views.Picture(file, caption)
         for file, caption in zip(example.pictures, captions, strict=True)
@@ -474,7 +487,7 @@ def _group_pictures(example: PairPicture, pair: ComparedPair) -> list[views.Pict
 
 
 def make_compare_claims(result: CompareResult) -> Iterator[views.Claim]:
-    """Yield a claim for each pair."""
+    """Yield a claim for each pair, about the accuracy of its second side."""
     for pair in result.pairs:
         method = "Newcombe's, of pairs" if pair.units is None else f"over {pair.unit}s"
         statement = (

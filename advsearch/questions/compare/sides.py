@@ -18,11 +18,11 @@ import pandas as pd
 from advsearch.extend import InputError, errors, rules, wording, workbench
 
 DRAW_SETTINGS = ("grid", "controls", "samples", "sampler", "seed")
-"""Settings that decide which configurations are drawn."""
+"""Settings that decide which configurations are sampled."""
 SIDE_COLUMNS = ("object", "model", "answer")
-"""Columns of rows in which sides may differ."""
+"""Columns of rows in which sides may differ; "answer" is the adversarial scene."""
 SIDE_SETTINGS = ("object", "model")
-"""Settings in which sides may differ."""
+"""Settings that sides may differ in and that `get_deciding_settings` leaves out."""
 SECONDARY_SETTINGS = (
     *DRAW_SETTINGS,
     "label",
@@ -40,12 +40,15 @@ SECONDARY_SETTINGS = (
     "value_range",
     "adversarial_of",
 )
-"""Settings that do not tell sweeps apart: of draws, along with object and model, or of
-no adversarial scene.
+"""Settings that are not listed as differences: those of the draws, which are equal;
+those that follow from the object or the model, such as its label; and those that
+change no prediction.
 """
 
 TOLERANCE = 1e-4
-"""Relative to the largest value of a column: values come from single precision."""
+"""Largest difference of equal values, relative to the largest value of the column.
+Values come from single precision.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,10 +56,10 @@ class Side:
     """One of the things that are compared.
 
     Attributes:
-        name: what tells it from the others.
+        name: what distinguishes it from the other sides.
         sweep: sweep that has its rows.
         labels: its object, model and adversarial scene, by `SIDE_COLUMNS`.
-        rows: one for each image in their order (`StoredSweep.read_rows`), with the
+        rows: one row for each image in order (`StoredSweep.read_rows`), with the
             `number` of the image.
     """
 
@@ -72,7 +75,10 @@ class Side:
 
     @property
     def varying_parameters(self) -> list[str]:
-        """The parameters that have more than one value; not what names the side."""
+        """The parameters that have more than one value.
+
+        The columns "model" and "answer", which name the side, are left out.
+        """
         names = [
             name for name in self.rows.attrs["units"] if name not in ("model", "answer")
         ]
@@ -83,9 +89,9 @@ def read_sides(paths: Sequence[Path]) -> list[Side]:
     """Read the sides that sweeps compare, each with a different name.
 
     A sweep has a side for each of its models. The sweep of an adversarial scene has two
-    sides for each model: the clean scene and the adversarial one. If several sweeps are
-    compared, it has only the latter. An image is left out if the object is out of view
-    in any side.
+    sides for each model: the clean scene and the adversarial one. But if several sweeps
+    are compared, only the adversarial one is a side. An image is left out if the object
+    is out of view in any side.
 
     Raises:
         FileFormatError: a folder has another run, or a sweep that has not ended.
@@ -128,13 +134,14 @@ def name_sides(sides: Sequence[Side]) -> list[str]:
     columns = _find_different_columns(sides)
     names = []
     for side in sides:
-        # an empty label: the scene without an adversarial one
+        # The label is empty for the clean scene, which has no adversarial run.
         labels = [
             wording.shorten_names(side.labels[column]) or "as it is"
             for column in columns
         ]
         names.append(", ".join(labels))
     if len(set(names)) < len(names):
+        # A name is empty only if the sides differ in no column.
         folders = [side.sweep.folder.name for side in sides]
         names = [
             f"{folder}, {name}" if name else folder
@@ -157,10 +164,9 @@ def _find_different_columns(sides: Sequence[Side]) -> list[str]:
 def read_sweep_sides(path: Path, *, is_only_sweep: bool) -> Iterator[Side]:
     """Yield the sides of one sweep, which have no names yet.
 
-    A side has the rows of one model and one scene (clean or adversarial).
-
-    If the sweep has an adversarial scene, its clean scene comes first, but only if no
-    other sweep is compared.
+    A side has the rows of one model and one scene. If the sweep has an adversarial
+    scene and is the only one, its clean scene comes first and its adversarial scene
+    second. If other sweeps are compared, too, only the adversarial scene is yielded.
 
     Args:
         path: the run directory of the sweep.
@@ -175,7 +181,8 @@ def read_sweep_sides(path: Path, *, is_only_sweep: bool) -> Iterator[Side]:
     model_index = rows["step"] % len(models)
     rows["number"] = rows["step"] // len(models)
     rows["correct"] = rows["correct"] == 1
-    scene_masks = [rows["number"] >= 0]  # all rows are of one scene
+    # A mask selects the rows of one scene. Without an attack it selects all rows.
+    scene_masks = [rows["number"] >= 0]
     if sweep.config.adversarial_of:
         # The second half of the images are of the adversarial scene.
         n_images = sweep.summary.planned // len(models)
@@ -188,7 +195,8 @@ def read_sweep_sides(path: Path, *, is_only_sweep: bool) -> Iterator[Side]:
             is_of_side = is_of_scene & (model_index == index)
             side_rows = rows[is_of_side].reset_index(drop=True)
             labels = {"object": sweep.summary.object, "model": model, "answer": ""}
-            # Rows have a column only for what differs among them, such as "object".
+            # Rows have one of these columns only if it has several values. The values
+            # are joined, since an object may vary within one side.
             for column in SIDE_COLUMNS:
                 if column in side_rows:
                     labels[column] = ",".join(side_rows[column].unique())
@@ -246,11 +254,12 @@ def check_same_draws(first: Side, second: Side) -> None:
             f"{where}; sweep as many objects and environments in both"
         )
     if first.labels["object"] != second.labels["object"]:
-        return  # ranges may follow from the object
+        return  # default ranges may follow from the object
+    # The keys of "units" are the names of the parameters.
     for name in first.rows.attrs["units"]:
-        is_sampled = name not in (*SIDE_COLUMNS, "environment")
+        names_side_or_scene = name in (*SIDE_COLUMNS, "environment")
         is_shared = name in second.rows.attrs["units"]
-        if not is_sampled or not is_shared:
+        if names_side_or_scene or not is_shared:
             continue
         if not has_same_values(first.rows[name], second.rows[name]):
             raise InputError(
@@ -272,14 +281,15 @@ def has_same_values(first: pd.Series, second: pd.Series) -> bool:
 def find_different_settings(sides: Sequence[Side]) -> list[str]:
     """Return the names of settings that decide predictions and differ between sides.
 
-    These are settings of their sweeps, and what their rows differ in, as two models of
-    one sweep do. `SECONDARY_SETTINGS` are left out.
+    Two sweeps differ in settings; two models of one sweep differ in a column of their
+    rows. `SECONDARY_SETTINGS` are left out.
     """
+    # All sweeps have the same names of settings.
     first, *others = (side.sweep.config.get_deciding_settings() for side in sides)
     differing_settings = {
         name for other in others for name in other if other[name] != first[name]
     }
-    # These are not among the deciding settings.
+    # `get_deciding_settings` does not return these.
     differing_settings |= {
         name
         for name in SIDE_SETTINGS

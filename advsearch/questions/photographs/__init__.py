@@ -1,1 +1,1 @@
-"""Photographs of the real thing, aligned with renderings, judged and counted."""
+"""Photographs of the real object: align them with renderings, evaluate and count."""

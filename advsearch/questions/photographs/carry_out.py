@@ -50,11 +50,13 @@ from advsearch.questions.photographs.result import (
 )
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
-"""Of files that are photographs."""
+"""Suffixes of files that are photographs."""
 ALIGNED_NAME = re.compile(r"rendering-([0-9]{1,12})(?:-.*)?")
 """Name of the file of a photograph that was aligned with a rendering."""
 STORED_FIELDS = ("rendering", "right", "label", "file")
-"""What a stored photograph says of its rendering, and its own file."""
+"""What is stored with a photograph: name, correctness and predicted label of its
+rendering, and the photograph's own file.
+"""
 
 
 @workbench.with_checked_arguments
@@ -128,8 +130,8 @@ def _read_photos(run: Path) -> pd.DataFrame:
 def _stored_photo(row: workbench.Row) -> dict[str, Any]:
     """Return what is stored of a photograph; empty for rows of another kind.
 
-    It has the `STORED_FIELDS`, and "source", the name of the file that it came from;
-    that is empty if a browser sent it.
+    It has the `STORED_FIELDS`, and "source", the name of the file that it came from,
+    which is empty if a browser sent it.
     """
     photo = row.payload.get("photo") if isinstance(row.payload, dict) else None
     return photo if isinstance(photo, dict) else {}
@@ -223,7 +225,7 @@ class Photographs:
     row_kinds = (PHOTO, LOOSE_PHOTO)
 
     def __init__(self) -> None:
-        # of the last run
+        # The evaluators of the last run are cached.
         self._load_evaluators = lru_cache(maxsize=1)(_load_evaluators)
         # A scene is used only by the thread that loaded it.
         self._thread = ThreadPoolExecutor(1, "photographs")
@@ -297,9 +299,9 @@ class Photographs:
             self._add_aligned(run, rendering, data, source)
 
     def _add_loose(self, run: Path, data: bytes, source: str) -> None:
-        """Evaluate a photograph without a rendering; only predictions are stored.
+        """Evaluate and store a photograph that was aligned with no rendering.
 
-        It is cut to the size of each model's images.
+        It is cropped to the size of each model's images.
 
         Args:
             run: directory of the run.
@@ -310,16 +312,26 @@ class Photographs:
             number = resumed_run.store.get_last_step(LOOSE_PHOTO) + 1
             rows = []
             for evaluator in self._load_evaluators(run):
+                # `size` is (height, width), and the function takes (width, height).
                 cut_photo = result.sanitize_photo(data, evaluator.size[::-1])
                 row = workbench.Row(LOOSE_PHOTO, number, values={})
-                photo: dict[str, JsonValue] = {"source": source}
-                rows.append(_add_prediction(row, evaluator, None, cut_photo, photo))
+                stored_photo: dict[str, JsonValue] = {"source": source}
+                rows.append(
+                    _add_prediction(
+                        row,
+                        evaluator,
+                        rendering=None,
+                        cut_photo=cut_photo,
+                        stored_photo=stored_photo,
+                    )
+                )
             resumed_run.append_rows(*rows)
 
     def _add_aligned(self, run: Path, rendering: str, data: bytes, source: str) -> None:
-        """Evaluate a photograph that was aligned with a rendering, and store both.
+        """Evaluate a photograph that was aligned with a rendering, and store it.
 
-        The photograph is cut to the size of the rendering.
+        It is cropped to the size of the rendering. What is stored with it includes the
+        model's prediction about the rendering.
 
         Args:
             run: directory of the run.
@@ -331,25 +343,33 @@ class Photographs:
         with Image.open(rendering_file, formats=("PNG", "JPEG")) as image:
             # A bad photograph is rejected before a scene is loaded.
             cut_photo = result.sanitize_photo(data, image.size)
-        # The number of the photograph is one more than that of the last.
+        # The number of a photograph is one more than that of the one before.
         with RunDirectory.resume(run) as resumed_run:
             number = resumed_run.store.get_last_step(PHOTO) + 1
             file_name = f"{rendering}-{number:04d}.jpg"
             rows = []
             for evaluator in self._load_evaluators(run):
-                is_right, label, values = evaluator.evaluate_rendering(
-                    resumed_run.store, rendering, rendering_file
+                rendering_right, rendering_label, row_values = (
+                    evaluator.evaluate_rendering(
+                        resumed_run.store, rendering, rendering_file
+                    )
                 )
-                photo: dict[str, JsonValue] = {
+                stored_photo: dict[str, JsonValue] = {
                     "source": source,
                     "rendering": rendering,
-                    "right": is_right,
-                    "label": label,
+                    "right": rendering_right,
+                    "label": rendering_label,
                     "file": file_name,
                 }
-                row = workbench.Row(PHOTO, number, values=values)
+                row = workbench.Row(PHOTO, number, values=row_values)
                 rows.append(
-                    _add_prediction(row, evaluator, rendering, cut_photo, photo)
+                    _add_prediction(
+                        row,
+                        evaluator,
+                        rendering=rendering,
+                        cut_photo=cut_photo,
+                        stored_photo=stored_photo,
+                    )
                 )
             writing.write_bytes(run / directory.PHOTOGRAPHS / file_name, cut_photo)
             resumed_run.append_rows(*rows)
@@ -360,16 +380,18 @@ def _add_prediction(
     evaluator: _PhotoEvaluator,
     rendering: str | None,
     cut_photo: bytes,
-    photo: Mapping[str, JsonValue],
+    stored_photo: Mapping[str, JsonValue],
 ) -> workbench.Row:
-    """Return a row with a model's prediction on a photograph.
+    """Return a row with a model's prediction about a photograph.
+
+    The name of the model is added to the row's values.
 
     Args:
         row: row with the values of the rendering, if there is one.
-        evaluator: evaluator of the model, whose name is added to the values.
+        evaluator: evaluator of the model.
         rendering: name of the rendering that the photograph was aligned with, if any.
-        cut_photo: the image file.
-        photo: what is stored of the photograph in addition to the prediction.
+        cut_photo: the cropped photograph, an image file as bytes.
+        stored_photo: what is stored of the photograph in addition to the prediction.
     """
     # A sweep over several objects stores which one it was.
     object_name = None
@@ -379,7 +401,8 @@ def _add_prediction(
     row = replace(row, values={**row.values, "model": model_value})
     judgement = evaluator.evaluate(rendering, object_name, cut_photo)
     row = workbench.add_judgement(row, judgement)
-    return replace(row, payload={"photo": dict(photo), "answer": row.payload})
+    # The payload of the prediction, such as boxes, becomes a part of the row's payload.
+    return replace(row, payload={"photo": dict(stored_photo), "answer": row.payload})
 
 
 @dataclass(frozen=True)
@@ -387,13 +410,14 @@ class _PhotoEvaluator:
     """Evaluate photographs by one model of a run.
 
     Attributes:
-        model: predicts.
-        task: evaluates the prediction.
+        model: model that predicts.
+        task: task that evaluates the prediction.
         size: (height, width) in pixels of the images that the model is run on.
-        find_truth: returns the ground truth of a photograph by the name of the
-            rendering that it was aligned with and of the object; None for a photograph
-            that was aligned with none, and for the only object.
-        index: index of the model, among `n_models` of the run.
+        find_truth: returns the ground truth of a photograph by the name of its
+            rendering (None if it was aligned with none) and the name of the object
+            (None if the run has a single object).
+        index: index of the model in the run.
+        n_models: number of models in the run.
     """
 
     model: Model
@@ -432,8 +456,8 @@ class _PhotoEvaluator:
     ) -> tuple[bool, str, Mapping[str, workbench.Value]]:
         """Return whether a rendering is right, its label, and the values of its row.
 
-        The prediction on a rendering of a sweep is read from the sweep's rows. For a
-        rendering of an attack, the model predicts the image file.
+        For a rendering of a sweep, they are read from the sweep's rows. For a rendering
+        of an attack, the model is run on the image file, and there are no values.
 
         Args:
             store: stored rows of the run.
@@ -444,15 +468,15 @@ class _PhotoEvaluator:
         Raises:
             InputError: the results have no row of a sweep's rendering.
         """
-        # Renderings of a sweep are numbered; those of an attack have names.
         is_of_sweep = rendering.isdecimal()
         if is_of_sweep:
-            # Each image has a row for each model.
+            # Rows are numbered by image, then by model.
             step = int(rendering) * self.n_models + self.index
             row = store.read_row("sweep", step)
             if row is not None:
                 return bool(row.correct), row.label or "", row.values
-        # Only an attack stores a rendering as PNG: a sweep has small JPEGs.
+        # A sweep stores its renderings as JPEG, an attack as PNG. So this is a
+        # rendering of a sweep without a row.
         if file.suffix != ".png":
             raise InputError(
                 f"rendering: the results have no row for {file.stem}; it "
@@ -463,7 +487,7 @@ class _PhotoEvaluator:
 
 
 def _load_evaluators(run: Path) -> list[_PhotoEvaluator]:
-    """Load what evaluates photographs of a run, one for each of its models.
+    """Load the evaluators of photographs of a run, one for each of its models.
 
     Raises:
         InputError: the run is no attack and no sweep.
@@ -503,15 +527,15 @@ def _find_sweep_truth(
     """Return the ground truth of an image of a sweep for the task of a model.
 
     If the ground truth does not depend on the configuration, or no image is named, it
-    is that of the object alone.
+    is the ground truth of the object.
 
     Args:
         sweep: the loaded scenes (`SceneLoader`).
         model_index: index of the model.
         image_number: number of the image as text; None for a photograph that was
             aligned with none.
-        object_name: name of the object. If it is None, or a name that the sweep does
-            not have, the first object is used: the sweep has a single one then.
+        object_name: name of the object. Without a scene of this name, the first scene
+            is used: rows state the object only if the sweep has several.
 
     Raises:
         InputError: the sweep has no such image.
@@ -519,16 +543,18 @@ def _find_sweep_truth(
     job = sweep.job
     task = job.tasks[model_index]
     if image_number is None or not _needs_position(task):
-        first_scene = job.scenes[0]
-        scenes = (scene for scene in job.scenes if scene.object == object_name)
-        return task.truth(job.make_facts(next(scenes, first_scene), {}))
+        scene = next(
+            (scene for scene in job.scenes if scene.object == object_name),
+            job.scenes[0],
+        )
+        return task.truth(job.make_facts(scene, {}))
     number = int(image_number)
     if number >= job.images_per_scene * len(job.scenes):
         raise InputError(
             f"rendering: the sweep has no picture {image_number}; it "
             "belongs to another run"
         )
-    scene, queries = sweep.make_queries(number)
+    scene, queries = sweep.make_queries(number)  # a query for each model
     query = queries[model_index]
     return scene.problems[model_index].find_truth(query.u, query.values)
 
@@ -538,6 +564,7 @@ def _load_attack_evaluators(run: Path, config: AttackConfig) -> list[_PhotoEvalu
 
     An attack on an ensemble has several models; each gets an evaluator.
     """
+    # The second value is the loaded configuration, which is not needed here.
     problem, _ = workbench.problem_from_config(workbench.with_evaluation_only(config))
     models: list[tuple[Model, Task]] = [(problem.model, problem.task)]
     if isinstance(problem.task, workbench.EnsembleTask):
@@ -547,6 +574,7 @@ def _load_attack_evaluators(run: Path, config: AttackConfig) -> list[_PhotoEvalu
             model=model,
             task=task,
             size=config.resolution or model.input_size,
+            # the remaining arguments are the names of the rendering and the object
             find_truth=partial(_find_attack_truth, run, problem, task),
             index=index,
             n_models=len(models),
@@ -569,12 +597,14 @@ def _find_attack_truth(
             the truth of the clean scene.
         _object: not used, as an attack has one object.
     """
-    u = problem.domain.start
+    u = problem.domain.start  # the clean scene
     is_adversarial = rendering not in (None, "clean")
-    # Otherwise the clean scene has the same truth.
+    # If the truth does not depend on the configuration, the clean scene's is the same.
     if is_adversarial and _needs_position(task):
         u = workbench.read_stored_configuration(run, problem)
-    # A trial has the conditions of its seed, others those that the scene comes with.
+    # A trial has the conditions that its seed draws. Other renderings have the
+    # conditions of the scene, for which the seed is None.
+    # A name without "verification-" stays as it is, and is no number.
     _, _, trial_number = (rendering or "").rpartition("verification-")
     seed = None
     if trial_number.isdecimal():

@@ -22,9 +22,7 @@ from advsearch.questions.photographs.result import (
 )
 
 KEY = "X-Advsearch-Key"
-"""Header with which this server's page sends a photograph; no other page can send
-it.
-"""
+"""Header with which this server's page sends the key; no other page knows the key."""
 
 
 class PhotographPages:
@@ -79,7 +77,7 @@ class PhotographPages:
             name: name of the image.
 
         Raises:
-            Refused: there is no such image.
+            RequestRejected: there is no such image.
         """
         with reject_invalid(HTTPStatus.NOT_FOUND):
             if kind == "rendering":
@@ -99,24 +97,25 @@ class PhotographPages:
     ) -> tuple[str, bytes]:
         """Store a photograph of a rendering, and return the table of agreement as JSON.
 
-        The request is checked first: another web page in the same browser must not be
-        able to send photographs to this server.
+        The table counts in how many photographs the model is right as it is in the
+        rendering. The request is checked first: another web page in the same browser
+        must not be able to send photographs to this server.
 
         Args:
             run: the directory of the run.
             name: name of the rendering.
             headers: headers of the request.
-            key: key that this server's own page sends. Other pages send no origin, or
-                another key.
+            key: key that this server's own page sends. A request of another program
+                may have no header "Origin", and one of another page lacks the key.
             read_data: reads the photograph, once the rendering is known to exist.
 
         Raises:
-            Refused: another page sent it, there is no such rendering, or the data is no
-                photograph.
+            RequestRejected: another page sent it, there is no such rendering, or the
+                data is no photograph.
         """
         sent_key = headers.get(KEY, "").encode("utf-8", "replace")
-        # `compare_digest` takes equally long for all keys, so that its time tells
-        # nothing.
+        # `compare_digest` takes equally long for all keys, so that its time reveals
+        # nothing about the key.
         has_key = hmac.compare_digest(key.encode(), sent_key)
         if headers.get("Origin") is None or not has_key:
             raise markup.RequestRejected(

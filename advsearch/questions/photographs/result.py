@@ -1,11 +1,11 @@
 """The table of agreement between renderings and photographs, and its page.
 
-A rendering is named as its file is: a sweep's by the number of its picture, an attack's
-``adversarial``, ``clean`` or ``verification-00``. A photograph comes from a browser, so
-it is not trusted: its size is checked before it is decoded, it is cut to the
-rendering's shape, and written again without metadata (coordinates, names of cameras).
-The page lays a rendering, translucent or its edges, over the camera's picture, after
-the phone app of 3DB (Leclerc et al. 2021, appendix D).
+A rendering has the name of its file: the number of a picture for a sweep, or
+``adversarial``, ``clean`` or ``verification-00`` for an attack. A photograph comes from
+a browser, so it is not trusted: its size is checked before it is decoded, it is cropped
+to the aspect ratio of the rendering, and written again without metadata (coordinates,
+names of cameras). The page lays a rendering, translucent or its edges, over the
+camera's picture, as the phone app of 3DB does (Leclerc et al. 2021, appendix D).
 """
 
 from __future__ import annotations
@@ -27,28 +27,32 @@ LOOSE_PHOTO = "loose photo"
 
 
 class PhotographedRendering(results.Fields):
-    """What one model predicts of a rendering and of the photographs aligned with it."""
+    """Predictions of a model about a rendering and the photographs aligned with it."""
 
     rendering: str = Field(
-        description="its name: the number of a sweep's picture, or "
+        description="name of the rendering: the number of a sweep's picture, or "
         "adversarial, clean, ..."
     )
     model: str
-    label: str = Field(description="what the model predicts of the rendering")
-    rendering_right: bool = Field(description="whether that is right")
+    label: str = Field(description="what the model predicts about the rendering")
+    rendering_right: bool = Field(description="whether that prediction is right")
     photos: int
-    photos_right: int = Field(description="photographs in which the model is right")
+    photos_right: int = Field(
+        description="number of photographs in which the model is right"
+    )
     agreeing: int = Field(
-        description="photographs that are right where the rendering "
-        "is, or wrong where it is"
+        description="number of photographs that are right like the rendering, or wrong "
+        "like it"
     )
     interval: results.Interval = Field(
-        description="95 % Clopper-Pearson interval of the share that agrees"
+        description="95 % Clopper-Pearson interval of the fraction that agrees"
     )
     labels: list[str] = Field(
-        description="what the model predicts of each photograph, in their order"
+        description="what the model predicts about each photograph, in their order"
     )
-    files: list[str] = Field(description="their files in images/photos/, likewise")
+    files: list[str] = Field(
+        description="files of the photographs in images/photos/, in the same order"
+    )
 
 
 class PhotoAgreement(results.Fields):
@@ -70,7 +74,7 @@ class PhotoAgreement(results.Fields):
         description="wrong in the rendering, wrong in the photograph"
     )
     agreement: float | None = Field(
-        description="share of the photographs that agree; null where there are none"
+        description="fraction of the photographs that agree; null without photographs"
     )
     interval: results.Interval | None = Field(
         description="95 % Clopper-Pearson interval of the agreement, as if all "
@@ -80,13 +84,13 @@ class PhotoAgreement(results.Fields):
 
 
 MAX_PIXELS = 50_000_000
-"""Limit of a photograph as it is sent; the largest phones take 50 million."""
+"""Maximum number of pixels of a photograph; those of phones have up to 50 million."""
 MAX_SIZE = 1024
-"""Longer side, in pixels, of a photograph that is stored."""
+"""Maximum length in pixels of the longer side of a stored photograph."""
 N_NAMED_RENDERINGS = 8
-"""Renderings that the page names, beside the last one."""
+"""Number of renderings that the page names, in addition to the last one."""
 JPEG_QUALITY = 95
-"""Of its JPEG file, 1 to 95."""
+"""Quality of stored photographs, 1 to 95."""
 _NAME = re.compile(r"[0-9]{1,12}|clean|adversarial|verification-[0-9]{2}")
 _PHOTO = re.compile(rf"(?:{_NAME.pattern})-[0-9]{{4,9}}\.jpg")
 
@@ -119,7 +123,7 @@ def list_renderings(run: Path) -> tuple[str, ...]:
 
     Those of an attack are in alphabetical order, but "adversarial" comes first.
     """
-    stored_images = markup.find_thumbnails(run)  # of a sweep
+    stored_images = markup.find_thumbnails(run)  # only a sweep has them
     if stored_images is not None:
         return tuple(map(str, stored_images.numbers))
     names = [
@@ -147,11 +151,11 @@ def sanitize_photo(data: bytes, shape: tuple[int, int]) -> bytes:
 
     Args:
         data: a file in JPEG, PNG or WebP.
-        shape: (width, height) whose aspect ratio it is cut to. The longer side is at
-            most `MAX_SIZE` pixels.
+        shape: (width, height) with the aspect ratio to which the photograph is cropped.
+            The longer side of the result has at most `MAX_SIZE` pixels.
 
     Raises:
-        InputError: it is too large, or no such image.
+        InputError: the data is too large, or no image of these formats.
     """
     if len(data) > markup.MAX_BODY_BYTES:
         raise InputError(
@@ -213,8 +217,8 @@ def make_align_page(
 
     Args:
         run: name of the run.
-        renderings: names of its renderings, of which the page shows the first.
-        table: counts of agreement, which the page has at its end.
+        renderings: names of its renderings. The page begins with the first.
+        table: counts of agreement, which stand at the end of the page.
         key: key that the server expects with a photograph.
         phone_address: address by which another device opens the page; None if none can.
     """
@@ -233,10 +237,11 @@ def make_align_page(
     data = []
     scripts: tuple[str, ...] = ()
     if renderings:
-        first_rendering = list(renderings[:1])
-        page_data = {"key": key, "names": first_rendering}
+        # The script takes a list, of the renderings to lay over the camera's image.
+        page_data = {"key": key, "names": [renderings[0]]}
         data = [markup.make_data_script(page_data, "photographing")]
         scripts = ("make.js", "align.js")
+    # `connects` lets the script send the photograph to the server.
     return markup.make_document(
         f"{run}, photographs", header, main, data=data, scripts=scripts, connects=True
     )
@@ -245,7 +250,7 @@ def make_align_page(
 def _align_section(renderings: Sequence[str]) -> markup.Html:
     """Return the section with the camera image and a rendering over it.
 
-    Without renderings it tells why there are none. The script of the page fills the
+    Without renderings it states why there are none. The script of the page fills the
     element "align".
     """
     if not renderings:
@@ -256,7 +261,7 @@ def _align_section(renderings: Sequence[str]) -> markup.Html:
         return markup.make_element(
             "p", reason, markup.make_element("code", "keep_pictures=all"), "."
         )
-    # the first ones, and the last one
+    # The page names the first renderings, and the last one.
     names = ", ".join(renderings[:N_NAMED_RENDERINGS])
     if len(renderings) > N_NAMED_RENDERINGS:
         names += f", ... {renderings[-1]}"
@@ -372,7 +377,7 @@ def _rendering_table(renderings: Sequence[PhotographedRendering]) -> markup.Html
 def _photographs_cell(rendering: PhotographedRendering) -> markup.Html:
     """Return in how many photographs the model is right, with a link to each.
 
-    The text of a link is what the model predicts of the photograph.
+    The text of a link is what the model predicts about the photograph.
     """
     links = []
     for label, file in zip(rendering.labels, rendering.files, strict=True):

@@ -1,6 +1,4 @@
-"""`recipe`: run an experiment that a YAML file describes, and make figures of its
-results.
-"""
+"""`recipe`: run an experiment that a YAML file describes, and make its figures."""
 
 from __future__ import annotations
 
@@ -54,11 +52,11 @@ from advsearch.questions.recipe.result import (
     RecipeResult,
 )
 
-# a full turn, degrees
+# degrees
 FULL_TURN = 360.0
-# the note of a run's store that holds the recipe, so that a resumed run repeats it
+# name of the note in a run's store that holds the recipe, so that a resumed run has it
 RECIPE_NOTE = "recipe"
-# with the result of an attack or of a sweep
+# a run, and the result of its attack or sweep
 DoneRun = tuple[PlannedRun, Any]
 
 FIGURES: Mapping[str, tuple[type[Options], Any]] = {
@@ -70,14 +68,16 @@ FIGURES: Mapping[str, tuple[type[Options], Any]] = {
     "scaling": (Options, rates.make_scaling_figure),
     "surface": (Options, rates.make_surface_figure),
 }
-"""The options of each kind of figure, and the function that makes it of rows."""
+"""The options of each kind of figure, and the function that makes the figure."""
 
 COMPARES_MODELS = ("agreement", "scaling", "surface")
-"""Kinds of figures that show all models; of the other kinds each model has its own."""
+"""Kinds of figures that show all models together. Of other kinds there is one figure
+for each model.
+"""
 
 # options of figures that name columns
 COLUMN_OPTIONS = ("by", "series", "texture", "shape", "shares")
-# columns of every recipe
+# columns that every recipe has
 COMMON_COLUMNS = (
     "object",
     "environment",
@@ -85,7 +85,7 @@ COMMON_COLUMNS = (
     rates.PREDICTION_COLUMN,
     rates.PART_COLUMN,
 )
-# stands for the parameters of a control that does not declare them
+# in place of the parameters of a control that does not declare them
 ANY_PARAMETER = "*"
 
 
@@ -110,12 +110,14 @@ def run_recipe(context: RunContext[RecipeConfig]) -> RecipeResult:
     if is_new:  # a resumed run was checked when it began
         check_recipe(recipe, config)
         check_figures(recipe, check_runs(runs), config.recipe)
+    # For a resumed run this writes the same note again.
     context.run.store.write_note(
         RECIPE_NOTE, json.dumps(recipe.model_dump(mode="json"))
     )
 
     done, warnings = _run_parts(runs, context)
     recipe_figures = list[RecipeFigure]()
+
     if any(result.is_unfinished for _, result in done):
         context.ending = results.INTERRUPTED
     elif config.photographs is not None:
@@ -131,9 +133,11 @@ def run_recipe(context: RunContext[RecipeConfig]) -> RecipeResult:
 
 
 def _read_noted_recipe(context: RunContext[RecipeConfig]) -> dict[str, Any] | None:
-    """Read the recipe that a resumed run began with, None of a new run."""
+    """Read the recipe that a resumed run began with.
+
+    None for a new run, and for a run that was stopped before it noted its recipe.
+    """
     resumed = context.resumed
-    # a run that was stopped at once has no store or has not noted its recipe
     if resumed is None or not Store.is_in(resumed):
         return None
     with Store.open_to_read(resumed) as store:
@@ -157,7 +161,7 @@ def _make_result(
     warnings: Sequence[str],
     context: RunContext[RecipeConfig],
 ) -> RecipeResult:
-    """Make the result of a recipe; a resumed run adds the seconds it took before.
+    """Make the result of a recipe, with the seconds of a resumed run before it stopped.
 
     Args:
         recipe: the recipe.
@@ -175,10 +179,10 @@ def _make_result(
             part=run.part,
             command=run.config.command,
             object=run.config.object,
-            ending=result.ending,
-            renders=sum(result.renders.values()),
+            ending=run_result.ending,
+            renders=sum(run_result.renders.values()),
         )
-        for run, result in done
+        for run, run_result in done
     ]
     result = context.result(
         RecipeResult,
@@ -194,17 +198,18 @@ def _make_result(
         figures=recipe_figures,
         warnings=list(dict.fromkeys(warnings)),
     )
-    # a run that was killed has no summary with seconds
+    # A run that was killed has no summary, and its seconds are unknown.
     if context.resumed is not None and (context.resumed / "summary.json").is_file():
         previous = read_result(context.resumed)
-        result.seconds["total"] += getattr(previous, "seconds", {"total": 0.0})["total"]
+        previous_seconds = getattr(previous, "seconds", {"total": 0.0})
+        result.seconds["total"] += previous_seconds["total"]
     return result
 
 
 def _list_scene_names(recipe: Recipe, config: RecipeConfig) -> dict[str, list[str]]:
     """Return the names of the objects, environments and models of a recipe.
 
-    These are by the name of the setting: "object", "environment" and "model".
+    The keys are the names of the settings: "object", "environment" and "model".
     """
     recipe_settings = description.apply_command_settings(recipe, config).settings
     defaults = {
@@ -237,11 +242,12 @@ def check_recipe(recipe: Recipe, config: RecipeConfig) -> None:
             )
         photographs = workbench.load_photographs()
         for run in photographed:
+            # The photographs of an object are in a directory of its name.
             directory = Path(config.photographs) / Path(run.config.object).stem
             # only a check: raises if the task cannot evaluate a photograph
             photographs.list_files(directory, run.config.task)
     for figure in recipe.figures:
-        kind, _ = read_figure_options(figure, config.recipe)
+        kind, _ = read_figure_options(figure, config.recipe)  # checks the options, too
         if kind == "cues" and config.task_name == wording.DETECTION:
             raise InputError(
                 f"task: {config.recipe} asks whether predictions are classes of the "
@@ -251,16 +257,17 @@ def check_recipe(recipe: Recipe, config: RecipeConfig) -> None:
 
 
 def check_runs(runs: Sequence[PlannedRun]) -> dict[str, set[str]]:
-    """Load everything that the runs name, and return the parameters of each part.
+    """Load everything that the runs name, and return the columns of each part.
 
     Without this check, a wrong name might be found only after hours of rendering. Runs
-    whose settings differ in nothing but seed and workers are loaded once.
+    whose settings differ only in seed and workers are loaded once.
 
     Returns:
-        For each part the names of its parameters, which are columns of its rows.
+        For each part the names of the columns that its rows have: parameters, and
+        "workers" if it sets that.
     """
-    parameters_of_settings = dict[str, set[str]]()
-    parameters_of_part = defaultdict[str, set[str]](set)
+    columns_of_settings = dict[str, set[str]]()
+    columns_of_part = defaultdict[str, set[str]](set)
     config_of_run = {run.name: run.config for run in runs}
     for run in runs:
         distinct_settings = {
@@ -268,23 +275,24 @@ def check_runs(runs: Sequence[PlannedRun]) -> dict[str, set[str]]:
             for name, value in run.config.to_json().items()
             if name not in ("seed", WORKERS_COLUMN)
         }
-        key = f"{distinct_settings} {run.around}"  # settings have no hash, text has
-        if key not in parameters_of_settings:
+        # A mapping has no hash, so its text is the key.
+        key = f"{distinct_settings} {run.around}"
+        if key not in columns_of_settings:
             # the search around whose distribution this run samples
             search = config_of_run[run.around] if run.around else None
-            parameters_of_settings[key] = _check_run(run.config, search)
-        parameters_of_part[run.part] |= parameters_of_settings[key]
+            columns_of_settings[key] = _check_run(run.config, search)
+        columns_of_part[run.part] |= columns_of_settings[key]
         if getattr(run.config, WORKERS_COLUMN, None) is not None:
-            parameters_of_part[run.part].add(WORKERS_COLUMN)
-    return parameters_of_part
+            columns_of_part[run.part].add(WORKERS_COLUMN)
+    return columns_of_part
 
 
 def _check_run(config: SceneConfig, search: SceneConfig | None) -> set[str]:
-    """Check a run by loading what it names, and return the parameters of its rows.
+    """Check a run by loading what it names, and return the columns of its rows.
 
     The parameters of a sweep are those that its scenes describe. A run that samples
-    around the result of a search cannot be loaded yet, since its ranges follow from
-    that result; its parameters are those of the search's controls.
+    around the distribution that a search found cannot be loaded before the search: its
+    columns are the parameters of the search's controls.
 
     Args:
         config: the settings of the run.
@@ -299,6 +307,7 @@ def _check_run(config: SceneConfig, search: SceneConfig | None) -> set[str]:
         assert isinstance(config, AttackConfig)  # sweeps have returned above
         workbench.check_from_config(config)
     source = search or config  # the settings with the controls
+    # `over` are the controls of an attack that vary at random.
     for name in (*source.controls, *getattr(source, "over", {})):
         kind = name.partition(":")[0]
         parameters = []
@@ -306,10 +315,11 @@ def _check_run(config: SceneConfig, search: SceneConfig | None) -> set[str]:
             parameters = [
                 parameter.name for parameter in workbench.CONTROLS[kind].parameters
             ]
-        # A control that declares none has parameters of the scene, whatever they are.
-        columns |= {
-            f"{name}.{parameter}" for parameter in parameters or [ANY_PARAMETER]
-        }
+        # A control that declares no parameters has some of the scene's, which are not
+        # known here.
+        if not parameters:
+            parameters = [ANY_PARAMETER]
+        columns |= {f"{name}.{parameter}" for parameter in parameters}
     return columns
 
 
@@ -329,16 +339,16 @@ def check_figures(
     for index, described in enumerate(recipe.figures, start=1):
         kind, options = read_figure_options(described, where)
         location = f"It stands in {where}, figure {index} ({kind})"
-        # the part that all others are compared with; it needs none of the columns
+        # The part that all others are compared with needs none of the columns.
         baseline = getattr(options, "beside", None)
         _check_option_parts(recipe, options, baseline, location)
-        parts = options.of or tuple(columns)
+        parts = options.of or tuple(columns)  # by default all parts
         columns_of_part = {
             part: part_columns
             for part, part_columns in columns.items()
             if part in parts and part != baseline
         }
-        if not columns_of_part:
+        if not columns_of_part:  # the figure shows only the baseline or photographs
             continue
         for option in COLUMN_OPTIONS:
             value = getattr(options, option, None) or ()  # a name, or several
@@ -360,7 +370,7 @@ def _check_option_parts(
 
     Args:
         recipe: the recipe with its parts.
-        options: options of the figure, with the parts `of`.
+        options: options of the figure; `of` are the parts that it shows.
         baseline: the part that all others are compared with; None without one.
         location: location of the figure, for messages.
     """
@@ -399,9 +409,9 @@ def _check_column(
         known.add(rates.GROUP_COLUMN)
     if name in known:
         return
-    # a control that does not declare its parameters may have this one
-    # ("mitsuba.*" stands for any parameter of the control "mitsuba")
-    matching = {name, f"{name.partition('.')[0]}.{ANY_PARAMETER}"}
+    # "mitsuba.*" stands for any parameter of the control "mitsuba".
+    control_name = name.partition(".")[0]
+    matching = {name, f"{control_name}.{ANY_PARAMETER}"}
     lacking = [
         part
         for part, columns in columns_of_part.items()
@@ -447,15 +457,16 @@ def _run_parts(
 ) -> tuple[list[DoneRun], list[str]]:
     """Run what is not finished, until a run is interrupted.
 
-    A run may sample around the result of a search, that is from the distribution that
-    the search found. If the search found none, the run is left out.
+    A run may sample around the distribution that a search found. If the search found
+    none, the run is left out.
 
     Args:
         runs: all runs, a search before the runs around it.
         context: context of the recipe's run.
 
     Returns:
-        The runs with their results, and a sentence for each run that was left out.
+        The runs with their results, without those after an interrupt; and a sentence
+        for each run that was left out.
     """
     done = list[DoneRun]()
     left_out = list[str]()
@@ -475,9 +486,8 @@ def _run_parts(
                     f"{run.part} is left out for it."
                 )
                 continue
-            config = sample_around(
-                config, search.distribution, search.configuration or {}
-            )
+            search_ranges = search.configuration or {}
+            config = sample_around(config, search.distribution, search_ranges)
         result = context.run_part(run.name, config)
         done.append((run, result))
         if result.is_unfinished:
@@ -497,7 +507,8 @@ def sample_around(
     Args:
         config: settings of the run that samples.
         distribution: mean of each parameter, and deviations as fractions of ranges.
-        search_ranges: the parameters of the search with their ranges.
+        search_ranges: the parameters of the search with their ranges; empty if it has
+            none.
     """
     controls: dict[str, dict[str, object]] = {}
     for (name, mean), deviation in zip(
@@ -523,9 +534,9 @@ def _range_around(
 ) -> list[float]:
     """Return the range of the uniform distribution with some mean and deviation.
 
-    The range is cut to that of the search. If the search went over a full turn of an
-    angle, it is cut to one turn instead. For a logarithmic parameter, the logarithm is
-    uniform.
+    The range is clipped to that of the search. If the search went over a full turn of
+    an angle, it is clipped to one turn instead. For a logarithmic parameter, the
+    logarithm is uniform.
 
     Args:
         mean: mean of the distribution.
@@ -538,7 +549,7 @@ def _range_around(
     # A uniform distribution of deviation s is 2 sqrt(3) s wide.
     half_width = math.sqrt(3.0) * deviation * (upper - lower)
     is_full_turn = parameter.periodic and upper - lower >= FULL_TURN
-    if is_full_turn:  # an angle beyond the bounds is one inside of them
+    if is_full_turn:  # an angle beyond the bounds is the same as one within them
         half_width = min(half_width, FULL_TURN / 2)
         bounds = [center - half_width, center + half_width]
     else:
@@ -616,7 +627,7 @@ def _read_frame(
 ) -> Rows:
     """Read the rows of all runs into one frame.
 
-    The column of the part has the name of the run's part. Photographs that a sweep was
+    The column "part" has the name of the run's part. Photographs that a sweep was
     compared with have rows, too, with the part `PHOTOGRAPHS`. Rows of a sweep with the
     setting `workers` have it as a column.
 
@@ -629,9 +640,10 @@ def _read_frame(
     units = dict[str, str]()
     surfaces = dict[str, Any]()
     for run, result in done:
-        # kinds of stored rows by the part that they count for; an attack has trials
+        # The kinds of stored rows that count for each part.
+        is_sweep = isinstance(run.config, SweepConfig)
         row_kinds: dict[str, Sequence[str]] = {run.part: tuple(TRIAL_NAMES)}
-        if isinstance(run.config, SweepConfig):
+        if is_sweep:
             row_kinds = {
                 run.part: ("sweep",),
                 PHOTOGRAPHS: workbench.load_photographs().row_kinds,
@@ -704,13 +716,14 @@ def make_figures(rows: Rows, kind: str, options: Options) -> Iterator[FigureCont
     """
     part_of_row = rows[rates.PART_COLUMN]
     _, make_figure = FIGURES[kind]
-    is_selected = part_of_row != PHOTOGRAPHS
     if options.required_parts:
         is_selected = part_of_row.isin(options.required_parts)
+    else:
+        is_selected = part_of_row != PHOTOGRAPHS
     selected = rows[is_selected]
-    compares_models = (
-        kind in COMPARES_MODELS or rates.MODEL_COLUMN in vars(options).values()
-    )
+    # An option such as `by` or `series` may name the column of the models.
+    shows_models = rates.MODEL_COLUMN in vars(options).values()
+    compares_models = kind in COMPARES_MODELS or shows_models
     rows_of_model = {"": selected}
     if not compares_models and rates.MODEL_COLUMN in selected:
         rows_of_model = rates.split_rows(selected, rates.MODEL_COLUMN)

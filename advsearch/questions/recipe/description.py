@@ -27,11 +27,11 @@ CONFIGS: Mapping[str, type[SceneConfig]] = {
     "attack": AttackConfig,
     "sweep": SweepConfig,
 }
-"""The settings of a part, by its command."""
-# the part that the rows of photographs belong to
+"""Class of the settings of a part, by the part's command."""
+# name of the part that the rows of photographs have
 PHOTOGRAPHS = "photographs"
 COMMAND_SETTINGS = (*settings.RUN_LOCATION, "seed", "threads", "deterministic")
-"""Settings that belong to the command line and not into a recipe's file."""
+"""Settings that are given with the command and not in the file of a recipe."""
 
 MAX_PARTS = 64
 MAX_FIGURES = 32
@@ -43,7 +43,7 @@ Settings = dict[str, object]
 
 
 class _Described(BaseModel):
-    """Base of what a recipe's file describes; unknown names are errors."""
+    """Base of what the file of a recipe contains; unknown names are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -51,8 +51,9 @@ class _Described(BaseModel):
 class Part(_Described):
     """Runs of one command, one for each object.
 
-    A part samples around the distributions that the searches of the part `around`
-    found, or the same configurations as the part `drawn_as`, which has the same ranges.
+    If `around` names an earlier part, whose runs are searches, each run samples around
+    the distribution that a search found. If `drawn_as` names an earlier part with the
+    same ranges, the runs sample the same configurations as that part.
     """
 
     command: Literal["attack", "sweep"]
@@ -63,7 +64,11 @@ class Part(_Described):
     @field_validator("settings")
     @classmethod
     def _reject_per_run_settings(cls, value: Settings) -> Settings:
-        """Reject settings that are the same for all parts."""
+        """Reject settings that a recipe cannot set for single parts.
+
+        These are the settings of the command, and those that every run gets from the
+        command or the recipe: its object and the object's label.
+        """
         for name in (*COMMAND_SETTINGS, "object", "label"):
             if name in value:
                 raise ValueError(
@@ -73,8 +78,8 @@ class Part(_Described):
 
 
 class Changes(_Described):
-    """Changes that `quick` makes: to settings of all parts, of single parts, parts left
-    out.
+    """Changes for a quick run: to settings of all parts, to settings of single parts,
+    and names of parts that are left out (`without`).
     """
 
     settings: Settings = Field(default_factory=dict)
@@ -83,16 +88,16 @@ class Changes(_Described):
 
 
 class Recipe(_Described):
-    """An experiment as a recipe's file describes it (docs/recipes.md).
+    """An experiment as the file of a recipe describes it (docs/recipes.md).
 
     Attributes:
-        title: the question it answers.
-        about: what is done for a result, and whose experiment it is.
+        title: the question that the recipe answers.
+        about: how the result is obtained, and whose experiment it is.
         settings: settings of all parts.
         parts: parts by name, in the order in which they run.
-        figures: kind (`figure`) and options of each figure.
+        figures: for each figure its kind (`figure`) and options.
         groups: names of objects by group.
-        quick: changes for a quick look.
+        quick: changes for a quick run.
     """
 
     title: Annotated[str, Field(min_length=1, max_length=200)]
@@ -112,7 +117,7 @@ class Recipe(_Described):
         for name in COMMAND_SETTINGS:
             if name in value:
                 raise ValueError(
-                    f"{name!r} is said with the command, not in its file; leave it out"
+                    f"{name!r} belongs to the command, not to its file; leave it out"
                 )
         return value
 
@@ -254,10 +259,11 @@ class PlannedRun:
     """A run of a recipe.
 
     Attributes:
-        name: name of its directory.
-        part: part of the recipe.
+        name: name of the run's directory.
+        part: name of the part that it belongs to.
         config: settings of the run.
-        around: the directory of the run whose result it samples around; None of others.
+        around: name of the directory of the search that it samples around; None if it
+            samples around none.
     """
 
     name: str
@@ -272,8 +278,8 @@ def plan_runs(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
     A part has a run for each object; a search has one for each combination of object,
     environment and model. The directory of a run is named after the part, the number of
     the run in it, the object, and the environment and model if they differ between
-    runs: "search-00-mug". A part may sample around the results of another part: then
-    each run samples around the run of that part with the same number and names.
+    runs: "search-00-mug". If a part samples around the searches of another part, each
+    of its runs samples around the search with the same number and names.
 
     Args:
         recipe: the recipe.
@@ -288,23 +294,25 @@ def plan_runs(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
     for name, part in recipe.parts.items():
         axes = _list_axes(recipe, part)
         for index, values in enumerate(product(*axes.values())):
-            value_of_axis = dict(zip(axes, values, strict=True))
-            run_config = _make_run_config(recipe, name, index, value_of_axis, config)
+            value_of_setting = dict(zip(axes, values, strict=True))
+            run_config = _make_run_config(recipe, name, index, value_of_setting, config)
             # the object, and what else differs between the runs of the part
             words = [
                 value
-                for axis, value in value_of_axis.items()
+                for axis, value in value_of_setting.items()
                 if axis == "object" or len(axes[axis]) > 1
             ]
             suffix = f"{index:02d}-{make_directory_name(words)}"
-            # the directory of the run that it samples around
-            around = f"{part.around}-{suffix}" if part.around else part.around
+            # `around` of a part is the name of a part; that of a run is a directory.
+            search_directory = None
+            if part.around is not None:
+                search_directory = f"{part.around}-{suffix}"
             runs.append(
                 PlannedRun(
                     name=f"{name}-{suffix}",
                     part=name,
                     config=run_config,
-                    around=around,
+                    around=search_directory,
                 )
             )
     if len(runs) > MAX_RUNS:
@@ -316,7 +324,11 @@ def plan_runs(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
 
 
 def _list_axes(recipe: Recipe, part: Part) -> dict[str, list[str]]:
-    """Return the settings of a part whose values are combined to its runs."""
+    """Return the settings whose values are combined to the runs of a part.
+
+    These are the object, and for an attack also the environment and the model. A sweep
+    takes several environments and models itself.
+    """
     defaults = {"object": ""}
     if part.command == "attack":
         defaults["environment"] = SceneConfig.default_environment
@@ -332,7 +344,7 @@ def _make_run_config(
     recipe: Recipe,
     name: str,
     index: int,
-    value_of_axis: Mapping[str, str],
+    value_of_setting: Mapping[str, str],
     config: RecipeConfig,
 ) -> SceneConfig:
     """Make the settings of one run of a part.
@@ -344,7 +356,7 @@ def _make_run_config(
         recipe: the recipe.
         name: name of the part.
         index: index of the run in the part.
-        value_of_axis: object of the run; of a search also environment and model.
+        value_of_setting: object of the run; for a search also environment and model.
         config: settings of the command.
 
     Raises:
@@ -356,14 +368,14 @@ def _make_run_config(
     run_settings: Settings = {
         **recipe.settings,
         **part.settings,
-        **value_of_axis,
+        **value_of_setting,
         "seed": seeds.stream(config.seed, seed_name),
     }
     if config.deterministic:
         run_settings["deterministic"] = True
     else:
         run_settings["threads"] = config.threads
-    label = config.find_label(value_of_axis["object"])
+    label = config.find_label(value_of_setting["object"])
     if label is not None:
         run_settings["label"] = label
     where = f"{config.recipe}: parts: {name}"
@@ -399,11 +411,13 @@ def check_powers(recipe: Recipe, runs: Iterable[PlannedRun], name: str) -> None:
     Raises:
         InputError: for the first such part.
     """
-    # A run stores its recipe, and the stored one may have been changed.
+    # A run stores its recipe, and the stored one may have been changed. So the content
+    # is compared, too.
     is_bundled = not is_file_name(name) and recipe == read_recipe(name)
-    if not is_bundled:
-        for run in runs:
-            run.config.check_powers(f"{name}: parts: {run.part}")
+    if is_bundled:
+        return
+    for run in runs:
+        run.config.check_powers(f"{name}: parts: {run.part}")
 
 
 def apply_command_settings(recipe: Recipe, config: RecipeConfig) -> Recipe:

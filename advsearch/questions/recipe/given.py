@@ -22,17 +22,18 @@ from advsearch.questions.recipe.rates import (
     Rows,
 )
 
-# characters that fit into a bar of the full width, and the least of a name cut short
+# number of characters that fit into a bar of the full width
 MAX_LETTERS = 85
+# minimum number of characters of a shortened name
 MIN_LETTERS = 4
 
-# how often a prediction is given, and how many of these are right
+# how often a prediction is given, and how many of these predictions are right
 PredictionCount = tuple[ClusteredFraction, int]
 
 
 class PredictionsOptions(Options):
-    """Options of the most frequent predictions: by which column, and how many of
-    them.
+    """Options of the most frequent predictions: the column that they are counted by
+    (`by`), and the maximum number for each of its values (`most`).
     """
 
     by: str
@@ -44,7 +45,7 @@ def make_predictions_figure(rows: Rows, options: PredictionsOptions) -> FigureCo
 
     Args:
         rows: rows of the parts that the figure shows.
-        options: the column, and how many predictions each value has.
+        options: the column, and the number of predictions for each of its values.
     """
     groups = dict[str, list[PredictionCount]]()
     for value, group_rows in rates.split_rows(rows, options.by).items():
@@ -53,7 +54,8 @@ def make_predictions_figure(rows: Rows, options: PredictionsOptions) -> FigureCo
         for label, _ in ranking[: options.most]:
             has_label = group_rows[rates.PREDICTION_COLUMN] == label
             tally = ClusteredFraction.from_rows(label, group_rows, has_label)
-            n_right = int(group_rows["correct"][has_label].sum())
+            rows_with_label = group_rows[has_label]
+            n_right = int(rows_with_label["correct"].sum())
             groups[value].append((tally, n_right))
 
     def draw(figure: Any) -> None:
@@ -63,6 +65,7 @@ def make_predictions_figure(rows: Rows, options: PredictionsOptions) -> FigureCo
             _draw_stacked_bar(axes, position, counts)
         axes.set_yticks(range(len(groups)), list(groups))
         axes.invert_yaxis()
+        # `_draw_stacked_bar` chooses the colors.
         axes.set(
             xlabel="share of predictions; blue: mostly right, red: mostly wrong, "
             "grey: others",
@@ -92,7 +95,7 @@ def _describe_predictions(
 
     Args:
         groups: for each group the predictions, the most frequent first, each with its
-            tally and how often it is right.
+            fraction and how often it is right.
         things: plural of what the groups are.
     """
     sentences = list[str]()
@@ -123,7 +126,7 @@ def _draw_stacked_bar(
     Args:
         axes: axes of matplotlib.
         position: position of the bar on the vertical axis.
-        counts: tally of each prediction, and how often it is right.
+        counts: fraction of each prediction, and how often it is right.
     """
     left = 0.0
     for tally, n_right in counts:
@@ -162,7 +165,8 @@ def _draw_stacked_bar(
 def shorten_to_fit(name: str, fraction: float) -> str:
     """Shorten a prediction's name to what fits into its bar.
 
-    That is the full name, the first of several names, the beginning of it, or nothing.
+    That is the full name, the first of several names, the beginning of the first name,
+    or nothing.
     """
     room = int(fraction * MAX_LETTERS)
     first_name = name.partition(",")[0]
@@ -176,16 +180,16 @@ def shorten_to_fit(name: str, fraction: float) -> str:
 
 # ---- shape and texture
 
-# seed of the samples that predict, and of the bootstrap
+# seed of the samples of labels, and of the bootstrap
 SEED = 0
 RESAMPLES = 2000
-# pairs of object and texture: two of each
+# minimum number of pairs of object and texture: two of each
 MIN_PAIRS = 4
 
 
 class CuesOptions(Options):
-    """Options of cues: columns of texture and shape, and the classes that name a
-    texture.
+    """Options of a figure of cues: the columns of texture and shape, and the classes
+    that name each texture.
     """
 
     texture: str = "material.which"
@@ -203,9 +207,10 @@ def make_cues_figure(rows: Rows, options: CuesOptions) -> FigureContent:
         rows: rows with object and texture.
         options: the columns of both, and the classes that name each texture.
     """
-    # The three mappings are by the name of the texture. `names_texture` has a flag for
-    # each row: whether its prediction names the texture. The others count the rows
-    # whose prediction names the object, and those whose prediction names the texture.
+    # All three are by the name of the texture.
+    # `names_texture`: whether each prediction (n,) names the texture
+    # `by_shape`: how often the prediction names the object, and so is right
+    # `by_texture`: how often the prediction names the texture
     names_texture = dict[str, Any]()
     by_shape = dict[str, ClusteredFraction]()
     by_texture = dict[str, ClusteredFraction]()
@@ -256,6 +261,7 @@ def _describe_named(
     ]
     with_classes = [name for name in names_texture if options.classes.get(name)]
     if with_classes:
+        # The index of the flags is that of their rows in `rows`, where it is unique.
         flags = pd.concat([names_texture[name] for name in with_classes])
         total = ClusteredFraction.from_rows("", rows.loc[flags.index], flags)
         text.append(
@@ -263,6 +269,7 @@ def _describe_named(
             f"{total.describe('so')}."
         )
         if not total.fraction:
+            # why that may be
             text.append("A model that has no class for a texture cannot name it.")
     return text
 
@@ -270,13 +277,14 @@ def _describe_named(
 def _names_class(predictions: Any, classes: Sequence[str]) -> Any:
     """Return a flag for each prediction (n,): whether it names one of the classes.
 
-    A label may be a list of synonyms, such as "cup, mug". It matches if the full label
-    is a class, or if one of the synonyms is.
+    A label may be a list of synonyms, such as "cup, mug". It names a class if the full
+    label is the class, or if one of the synonyms is.
     """
     names = predictions.map(
         lambda label: {label.strip(), *map(str.strip, label.split(","))}
     )
-    return ~names.map(set(classes).isdisjoint)
+    names_none = names.map(set(classes).isdisjoint)
+    return ~names_none
 
 
 def _draw_cues(
@@ -284,7 +292,7 @@ def _draw_cues(
     by_shape: Mapping[str, ClusteredFraction],
     by_texture: Mapping[str, ClusteredFraction],
 ) -> None:
-    """Draw for each texture the fractions of predictions by shape and by texture.
+    """Draw for each texture how often predictions name the object, and the texture.
 
     Args:
         figure: figure of matplotlib.
@@ -305,6 +313,7 @@ def _draw_cues(
         label="the texture",
         **style,
     )
+    # The bar of the object begins at 0, so its interval is drawn where it is.
     for position, name in enumerate(ordered):
         axes.plot(
             by_shape[name].interval(),
@@ -321,7 +330,7 @@ def _draw_cues(
 
 
 def count_predicted(rows: Rows, options: CuesOptions) -> list[tuple[int, int, int]]:
-    """Count how many predictions the shape and the texture predict, by pair of both.
+    """Count for each pair of shape and texture the predictions that each cue predicts.
 
     The shape predicts, for a pair of object and texture, the model's most frequent
     label for the same object with other textures. The texture predicts the most
@@ -352,10 +361,10 @@ def count_predicted(rows: Rows, options: CuesOptions) -> list[tuple[int, int, in
     for (shape, texture), labels in labels_of_pair.items():
         same_shape, same_texture = _collect_labels(labels_of_pair, shape, texture)
         n_samples = min(len(same_shape), len(same_texture))
-        # none if there is no other texture, or no other object
+        # There are none without another texture of the shape, or another shape.
         if n_samples:
-            by_shape = _most_frequent_of_sample(same_shape, n_samples, generator)
-            by_texture = _most_frequent_of_sample(same_texture, n_samples, generator)
+            by_shape = _sample_most_frequent(same_shape, n_samples, generator)
+            by_texture = _sample_most_frequent(same_texture, n_samples, generator)
             counts.append(
                 (len(labels), labels.count(by_shape), labels.count(by_texture))
             )
@@ -367,7 +376,7 @@ def _collect_labels(
 ) -> tuple[list[str], list[str]]:
     """Return the predictions about the same shape, and those about the same texture.
 
-    The pair of both itself is left out of either.
+    The pair of this shape and this texture is in neither.
 
     Args:
         labels_of_pair: predictions by (shape, texture).
@@ -384,10 +393,13 @@ def _collect_labels(
     return same_shape, same_texture
 
 
-def _most_frequent_of_sample(
+def _sample_most_frequent(
     labels: Sequence[str], n_samples: int, generator: random.Random
 ) -> str:
-    return rates.rank_predictions(generator.sample(labels, n_samples))[0][0]
+    """Return the most frequent of the labels in a random sample."""
+    ranking = rates.rank_predictions(generator.sample(labels, n_samples))
+    most_frequent, _ = ranking[0]
+    return most_frequent
 
 
 def _compare_cues(pairs: Sequence[tuple[int, int, int]]) -> str:
@@ -408,10 +420,10 @@ def _compare_cues(pairs: Sequence[tuple[int, int, int]]) -> str:
         )
     generator = random.Random(SEED)
     resampled = sorted(
-        _shape_advantage(generator.choices(pairs, k=len(pairs)))
+        _compute_shape_advantage(generator.choices(pairs, k=len(pairs)))
         for _ in range(RESAMPLES)
     )
-    # 2.5 % at either end are outside of the interval
+    # 2.5 % of the values at each end are outside of the interval.
     n_outside = round(RESAMPLES * 0.025)
     lower = resampled[n_outside]
     upper = resampled[-1 - n_outside]
@@ -426,13 +438,13 @@ def _compare_cues(pairs: Sequence[tuple[int, int, int]]) -> str:
         f"given in {wording.percent(n_by_shape / total)}, "
         "and that about the same texture on other objects, of as many predictions, in "
         f"{wording.percent(n_by_texture / total)}: "
-        f"{_shape_advantage(pairs):.0f} points more by shape "
+        f"{_compute_shape_advantage(pairs):.0f} points more by shape "
         f"(95 % interval {lower:.0f} to {upper:.0f}, over pairs of object and "
         f"texture): {verdict}."
     )
 
 
-def _shape_advantage(pairs: Sequence[tuple[int, int, int]]) -> float:
+def _compute_shape_advantage(pairs: Sequence[tuple[int, int, int]]) -> float:
     """Compute the percentage points by which the shape predicts better."""
     difference = sum(by_shape - by_texture for _, by_shape, by_texture in pairs)
     return 100 * difference / sum(total for total, _, _ in pairs)
@@ -442,7 +454,7 @@ def _shape_advantage(pairs: Sequence[tuple[int, int, int]]) -> float:
 
 Float64Array = npt.NDArray[np.float64]
 Mixture = tuple[float, float, float]
-# indices along the first and the second share, and whether it points down
+# (a, b, points_down): see `list_triangles`
 Triangle = tuple[int, int, bool]
 SINGLE_PREDICTION = (
     "The prediction is {} in every picture, so that shares of predictions tell "
@@ -454,9 +466,12 @@ SINGLE_PREDICTION = (
 class TernaryOptions(Options):
     """Options of ternary diagrams of three fractions.
 
-    With `normalised` the colors of each prediction end at its own largest fraction, and
-    those of margins begin at the smallest. `side` is the number of triangles along a
-    side.
+    Attributes:
+        shares: columns of the three ingredients.
+        normalised: whether the colors of each diagram end at its largest value; the
+            colors of margins then begin at the smallest value.
+        most: maximum number of predictions, each with a diagram.
+        side: number of triangles along a side of the diagram.
     """
 
     shares: tuple[str, str, str]
@@ -469,9 +484,9 @@ def make_ternary_figure(rows: Rows, options: TernaryOptions) -> FigureContent:
     """Make a figure of where in a mixture each prediction is frequent.
 
     A mixture has three ingredients, whose fractions add up to 1. It is a point in a
-    triangle, which is cut into small triangles. If all predictions are the same, the
-    figure shows the margin of the right label instead.
-
+    triangle, which is divided into small triangles. If all predictions are the same,
+    and there are enough margins, the figure shows the margin of the right label
+    instead.
     Args:
         rows: rows of one mixture each.
         options: the columns of the ingredients, and how the figure is drawn.
@@ -479,13 +494,13 @@ def make_ternary_figure(rows: Rows, options: TernaryOptions) -> FigureContent:
     mixtures = _read_mixtures(rows, options)
     names = [rates.strip_control(name) for name in options.shares]
     main_ingredient = mixtures.argmax(axis=1)  # (n,)
-    corners = list_triangles(options.side)
-    in_triangle = _split_by_triangle(options, mixtures, corners)
+    corners_of_triangle = list_triangles(options.side)
+    in_triangle = _split_by_triangle(options, mixtures, list(corners_of_triangle))
 
     ranking = rates.rank_predictions(rows[rates.PREDICTION_COLUMN])
-    margins = _margins_by_ingredient(rows, names, main_ingredient)
+    margins = _group_margins(rows, names, main_ingredient)
     has_single_prediction = len(ranking) == 1
-    # The margins are compared by intervals, for which each ingredient needs two values.
+    # The interval of a mean needs two values for each ingredient.
     by_margin = has_single_prediction and min(map(len, margins.values())) >= 2
     ranking = ranking[: options.most]
     if by_margin:
@@ -495,10 +510,11 @@ def make_ternary_figure(rows: Rows, options: TernaryOptions) -> FigureContent:
             rows, ranking, names, main_ingredient
         )
     panels = _make_panels(rows, ranking, by_margin, in_triangle)
-    text += _describe_empty(in_triangle, corners)
+    text += _describe_empty(in_triangle)
 
     def draw(figure: Any) -> None:
-        _draw_panels(figure, panels, list(corners.values()), names, by_margin, options)
+        corners = list(corners_of_triangle.values())
+        _draw_panels(figure, panels, corners, names, by_margin, options)
 
     return FigureContent(
         title=f"Predictions over {', '.join(names)}",
@@ -513,13 +529,14 @@ def make_ternary_figure(rows: Rows, options: TernaryOptions) -> FigureContent:
 def _split_by_triangle(
     options: TernaryOptions,
     mixtures: npt.NDArray[np.float64],
-    corners: Mapping[Any, Any],
+    triangles: Sequence[Triangle],
 ) -> list[npt.NDArray[np.bool_]]:
     """Return for each triangle of the diagram which mixtures (n,) lie in it."""
-    triangle_of_mixture = pd.Series(
-        [find_triangle(mixture, options.side) for mixture in mixtures]
-    )
-    return [(triangle_of_mixture == triangle).to_numpy() for triangle in corners]
+    triangle_of_mixture = [find_triangle(mixture, options.side) for mixture in mixtures]
+    return [
+        np.array([other == triangle for other in triangle_of_mixture], dtype=bool)
+        for triangle in triangles
+    ]
 
 
 def _make_panels(
@@ -528,7 +545,7 @@ def _make_panels(
     by_margin: bool,
     in_triangle: Sequence[npt.NDArray[np.bool_]],
 ) -> dict[str, list[float | None]]:
-    """Return what the diagram of each prediction shows: a value for each triangle.
+    """Return the value of each triangle in the diagram of each prediction.
 
     The value is the fraction of the mixtures in the triangle that have this prediction;
     with `by_margin` it is their mean margin. It is None if no mixture lies there.
@@ -544,24 +561,23 @@ def _make_panels(
         values = (rows[rates.PREDICTION_COLUMN] == label).to_numpy()
         if by_margin:
             values = rows["margin"].astype(float).to_numpy()
-        panels[label] = _mean_by_triangle(values, in_triangle)
+        panels[label] = _compute_triangle_means(values, in_triangle)
     return panels
 
 
 def _describe_empty(
-    in_triangle: Sequence[npt.NDArray[np.bool_]], corners: Mapping[Any, Any]
+    in_triangle: Sequence[npt.NDArray[np.bool_]],
 ) -> list[str]:
     """Describe how many triangles have no mixture; empty if all have one.
 
     Args:
         in_triangle: for each triangle, which mixtures (n,) lie in it.
-        corners: one entry for each triangle.
     """
     text = list[str]()
     n_empty = sum(not is_inside.any() for is_inside in in_triangle)
     if n_empty:
         text.append(
-            f"No picture was drawn in {n_empty} of {len(corners)} parts of the "
+            f"No picture was drawn in {n_empty} of {len(in_triangle)} parts of the "
             "diagram, which are hatched."
         )
     return text
@@ -573,11 +589,11 @@ def _read_mixtures(rows: Rows, options: TernaryOptions) -> Float64Array:
         [rates.get_numeric_column(rows, name) for name in options.shares], axis=1
     )
     total = amounts.sum(axis=1, keepdims=True)
-    # not divided by 0, where there is nothing of any
+    # no division by 0 without any of the ingredients
     return amounts / np.where(total == 0.0, 1.0, total)
 
 
-def _margins_by_ingredient(
+def _group_margins(
     rows: Rows, names: Sequence[str], main_ingredient: npt.NDArray[np.intp]
 ) -> dict[str, Float64Array]:
     """Return the known margins of the mixtures in which each ingredient is largest.
@@ -598,10 +614,15 @@ def _margins_by_ingredient(
     }
 
 
-def _mean_by_triangle(
+def _compute_triangle_means(
     values: npt.NDArray[Any], in_triangle: Sequence[npt.NDArray[np.bool_]]
 ) -> list[float | None]:
-    """Compute the mean of values (n,) in each triangle, None where there are none."""
+    """Compute the mean of the known values in each triangle; None if there are none.
+
+    Args:
+        values: (n,) values of the mixtures; NaN if unknown.
+        in_triangle: for each triangle, which mixtures (n,) lie in it.
+    """
     means = list[float | None]()
     for is_inside in in_triangle:
         known = values[is_inside & ~np.isnan(values)]
@@ -616,7 +637,7 @@ def _describe_margins(
     """Describe the margins of a single prediction by the main ingredient.
 
     Args:
-        label: the only prediction that is given.
+        label: the only prediction.
         margins: margins of the mixtures in which each ingredient is the largest, by its
             name.
 
@@ -631,7 +652,7 @@ def _describe_margins(
         "standard error",
     ]
     table: list[list[rates.Cell]] = [
-        [name, len(values), float(values.mean()), _standard_error(values)]
+        [name, len(values), float(values.mean()), _compute_standard_error(values)]
         for name, values in margins.items()
     ]
     return text, heads, table
@@ -659,24 +680,26 @@ def _describe_ingredients(
     heads = ["prediction", "where most is", "given in", *rates.FRACTION_HEADS]
     for label, times in ranking:
         is_label = (rows[rates.PREDICTION_COLUMN] == label).to_numpy()
-        # for each ingredient how often the label is predicted where it is the largest
+        # for each ingredient, how often the label is predicted if it is the largest
         tallies = []
         for index, name in enumerate(names):
             is_main = main_ingredient == index
             tallies.append(
                 ClusteredFraction.from_rows(name, rows[is_main], is_label[is_main])
             )
-        whose = f"{label}, {wording.percent(times / len(rows))} of all predictions, is"
+        share = wording.percent(times / len(rows))
+        # A sentence begins: "mug, 12 % of all predictions, is rarest where ...".
+        beginning = f"{label}, {share} of all predictions, is"
         known_fractions = {tally.fraction for tally in tallies if tally.total}
         if len(known_fractions) == 1:
             text.append(
-                f"{whose} given as often whatever most of the mixture is: no "
+                f"{beginning} given as often whatever most of the mixture is: no "
                 "difference is shown."
             )
         else:
             text += rates.describe_extremes(
                 tallies,
-                lowest_prefix=f"{whose} rarest where most of the mixture",
+                lowest_prefix=f"{beginning} rarest where most of the mixture",
                 highest_prefix="most frequent where most of it",
                 things="ingredients",
                 verb="given",
@@ -695,7 +718,7 @@ def _draw_panels(
 ) -> None:
     """Draw a ternary diagram for each prediction, with one or several color bars.
 
-    All diagrams share a color bar, unless each is normalised to its own values.
+    All diagrams have the same colors and share a color bar, unless they are normalised.
 
     Args:
         figure: figure of matplotlib.
@@ -703,8 +726,8 @@ def _draw_panels(
         corners: mixtures at the corners of the triangles.
         names: names of the ingredients.
         by_margin: whether values are margins, not fractions.
-        options: options with `normalised`, each diagram has colors and a bar of its
-            own.
+        options: options of the figure; if `normalised`, each diagram has its own colors
+            and its own color bar.
     """
     all_axes = figure.subplots(1, len(panels), squeeze=False)[0]
     for axes, (prediction, values) in zip(all_axes, panels.items(), strict=True):
@@ -718,6 +741,8 @@ def _draw_panels(
                 triangles, ax=axes, shrink=0.7, location="bottom", label=prediction
             )
     if not options.normalised:
+        # Fractions have the same range in all diagrams, and margins have one diagram.
+        # So the colors of the last diagram are those of all.
         figure.colorbar(
             triangles,
             ax=list(all_axes),
@@ -738,9 +763,9 @@ def find_triangle(mixture: Sequence[float], side: int) -> Triangle:
         side: number of triangles along a side of the diagram.
     """
     a, b, c = (int(fraction * side) for fraction in mixture)
-    # Inside a triangle the sum of the rounded numbers is `side - 1` or `side - 2`. At a
-    # corner, which several triangles share, nothing is rounded and it is `side`: 1 is
-    # taken from the largest number, so that the corner belongs to one triangle.
+    # Inside of a triangle, `a + b + c` is `side - 1` or `side - 2`. At a corner of
+    # triangles nothing is rounded, and it is `side`. A point there belongs to several
+    # triangles; one is chosen by taking 1 from the largest number.
     while a + b + c >= side:
         if a >= max(b, c):
             a -= 1
@@ -787,8 +812,8 @@ def _compare_margins(margins: Mapping[str, Float64Array]) -> str:
     """Describe for which ingredient the mean margin is smallest, and for which largest.
 
     The margin is by how much the right label leads the next one. The two ingredients
-    were selected as extremes among all, so that their intervals are widened
-    (Bonferroni) before they are compared.
+    were selected as extremes among all, so their intervals are widened (Bonferroni)
+    before they are compared.
 
     Args:
         margins: margins of the mixtures in which each ingredient is the largest, by its
@@ -801,37 +826,40 @@ def _compare_margins(margins: Mapping[str, Float64Array]) -> str:
     largest = max(margins, key=lambda name: margins[name].mean())
     descriptions = []
     for name in (smallest, largest):
-        lower, upper = _mean_interval(margins[name])
+        lower, upper = _compute_mean_interval(margins[name])  # of this mean alone
         descriptions.append(
             f"{name}: {margins[name].mean():.3g} "
             f"(95 % interval {lower:.3g} to {upper:.3g}, {len(margins[name])} pictures)"
         )
     widened = f"their intervals, widened for having been chosen among {len(margins)},"
     verdict = f"No difference is shown: {widened} overlap"
-    _, upper_of_smallest = _mean_interval(margins[smallest], len(margins))
-    lower_of_largest, _ = _mean_interval(margins[largest], len(margins))
+    n_compared = len(margins)
+    _, upper_of_smallest = _compute_mean_interval(margins[smallest], n_compared)
+    lower_of_largest, _ = _compute_mean_interval(margins[largest], n_compared)
     if upper_of_smallest < lower_of_largest:
         verdict = f"The difference is shown: {widened} do not overlap"
-    # "It" is the right label, of which the sentence before speaks.
+    # "It" is the right label, which the sentence before names.
     return (
         f"It leads least where most of the mixture is {descriptions[0]}; most where "
         f"most of it is {descriptions[1]}. {verdict}."
     )
 
 
-def _mean_interval(values: Float64Array, n_compared: int = 1) -> tuple[float, float]:
+def _compute_mean_interval(
+    values: Float64Array, n_compared: int = 1
+) -> tuple[float, float]:
     """Return the normal 95 % interval of the mean of values (n,).
 
     It is widened for a choice among `n_compared` means (Bonferroni).
     """
     # the probability on each of the two sides
     alpha = (1.0 - statistics.intervals.CONFIDENCE) / (2.0 * n_compared)
-    half_width = NormalDist().inv_cdf(1.0 - alpha) * _standard_error(values)
+    half_width = NormalDist().inv_cdf(1.0 - alpha) * _compute_standard_error(values)
     mean = values.mean()
     return mean - half_width, mean + half_width
 
 
-def _standard_error(values: Float64Array) -> float:
+def _compute_standard_error(values: Float64Array) -> float:
     """Compute the standard error of the mean of values (n,)."""
     return float(values.std(ddof=1)) / math.sqrt(len(values))
 
@@ -841,21 +869,22 @@ def _choose_color_range(
 ) -> tuple[float, float]:
     """Return the values of the first and the last color of a ternary diagram.
 
-    The colors of fractions go from 0 to 1; if normalised, from 0 to the largest value.
-    The colors of margins go to the largest value. They begin at 0, or at the smallest
-    value if it is below 0 or if they are normalised.
+    Fractions have the range 0 to 1; normalised, 0 to the largest value. Margins have
+    the range from 0, or the smallest value if that is negative, to the largest value;
+    normalised, from the smallest value to the largest.
 
     Args:
         values: values of the triangles.
         by_margin: whether these are margins, not fractions.
-        normalised: whether the range is that of the values.
+        normalised: whether the range depends on the values.
     """
     lower = min([*values, 0.0])
     upper = 1.0
     if normalised and by_margin:
         lower = min(values)
     if normalised or by_margin:
-        upper = max([*values, 1e-9])  # above 0, where the colors begin
+        # The smallest bound is above 0, so that the range of fractions has a width.
+        upper = max([*values, 1e-9])
     return lower, upper
 
 
@@ -915,7 +944,7 @@ def _draw_panel(
 def _draw_outline(axes: Any, names: Sequence[str]) -> None:
     """Draw the triangle of all mixtures, with the name of an ingredient at each corner.
 
-    A corner is the mixture that is that ingredient alone.
+    A corner of the diagram is a single ingredient.
     """
     pure = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     outline = [_to_plane(mixture) for mixture in pure]

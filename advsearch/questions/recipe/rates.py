@@ -1,4 +1,6 @@
-"""Figures of rates: accuracy, agreement with photographs, throughput, surface parts."""
+"""Figures of fractions and throughput: accuracy, agreement with photographs, images per
+second, parts of surfaces.
+"""
 
 from __future__ import annotations
 
@@ -45,28 +47,37 @@ that set it).
 
 OTHER_OBJECTS = "other objects"
 
-TRIAL_NAMES = {"first control": "clean scene", "control": "clean scene", "verification": "answer",
-          "baseline verification": "random search"}  # fmt: skip
+TRIAL_NAMES = {
+    "first control": "clean scene",
+    "control": "clean scene",
+    "verification": "answer",
+    "baseline verification": "random search",
+}
 """The kinds of an attack's rows that are in the frame, and their names in figures."""
 
-# columns of a table for one proportion, after the column of its numerator
+# columns of a table for one fraction, after the column of its numerator
 FRACTION_HEADS = ["of", "share", "low", "high"]
 Cell = str | int | float | None
 Float64Array = npt.NDArray[np.float64]
-# a pd.DataFrame, which has no types
+# a pd.DataFrame; pandas has no types
 Rows = Any
+# lengths of a figure in inches
+FIGURE_WIDTH = 6.0
+LINES_HEIGHT = 3.4
+MIN_MAP_WIDTH = 5.4
 
 
 def read_rows(
     part: str, folder: Path, summary: Any, seed: int, kinds: Sequence[str], **more: Cell
 ) -> tuple[list[dict[str, Any]], dict[str, str]]:
-    """Read the stored rows of a run, and the units of their parameters.
+    """Read the stored rows of a run, and the units of measure of their parameters.
 
     Each row has `object`, `environment`, `model` and the parameters; the prediction
     (`answer`, `correct`, `margin`); `time`, when it was stored (seconds since 1970);
-    and `unit`, the independent unit that it belongs to. Rows with the same draw of
-    the same seed share a unit, also across parts. So do the trials of several attacks
-    that have the same number. Any other row is a unit by itself.
+    and `unit`, the independent unit that it belongs to, as text. Rows of a sweep with
+    the same seed and the same draw share a unit, also across parts. Trials of attacks
+    with the same seed and the same number share a unit. Any other row is a unit by
+    itself.
 
     Args:
         part: part of the recipe that the run belongs to.
@@ -77,11 +88,12 @@ def read_rows(
         **more: further columns, equal in all rows.
 
     Returns:
-        The rows as mappings from column to value, and the unit of each parameter.
+        The rows as mappings from column to value, and the unit of measure of each
+        parameter.
     """
     rows = list[dict[str, Any]]()
-    units = dict[str, str]()
-    sweep_units = None  # how the rows of a sweep follow from draws
+    units_of_measure = dict[str, str]()
+    sweep_units = None  # maps the rows of a sweep to independent units
     with Store.open_to_read(folder) as store:
         if summary.command == "sweep":
             is_sampled = summary.sampler is not None
@@ -92,18 +104,20 @@ def read_rows(
             # An image without the object says nothing about its recognition.
             if row.kind == "sweep" and row.is_out_of_view:
                 continue
-            units |= {name: stored["unit"] for name, stored in row.values.items()}
+            units_of_measure |= {
+                name: stored["unit"] for name, stored in row.values.items()
+            }
+            # A sweep may also have rows of photographs, which share no draw.
             if summary.command == "attack":
-                unit = f"{seed} {row.step}"
+                independent_unit = f"{seed} {row.step}"
             elif row.kind == "sweep" and sweep_units is not None:
-                unit = f"{seed} {sweep_units.find_unit(row.step)}"
+                independent_unit = f"{seed} {sweep_units.find_unit(row.step)}"
             else:
-                unit = f"{folder.name} {row.kind} {row.id}"
+                independent_unit = f"{folder.name} {row.kind} {row.id}"
             values = _read_row_values(row, summary)
-            rows.append(
-                {**values, "time": row.time, PART_COLUMN: part, "unit": unit, **more}
-            )
-    return rows, units
+            values |= {"time": row.time, PART_COLUMN: part, "unit": independent_unit}
+            rows.append({**values, **more})
+    return rows, units_of_measure
 
 
 def _read_row_values(row: Any, summary: Any) -> dict[str, Any]:
@@ -136,7 +150,7 @@ def make_frame(
         rows: rows as `read_rows` returns them.
         groups: names of objects by group; the first group that names an object has
             it. Without groups the frame has no such column.
-        **facts: what becomes the frame's ``attrs``.
+        **facts: become the frame's ``attrs``.
     """
     frame = pd.DataFrame(rows)
     if groups:
@@ -204,17 +218,17 @@ def rank_predictions(predictions: Iterable[str]) -> list[tuple[str, int]]:
 
 
 class ClusteredFraction:
-    """Count rows of independent units, and estimate the fraction that is counted.
+    """Counts some rows in independent units, and estimates the fraction of these rows.
 
-    A unit is what rows share that are not independent, such as a draw of a seed.
+    A unit is what dependent rows share, such as a draw of a seed.
 
     Attributes:
-        name: name of what the rows are of, for tables and sentences.
-        unit_counts: (n,) rows that are counted in each unit.
-        unit_sizes: (n,) rows of each unit.
-        n_counted: rows that are counted in all.
-        total: rows in all.
-        fraction: the mean over units of their fraction; None without rows.
+        name: name of the rows in tables and sentences, such as that of an environment.
+        unit_counts: (n,) number of rows that are counted in each unit.
+        unit_sizes: (n,) number of all rows of each unit.
+        n_counted: number of rows that are counted.
+        total: number of all rows.
+        fraction: mean over units of the fraction that is counted; None without rows.
     """
 
     def __init__(
@@ -223,9 +237,9 @@ class ClusteredFraction:
         """Compute the totals and the fraction from the counts of each unit.
 
         Args:
-            name: name of what the rows are of, such as an environment.
-            unit_counts: (n,) rows that are counted in each unit.
-            unit_sizes: (n,) rows of each unit.
+            name: name of the rows, such as that of an environment.
+            unit_counts: (n,) number of rows that are counted in each unit.
+            unit_sizes: (n,) number of all rows of each unit.
         """
         self.name = name
         self.unit_counts = unit_counts
@@ -241,9 +255,9 @@ class ClusteredFraction:
         """Count rows by unit.
 
         Args:
-            name: name of the tally.
+            name: name of the rows.
             rows: rows with a column "unit".
-            flags: (n,) whether each is counted; by default those that are correct.
+            flags: (n,) whether each row is counted; None counts the correct ones.
         """
         if flags is None:
             flags = rows["correct"]
@@ -273,7 +287,7 @@ class ClusteredFraction:
     def interval(self, n_compared: int = 1) -> results.Interval | None:
         """Return the 95 % interval of the fraction.
 
-        With `n_compared` > 1 it is widened for a choice among as many (Bonferroni).
+        With `n_compared` > 1 it is widened for that many comparisons (Bonferroni).
         """
         if not self.total:
             return None
@@ -285,7 +299,7 @@ class ClusteredFraction:
     def describe(self, verb: str = "right") -> str:
         """Format the fraction: ``right in 12 of 20 (60 %, 95 % interval 36-81 %)``.
 
-        `verb` is what is counted.
+        `verb` states what is counted.
         """
         share = (
             f"{wording.percent(self.fraction)}, 95 % interval "
@@ -294,9 +308,9 @@ class ClusteredFraction:
         return f"{verb} in {self.n_counted} of {self.total} ({share})"
 
     def is_below(self, other: ClusteredFraction, n_compared: int = 1) -> bool:
-        """Return whether the interval of this tally lies below that of another one.
+        """Return whether the interval of this fraction lies below that of another.
 
-        Both are widened for a choice among `n_compared`.
+        Both are widened for `n_compared` comparisons.
         """
         lower = self.interval(n_compared)
         upper = other.interval(n_compared)
@@ -310,18 +324,18 @@ def describe_extremes(
     things: str,
     verb: str = "right",
 ) -> list[str]:
-    """Describe which tally has the lowest fraction and which has the highest.
+    """Describe which fraction is the lowest and which is the highest.
 
-    The two were selected among k for being extreme. Therefore they are compared by
-    intervals of confidence 1 - 0.05 / k, which hold for all k together. Where these
+    The two were selected among k because they are extreme. Therefore they are compared
+    by intervals of confidence 1 - 0.05 / k, which hold for all k together. If these
     overlap, no difference is shown.
 
     Args:
-        fractions: the tallies; those without rows are left out.
+        fractions: the fractions; those without rows are left out.
         lowest_prefix: beginning of the sentence about the lowest, such as "Lowest".
         highest_prefix: beginning of the part about the highest.
-        things: plural of what the tallies are of.
-        verb: word for what is counted, "right" or "wrong" say.
+        things: plural of what the fractions are of, such as "environments".
+        verb: word for what is counted, for example "right" or "wrong".
     """
     known = [tally for tally in fractions if tally.total]
     if len(known) < 2:
@@ -337,7 +351,7 @@ def describe_extremes(
 
     descriptions = []
     for tally in (lowest, highest):
-        n_ties = shares.count(tally.fraction or 0.0) - 1  # without the tally itself
+        n_ties = shares.count(tally.fraction or 0.0) - 1  # without the fraction itself
         ties = _format_ties(n_ties)
         descriptions.append(f"is {tally.name}{ties}: {tally.describe(verb)}")
     widened = (
@@ -363,12 +377,14 @@ def _format_ties(n_ties: int) -> str:
 def pluralize_column(name: str) -> str:
     """Return the plural that names the values of a column.
 
-    Examples are ``environments``, ``materials`` and ``values of pose.yaw``.
+    For example, ``environments`` for "environment.which", ``materials`` for "material",
+    and ``values of pose.yaw`` for "pose.yaw".
     """
     if name == TRIAL_COLUMN:
         return "kinds of trials"
     control, _, parameter = name.partition(".")
-    # the parameter "which" chooses among several environments, say
+    # The parameter "which" of a control selects one of the things that the control is
+    # named after, such as an environment.
     if parameter in ("", "which"):
         return f"{control}s"
     return f"values of {name}"
@@ -380,9 +396,11 @@ def strip_control(name: str) -> str:
 
 
 class Options(BaseModel):
-    """Options of every figure: its title, and the parts whose rows it shows.
+    """Options of every figure.
 
-    An empty title means the figure's default title, no parts mean all.
+    Attributes:
+        title: title of the figure; empty takes the default title.
+        of: parts of the recipe whose rows the figure shows; empty shows all.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -392,15 +410,21 @@ class Options(BaseModel):
 
     @property
     def required_parts(self) -> tuple[str, ...]:
-        """The parts of the recipe whose rows the figure needs; empty for all."""
+        """The parts of the recipe that the figure needs; empty for all."""
         return self.of
 
 
 @dataclass(frozen=True)
 class FigureContent:
-    """Content of a figure: sentences, a table, and what draws all but the title.
+    """Content of a figure: sentences, a table, and a function that draws it.
 
-    `draw` takes a matplotlib figure; `size` is in inches.
+    Attributes:
+        title: title of the figure.
+        text: sentences that describe the figure.
+        columns: heads of the table's columns.
+        rows: rows of the table.
+        draw: draws all but the title on a matplotlib figure.
+        size: width and height in inches.
     """
 
     title: str
@@ -411,16 +435,30 @@ class FigureContent:
     size: tuple[float, float]
 
 
-# default bins of a range that lines are drawn over
+# default number of bins of a range that lines are drawn over
 DEFAULT_BINS = 12
-# characters of a label that fit under a column without being rotated
+# number of characters of a label that fit under a column without being rotated
 MAX_UPRIGHT_LETTERS = 4
-# counts by the name of a row, one for each series
+# for each row by its name, a fraction for each series
 Cells = Mapping[str, Sequence[ClusteredFraction]]
 
 
 class RatesOptions(Options):
-    """Columns that rates are split by, and how they are drawn; see docs/recipes.md."""
+    """Options of a figure of rates; see docs/recipes.md.
+
+    Attributes:
+        by: column whose values have a row each.
+        series: column whose values have a bar or a line each; None for none.
+        form: what is drawn.
+        bins: number of bins of a numeric column; None for a row of each value.
+        range: range of the bins; None takes that of the values.
+        names: names in the figure, by value.
+        wrong: whether wrong predictions are counted instead of right ones.
+        beside: part that all others are compared with; None for none.
+        away_from: value whose distance from the column's is used instead; None uses the
+            column itself.
+        turn: period of the values, such as 360 degrees; None for none.
+    """
 
     by: str
     series: str | None = None
@@ -435,7 +473,10 @@ class RatesOptions(Options):
 
     @property
     def required_parts(self) -> tuple[str, ...]:
-        """The parts of the recipe whose rows the figure needs; empty for all."""
+        """The parts of the recipe that the figure needs; empty for all.
+
+        The part `beside` is needed in addition to those in `of`.
+        """
         if self.beside and self.of:
             return (*self.of, self.beside)
         return self.of
@@ -469,20 +510,21 @@ def make_rates_figure(rows: Rows, options: RatesOptions) -> FigureContent:
     series = [options.names.get(value, value) for value in series_values]
     cells, bin_centers = _count_cells(rows, series_values, options)
     totals = _count_series("all", rows, series_values, options)
-    bars = dict(cells)  # the cells, and the baseline if there is one
+    bars = dict(cells)  # the cells, and before them the baseline if there is one
 
     text = _describe_cells(cells, series, bin_centers is not None, options)
     text += _describe_series(cells, totals, series, options)
     if options.beside and len(baseline_rows):
-        # the part that all others are compared with: its bar comes first
-        name = options.names.get(options.beside, options.beside)
-        tallies = _count_series("", baseline_rows, series_values, options)
-        text += _compare_with_baseline(name, tallies, totals, series, verb)
-        bars = {name: tallies, **cells}
+        # The baseline is the part that all others are compared with.
+        baseline_name = options.names.get(options.beside, options.beside)
+        baseline = _count_series("", baseline_rows, series_values, options)
+        text += _compare_with_baseline(baseline_name, baseline, totals, series, verb)
+        bars = {baseline_name: baseline, **cells}
 
     def draw(figure: Any) -> None:
         """Draw lines over the bins, or else bars or a map."""
         if options.form == "lines":
+            # Lines are drawn over bins, but a single value has no center.
             positions = bin_centers or range(len(cells))
             unit = format_unit(rows, options.by).strip()
             _draw_rate_lines(figure, cells, series, positions, unit, options)
@@ -501,7 +543,7 @@ def make_rates_figure(rows: Rows, options: RatesOptions) -> FigureContent:
 
 
 def _split_baseline(rows: Rows, options: RatesOptions) -> tuple[Rows, Rows]:
-    """Return the rows of the part that is the baseline, and all others."""
+    """Return the rows of the part that the others are compared with, and the others."""
     is_baseline = rows[PART_COLUMN] == options.beside
     return rows[is_baseline], rows[~is_baseline]
 
@@ -527,8 +569,8 @@ def _count_cells(
         options: options of the figure.
 
     Returns:
-        For each group by its name a tally for each series; and the centers of bins,
-        None if the groups are single values.
+        For each group by its name, a fraction for each series; and the centers of the
+        bins, None if the groups are single values.
     """
     groups, bin_centers = _group_rows(rows, options)
     cells = dict[str, list[ClusteredFraction]]()
@@ -549,28 +591,33 @@ def _count_series(
     """Count the right predictions in each series; with `options.wrong` the wrong ones.
 
     Args:
-        name: name of the tallies.
-        rows: the rows, of all series.
+        name: name of the fractions.
+        rows: the rows of all series.
         series_values: values of the column `options.series`; a single "" without it.
         options: options of the figure.
 
     Returns:
-        A tally for each series, in the order of `series_values`; a series without rows
-        has an empty one.
+        A fraction for each series, in the order of `series_values`. A series without
+        rows has a fraction of no rows.
     """
     rows_of_series = {"": rows}
     if options.series and len(rows):
         rows_of_series = split_rows(rows, options.series)
+    counts_right = not options.wrong
     tallies = []
     for value in series_values:
-        series_rows = rows_of_series.get(value, rows[:0])
-        is_counted = series_rows["correct"] != options.wrong
+        no_rows = rows[:0]
+        series_rows = rows_of_series.get(value, no_rows)
+        is_counted = series_rows["correct"] == counts_right
         tallies.append(ClusteredFraction.from_rows(name, series_rows, is_counted))
     return tallies
 
 
 def _name_series(series: Sequence[str], options: RatesOptions) -> list[str]:
-    """Return names of series for sentences; a number says of what: ``severity 3``."""
+    """Return names of series for sentences.
+
+    A number follows the name of the column, as in ``severity 3``.
+    """
     column_name = strip_control(options.series or "")
     names = []
     for name in series:
@@ -582,10 +629,10 @@ def _name_series(series: Sequence[str], options: RatesOptions) -> list[str]:
 def _describe_cells(
     cells: Cells, series: Sequence[str], is_binned: bool, options: RatesOptions
 ) -> list[str]:
-    """Describe the lowest and the highest cell: of a map, or else of each series.
+    """Describe the lowest and the highest fraction: of a map, or else of each series.
 
     Args:
-        cells: for each row by its name, a tally for each series.
+        cells: for each row by its name, a fraction for each series.
         series: names of the series.
         is_binned: whether the rows are bins of a number.
         options: options of the figure.
@@ -599,8 +646,9 @@ def _describe_cells(
     for index, name in enumerate(series):
         tallies = [row[index].with_name(row_name) for row_name, row in cells.items()]
         n_known = sum(tally.total > 0 for tally in tallies)
+        # There is nothing to compare. `_describe_series` describes the series.
         if has_several_series and n_known < 2:
-            continue  # a single row is described by `_describe_series`
+            continue
         lowest = f"For {name}, lowest" if has_several_series else "Lowest"
         text += describe_extremes(
             tallies,
@@ -615,10 +663,10 @@ def _describe_cells(
 def _describe_map_cells(
     cells: Cells, series: Sequence[str], options: RatesOptions
 ) -> list[str]:
-    """Describe the lowest and the highest cell of all rows and series of a map.
+    """Describe the lowest and the highest fraction of all cells of a map.
 
     Args:
-        cells: for each row by its name, a tally for each series.
+        cells: for each row by its name, a fraction for each series.
         series: names of the series.
         options: options of the figure.
     """
@@ -649,14 +697,15 @@ def _describe_series(
     model, as the mCE (mean corruption error) of Hendrycks and Dietterich (2019).
 
     Args:
-        cells: for each row a tally for each series.
-        totals: totals of each series over all rows.
+        cells: for each row a fraction for each series.
+        totals: fraction of each series over all rows.
         series: names of the series.
         options: options of the figure.
     """
     if not options.series or len(series) < 2:
         return []
     verb = "wrong" if options.wrong else "right"
+    # The sentence becomes "Over all, the lowest share is that of NAME: ...".
     overall = []
     for name, tally in zip(_name_series(series, options), totals, strict=True):
         overall.append(tally.with_name(f"that of {name}"))
@@ -667,7 +716,8 @@ def _describe_series(
         things=pluralize_column(options.series),
         verb=verb,
     )
-    # one text, so that figures by other columns do not repeat it
+    # Figures of other columns have the same sentences. Joined to one text, they are
+    # printed once.
     text = [" ".join(sentences)]
     if options.wrong and options.series == MODEL_COLUMN:
         text += _describe_mean_errors(cells, series)
@@ -675,13 +725,13 @@ def _describe_series(
 
 
 def _describe_mean_errors(cells: Cells, models: Sequence[str]) -> Iterator[str]:
-    """Yield the mean corruption error (mCE) of each model but the first, in a sentence.
+    """Yield the mean corruption error (mCE) of each model but the first, as sentences.
 
     That is the mean over rows of the model's error divided by the first model's. Rows
     in which the first model has no errors are left out.
 
     Args:
-        cells: for each row a tally of errors for each model.
+        cells: for each row a fraction of errors for each model.
         models: names of the models.
     """
     for index, name in enumerate(models[1:], start=1):
@@ -704,16 +754,16 @@ def _compare_with_baseline(
     series: Sequence[str],
     verb: str,
 ) -> list[str]:
-    """Compare one part with all other rows, a sentence for each series.
+    """Compare one part with all other rows, in a sentence for each series.
 
     A difference is shown if the intervals do not overlap.
 
     Args:
         name: name of the part.
-        tallies: tallies of the part, for each series.
-        totals: totals of the others, for each series.
+        tallies: fractions of the part, for each series.
+        totals: fractions of the other parts, for each series.
         series: names of the series.
-        verb: word for what is counted, "right" or "wrong" say.
+        verb: word for what is counted, for example "right" or "wrong".
     """
     text = []
     for series_name, tally, total in zip(series, tallies, totals, strict=True):
@@ -736,8 +786,8 @@ def _tabulate_rates(
     """Return the table of a rates figure; with series, their totals come last.
 
     Args:
-        cells: for each row by its name, a tally for each series.
-        totals: totals of each series over all rows.
+        cells: for each row by its name, a fraction for each series.
+        totals: fraction of each series over all rows.
         series: names of the series.
         options: options of the figure.
     """
@@ -753,17 +803,19 @@ def _tabulate_rates(
 
 
 def _choose_size(
-    n_bars: int, n_rows: int, n_series: int, options: RatesOptions
+    n_bar_groups: int, n_map_rows: int, n_series: int, options: RatesOptions
 ) -> tuple[float, float]:
-    """Return width and height of a rates figure, inches.
+    """Return width and height of a rates figure in inches.
 
-    A map has room for each series and row, bars for each series of each row.
+    A map has a column for each series. Bars come in groups, each with a bar for each
+    series.
     """
     if options.form == "map":
-        return max(2.8 + 0.42 * n_series, 5.4), 1.9 + 0.28 * n_rows
+        width = max(2.8 + 0.42 * n_series, MIN_MAP_WIDTH)
+        return width, 1.9 + 0.28 * n_map_rows
     if options.form == "lines":
-        return 6.0, 3.4
-    return 6.0, 1.4 + (0.2 + 0.09 * n_series) * n_bars
+        return FIGURE_WIDTH, LINES_HEIGHT
+    return FIGURE_WIDTH, 1.4 + (0.2 + 0.09 * n_series) * n_bar_groups
 
 
 def _draw_rates(
@@ -777,7 +829,7 @@ def _draw_rates(
 
     Args:
         figure: figure of matplotlib.
-        bars: for each row a tally for each series, with the baseline first, if any.
+        bars: for each row a fraction for each series, with the baseline first, if any.
         cells: the same without the baseline.
         series: names of the series.
         options: options of the figure.
@@ -810,7 +862,7 @@ def _draw_rate_lines(
 
     Args:
         figure: figure of matplotlib.
-        cells: for each bin a tally for each series.
+        cells: for each bin a fraction for each series.
         series: names of the series.
         positions: center of each bin, or its index if the rows are not binned.
         unit: unit of the parameter; empty without one.
@@ -828,18 +880,18 @@ def _draw_rate_lines(
 def _group_rows(
     rows: Rows, options: RatesOptions
 ) -> tuple[Mapping[str, Rows], list[float] | None]:
-    """Split rows by a column's values, or by bins of them.
+    """Split rows by the values of a column, or by bins of its values.
 
-    Without `bins`, and unless lines are drawn, each value is a group. Rows outside of
-    the `range` are in no bin.
+    Each value is a group if `bins` is None and no lines are drawn. Rows outside of the
+    `range` are in no bin.
 
     Args:
         rows: the rows.
         options: the column, and the number and range of its bins.
 
     Returns:
-        The rows by the name of the value or bin; and the centers of the bins, None
-        without bins.
+        The rows by the name of the value or bin; and the centers of the bins, None if
+        there are no bins.
     """
     if options.bins is None and options.form != "lines":
         return split_rows(rows, options.by), None
@@ -852,14 +904,13 @@ def _group_rows(
             f"differ, got {lower:g} to {upper:g}"
         )
     bin_index = _find_bins(values, lower, upper, n_bins)
-    edges = (lower + (upper - lower) * index / n_bins for index in range(n_bins + 1))
+    edges = [lower + (upper - lower) * index / n_bins for index in range(n_bins + 1)]
     groups = dict[str, Rows]()
     centers = list[float]()
     for index, (start, end) in enumerate(pairwise(edges)):
         bounds = f"{wording.format_figure_value(start)} to {wording.format_figure_value(end)}"
         name = bounds + format_unit(rows, options.by)
-        in_bin = bin_index == index
-        groups[name] = rows[in_bin]
+        groups[name] = rows[bin_index == index]
         centers.append((start + end) / 2)
     return groups, centers
 
@@ -876,9 +927,9 @@ def _find_bins(values: Any, lower: float, upper: float, n_bins: int) -> Any:
         n_bins: number of bins of equal width.
     """
     position = (values - lower) / (upper - lower) * n_bins
-    in_range = values.between(lower, upper)
-    # The upper end is in the last bin.
-    return position.clip(upper=n_bins - 1).where(in_range) // 1
+    is_in_range = values.between(lower, upper)
+    position = position.clip(upper=n_bins - 1)  # the upper end is in the last bin
+    return position.where(is_in_range) // 1  # rounded down; NaN stays NaN
 
 
 def _read_binned_values(rows: Rows, options: RatesOptions) -> Any:
@@ -903,7 +954,7 @@ def _draw_map(axes: Any, cells: Cells, series: Sequence[str], label: str) -> Non
 
     Args:
         axes: axes of matplotlib.
-        cells: for each row of the matrix a tally for each series.
+        cells: for each row of the matrix a fraction for each series.
         series: names of the columns.
         label: label of the color bar.
     """
@@ -945,7 +996,7 @@ def _draw_lines(
 
     Args:
         axes: axes of matplotlib.
-        cells: for each bin a tally for each series.
+        cells: for each bin a fraction for each series.
         series: names for the legend.
         bin_positions: positions of the bins along the horizontal axis.
     """
@@ -958,7 +1009,7 @@ def _draw_lines(
             tally = tallies[index]
             if not tally.total:
                 continue
-            # Without an interval nothing is known: the band is full.
+            # An unknown interval is drawn as a band from 0 to 1.
             interval = tally.interval() or (0.0, 1.0)
             positions.append(position)
             shares.append(tally.fraction)
@@ -988,10 +1039,10 @@ ALL_OBJECTS = "all objects"
 
 
 class AgreementOptions(Options):
-    """Options of agreements: the rendered part, and the parts to compare it with.
+    """Options of a figure of agreement.
 
-    The first of `of` has the renderings that photographs are compared with, the others
-    show the same configurations under other conditions.
+    The first part in `of` has the renderings that photographs are compared with. The
+    other parts show the same configurations under other conditions.
     """
 
     of: tuple[str, ...] = Field(min_length=1)
@@ -999,7 +1050,7 @@ class AgreementOptions(Options):
 
     @property
     def required_parts(self) -> tuple[str, ...]:
-        """The parts of the recipe whose rows the figure needs."""
+        """The parts of the recipe that the figure needs."""
         return (*self.of, PHOTOGRAPHS)
 
 
@@ -1015,7 +1066,7 @@ AGREEMENT_HEADS = [
 
 
 def make_agreement_figure(rows: Rows, options: AgreementOptions) -> FigureContent:
-    """Compare predictions about renderings with those about other images of the same.
+    """Compare predictions about renderings with those about other images of the object.
 
     The other images are photographs, and the images of other parts. A pair agrees if
     the model is right about both images, or wrong about both. If there are no
@@ -1028,15 +1079,17 @@ def make_agreement_figure(rows: Rows, options: AgreementOptions) -> FigureConten
     Raises:
         InputError: if a part has no rows or other configurations.
     """
-    # `dropna` leaves out the columns that only other parts have
-    renderings = _select_part(rows, options.of[0]).dropna(axis=1, how="all")
+    rendered_part = options.of[0]
+    # `dropna` removes the columns that only rows of other parts have.
+    renderings = _select_part(rows, rendered_part).dropna(axis=1, how="all")
     if renderings.empty:
         raise InputError(
             "figures: agreement: expected predictions of a part "
-            f"{options.of[0]!r}, got none"
+            f"{rendered_part!r}, got none"
         )
     objects = [ALL_OBJECTS, *renderings["object"].unique()]
-    # for each object a tally of each series; a series compares with one part's images
+    # For each object a fraction for each series. A series is a part that the renderings
+    # are compared with.
     bars: dict[str, list[ClusteredFraction]] = {name: [] for name in objects}
     series = list[str]()
     text = list[str]()
@@ -1048,11 +1101,11 @@ def make_agreement_figure(rows: Rows, options: AgreementOptions) -> FigureConten
             continue
         pairs = _pair_rows(part_rows, renderings)
         n_unpaired = len(part_rows) - len(pairs)
-        # a photograph may show no rendering, but another part has to have all of them
+        # A photograph may belong to no rendering, but rows of other parts must.
         if part != PHOTOGRAPHS and n_unpaired:
             raise InputError(
                 f"figures: agreement: expected {part} to have the "
-                f"configurations of {options.of[0]}"
+                f"configurations of {rendered_part}"
             )
         series_name = options.names.get(part, part)
         series.append(series_name)
@@ -1068,7 +1121,8 @@ def make_agreement_figure(rows: Rows, options: AgreementOptions) -> FigureConten
         columns=AGREEMENT_HEADS,
         rows=table,
         draw=lambda figure: _draw_agreement(figure, bars, series),
-        size=(6.0, 1.7 + 0.2 * len(series) + 0.34 * (len(bars) - 1)),
+        # a row of bars for each object, and a line of the legend for each series
+        size=(FIGURE_WIDTH, 1.7 + 0.2 * len(series) + 0.34 * (len(bars) - 1)),
     )
 
 
@@ -1089,10 +1143,10 @@ def _add_agreement(
     Two images agree if the model is right about both, or wrong about both.
 
     Args:
-        bars: for each object, and for `ALL_OBJECTS`, the tallies of the series; these
-            pairs are one more series.
+        bars: for each object, and for `ALL_OBJECTS`, the fractions of the series; these
+            pairs are added as one more series.
         pairs: pairs of renderings and other images.
-        table: rows of the table, to which one for each entry of the bars is added.
+        table: rows of the table; a row is added for each entry of the bars.
         series_name: name of the other images.
     """
     for name, tallies in bars.items():
@@ -1141,13 +1195,14 @@ def _count_agreement(name: str, pairs: Rows) -> tuple[ClusteredFraction, list[Ce
     """Count the pairs in which both predictions are right, or both are wrong.
 
     Args:
-        name: name of the tally.
+        name: name of the fraction.
         pairs: pairs with "correct rendered" for the rendering, "correct" for the other
             image.
 
     Returns:
-        The tally of these pairs; and the cells of the table's row: pairs by whether the
-        rendering and the other image are right, equal predictions, and the tally.
+        The fraction of these pairs; and the cells of the table's row: pairs by whether
+        the rendering and the other image are right, equal predictions, and the
+        fraction.
     """
     of_rendering = pairs["correct rendered"]
     of_other = pairs["correct"]
@@ -1163,9 +1218,9 @@ def _count_agreement(name: str, pairs: Rows) -> tuple[ClusteredFraction, list[Ce
 
 
 def _count_same_prediction(pairs: Rows) -> int:
-    return int(
-        (pairs[f"{PREDICTION_COLUMN} rendered"] == pairs[PREDICTION_COLUMN]).sum()
-    )
+    """Return the number of pairs with the same prediction about both images."""
+    rendered_prediction = pairs[f"{PREDICTION_COLUMN} rendered"]
+    return int((rendered_prediction == pairs[PREDICTION_COLUMN]).sum())
 
 
 def _describe_agreement(name: str, tally: ClusteredFraction, pairs: Rows) -> str:
@@ -1195,16 +1250,17 @@ def _describe_photographs(n_pairs: int, n_unpaired: int) -> list[str]:
 
 
 def _describe_where(right: bool, pairs: Rows) -> str:
-    """Describe how often the model is right (wrong) about both images of a pair.
+    """Describe how often the model is right about both images of a pair, or wrong.
 
-    Among the pairs in which it is right (wrong) about the rendering, this counts those
-    in which it is so about the other image, too. The sentence calls the model "it",
-    since it follows one that names the model.
+    Among the pairs in which the model is right (wrong) about the rendering, this counts
+    those in which it is also right (wrong) about the other image. The sentence calls
+    the model "it", since it follows one that names the model.
 
     Args:
-        right: selects the pairs in which the model is right about the rendering, or
-            else wrong.
-        pairs: pairs of a rendering and another image.
+        right: whether to select the pairs in which the model is right about the
+            rendering, or those in which it is wrong.
+        pairs: pairs of a rendering and another image; the column "correct" is about the
+            other image, "correct rendered" about the rendering.
     """
     verb = "right" if right else "wrong"
     is_selected = pairs["correct rendered"] == right
@@ -1217,7 +1273,7 @@ def _describe_where(right: bool, pairs: Rows) -> str:
 
 
 def make_scaling_figure(rows: Rows, options: Options) -> FigureContent:
-    """Make a figure of the throughput of sweeps, images per second, by worker count.
+    """Make a figure of the images per second of sweeps, by the number of workers.
 
     Args:
         rows: rows of sweeps, with the times when they were stored.
@@ -1230,13 +1286,15 @@ def make_scaling_figure(rows: Rows, options: Options) -> FigureContent:
         raise InputError(
             "figures: scaling: expected sweeps with `workers` among the parts, got none"
         )
-    # grouping leaves out the rows of sweeps that do not set the workers
-    runs = rows.groupby([WORKERS_COLUMN, "object"], sort=False)["time"].agg(
+    # Grouping leaves out the rows of sweeps that do not set the workers. A run is one
+    # object with one number of workers.
+    rate_of_run = rows.groupby([WORKERS_COLUMN, "object"], sort=False)["time"].agg(
         _compute_throughput
     )
+    # for each number of workers, in ascending order, the rate of each object
     rates_by_count = {
-        int(workers): run_rates.droplevel(0)
-        for workers, run_rates in runs.groupby(level=0)
+        int(workers): run_rates.droplevel(WORKERS_COLUMN)
+        for workers, run_rates in rate_of_run.groupby(level=WORKERS_COLUMN)
     }
     table = list[list[Cell]]()
     for workers, run_rates in rates_by_count.items():
@@ -1251,7 +1309,7 @@ def make_scaling_figure(rows: Rows, options: Options) -> FigureContent:
     )
 
     def draw(figure: Any) -> None:
-        _draw_scaling(figure, rates_by_count, runs.max())
+        _draw_scaling(figure, rates_by_count, rate_of_run.max())
 
     heads = [
         "workers",
@@ -1265,24 +1323,34 @@ def make_scaling_figure(rows: Rows, options: Options) -> FigureContent:
         columns=heads,
         rows=table,
         draw=draw,
-        size=(6.0, 3.4),
+        size=(FIGURE_WIDTH, LINES_HEIGHT),
     )
 
 
 def _compute_gains(run_rates: Any, rates_by_count: Mapping[int, Any]) -> Any:
-    """Divide the rates of runs by those of the same objects with the fewest workers."""
-    slowest = next(iter(rates_by_count.values()))
-    return (run_rates / slowest.reindex(run_rates.index)).dropna()
+    """Divide the rate of each object by its rate with the fewest workers.
+
+    Args:
+        run_rates: images per second by object (a pd.Series).
+        rates_by_count: the same for each number of workers, in ascending order.
+
+    Returns:
+        The quotients by object; objects without a rate with the fewest workers are left
+        out.
+    """
+    rates_of_fewest = next(iter(rates_by_count.values()))
+    return (run_rates / rates_of_fewest.reindex(run_rates.index)).dropna()
 
 
 def _describe_scaling(rates_by_count: Mapping[int, Any]) -> list[str]:
     """Describe the throughput of each worker count, relative to the fewest workers.
 
-    Each count has several runs, one of each object: the sentences have their median and
-    range.
+    For each count there are several runs, one of each object. The sentences state their
+    median and range.
 
     Args:
-        rates_by_count: throughput of several runs, by ascending worker count.
+        rates_by_count: images per second by object (a pd.Series), by ascending worker
+            count.
     """
     fewest = next(iter(rates_by_count))
     text = list[str]()
@@ -1321,7 +1389,7 @@ def _draw_scaling(
 
     Args:
         figure: figure of matplotlib.
-        rates_by_count: images per second of several runs, by ascending worker count.
+        rates_by_count: images per second by object, by ascending worker count.
         max_rate: the largest of all rates.
     """
     axes = figure.subplots()
@@ -1363,8 +1431,8 @@ def _draw_scaling(
 def _compute_throughput(times: Any) -> float:
     """Compute images per second from the times (n,) when the rows of a run were stored.
 
-    The first quarter is left out, in which workers load. Rows of one batch are stored
-    at once.
+    The first quarter is left out, since workers are still loading then. Rows of one
+    batch are stored at the same time.
 
     Raises:
         InputError: if the rest is a single batch.
@@ -1387,8 +1455,8 @@ def _format_spread(values: Any) -> str:
     return f"{median} ({values.min():.3g} to {values.max():.3g})"
 
 
-def _list_surface_cells(surface_table: Any) -> list[Cell]:
-    """Return the cells of a row: the counts of one object, model and kind of part."""
+def _make_surface_cells(surface_table: Any) -> list[Cell]:
+    """Return the cells of a table's row about one object, model and kind of part."""
     return [
         surface_table.object,
         wording.shorten_name(surface_table.model),
@@ -1403,7 +1471,7 @@ def _list_surface_cells(surface_table: Any) -> list[Cell]:
 def make_surface_figure(rows: Rows, options: Options) -> FigureContent:
     """Make a figure of the surface parts that are visible when predictions are wrong.
 
-    It puts the images that the sweeps have written below each other.
+    It shows the images that the sweeps have written below each other.
 
     Args:
         rows: rows of the runs; their `attrs` have the summaries of the surfaces.
@@ -1412,8 +1480,8 @@ def make_surface_figure(rows: Rows, options: Options) -> FigureContent:
     Raises:
         InputError: if no sweep has `surface: true`.
     """
-    surfaces = rows.attrs["surfaces"]
-    if not surfaces:
+    surface_of_run = rows.attrs["surfaces"]
+    if not surface_of_run:
         raise InputError(
             "figures: surface: expected a sweep with `surface: true` "
             "among its parts, got none"
@@ -1423,17 +1491,19 @@ def make_surface_figure(rows: Rows, options: Options) -> FigureContent:
         """Draw the figures of the runs below each other."""
         from matplotlib.image import imread  # matplotlib takes half a second
 
-        all_axes = figure.subplots(len(surfaces), squeeze=False)[:, 0]
-        for axes, run in zip(all_axes, surfaces, strict=True):
+        all_axes = figure.subplots(len(surface_of_run), squeeze=False)[:, 0]
+        for axes, run in zip(all_axes, surface_of_run, strict=True):
             directory = RunDirectory.locate_part(rows.attrs["folder"], run)
             axes.imshow(imread(directory / "images" / "surface.png"))
             axes.axis("off")
 
     table = list[list[Cell]]()
     text = list[str]()
-    for run_surface in surfaces.values():
-        text += workbench.surface_sentences(run_surface)
-        table += map(_list_surface_cells, run_surface.tables)
+    for surface in surface_of_run.values():
+        text += workbench.surface_sentences(surface)
+        table += [
+            _make_surface_cells(surface_table) for surface_table in surface.tables
+        ]
     heads = [
         "object",
         "model",
@@ -1449,5 +1519,5 @@ def make_surface_figure(rows: Rows, options: Options) -> FigureContent:
         columns=heads,
         rows=table,
         draw=draw,
-        size=(6.4, 2.65 * len(surfaces)),
+        size=(6.4, 2.65 * len(surface_of_run)),
     )

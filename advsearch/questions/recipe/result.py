@@ -1,6 +1,4 @@
-"""Settings and result of `recipe`: its runs, and its figures with numbers and
-sentences.
-"""
+"""Settings and result of `recipe`: its runs and figures."""
 
 from __future__ import annotations
 
@@ -35,8 +33,8 @@ SCENE_SETTINGS: Any = SceneConfig
 
 
 class RecipeConfig(Config):
-    """Settings of `recipe`: which recipe, and on which objects, environments and
-    models.
+    """Settings of `recipe`: the recipe, and the objects, environments and models that
+    replace those of the recipe.
     """
 
     command: ClassVar[str] = "recipe"
@@ -51,10 +49,12 @@ class RecipeConfig(Config):
         ..., "recipe", "the experiment to run",
         "the name of a recipe, which advsearch recipe list shows, or a YAML file",
     )
-    quick: bool = setting(False, "recipe", "few and small pictures, for a first look")
+    quick: bool = setting(
+        False, "recipe", "use few and small pictures, for a first look"
+    )
     photographs: str | None = setting(
-        None, "recipe", "photographs to compare with renderings, of each object in a "
-                        "folder of its name", "a folder",
+        None, "recipe", "photographs to compare with renderings, in a folder for each "
+                        "object, named after it", "a folder",
         otherwise="those taken with advsearch dashboard",
     )
     object: str | None = setting_as_in(SweepConfig, "object", default=None, otherwise=FROM_RECIPE)
@@ -138,9 +138,11 @@ class RecipeConfig(Config):
     @field_validator("label")
     @classmethod
     def _check_labels(cls, value: dict[str, str]) -> dict[str, str]:
-        """Reject empty labels and zero bytes."""
+        """Reject labels without a name, and zero bytes."""
         for name, label in value.items():
-            if not label.strip(" ,\t\n") or "\0" in name + label:
+            # A label is a list of names that commas separate.
+            names_nothing = not label.strip(" ,\t\n")
+            if names_nothing or "\0" in name + label:
                 raise ValueError("an empty name")
         return value
 
@@ -158,9 +160,9 @@ class RecipeConfig(Config):
         return str(self.task["name"])
 
     def find_label(self, name: str) -> str | None:
-        """Return the right label that the settings give an object, None for its own.
+        """Return the right label of an object from the settings; None without one.
 
-        They name the object as it is, or by the stem of its file, or all objects.
+        The settings may name the object, the stem of its file, or all objects.
         """
         return (
             self.label.get(name)
@@ -169,31 +171,32 @@ class RecipeConfig(Config):
         )
 
 
-# columns of a figure's numbers that are a fraction and the bounds of its 95 % interval
+# columns of a figure's numbers: a fraction, and the bounds of its 95 % interval
 FRACTION_COLUMNS = ("share", "low", "high")
 
 
 class RecipePart(results.Fields):
     """One run of a recipe."""
 
-    name: str = Field(description="of its folder, in `parts`")
+    name: str = Field(description="name of its folder in `parts`")
     part: str = Field(description="the part of the recipe that it belongs to")
     command: str
     object: str
     ending: str
-    renders: int = Field(description="pictures that it took")
+    renders: int = Field(description="number of pictures that were rendered")
 
 
 class RecipeFigure(results.Fields):
     """One figure: its numbers, and sentences about them."""
 
-    figure: str = Field(description="its kind")
+    figure: str = Field(description="kind of the figure")
     title: str
-    text: list[str] = Field(description="what it says, in sentences")
+    text: list[str] = Field(description="sentences that describe the figure")
     columns: list[str] = Field(
-        description="of its numbers; `low` and `high` are a share's 95 % interval"
+        description="heads of the table; `low` and `high` are the 95 % interval of a "
+        "fraction"
     )
-    rows: list[list[Cell]] = Field(description="of its numbers")
+    rows: list[list[Cell]] = Field(description="rows of the table")
 
 
 class RecipeResult(views.InNotebook, RunResult):
@@ -201,17 +204,17 @@ class RecipeResult(views.InNotebook, RunResult):
 
     command: ClassVar[str] = "recipe"
 
-    recipe: str = Field(description="its name, or its file")
-    title: str = Field(description="what it asks")
+    recipe: str = Field(description="name or file of the recipe")
+    title: str = Field(description="the question that the recipe answers")
     about: str = Field(
-        description="what is done for a result, and whose experiment it is"
+        description="how the result is obtained, and whose experiment it is"
     )
-    quick: bool = Field(description="whether it was few small pictures")
+    quick: bool = Field(description="whether few and small pictures were used")
     objects: list[str]
     model: str
     parts: list[RecipePart] = Field(description="the runs in the folder `parts`")
     figures: list[RecipeFigure]
-    warnings: list[str] = Field(description="sentences that a reader has to know")
+    warnings: list[str] = Field(description="remarks that limit what the result shows")
 
     @property
     def brief(self) -> str:
@@ -290,10 +293,10 @@ def _format_cell(column: str, value: Cell) -> str:
 
 
 def omit_repeated_sentences(figures: Sequence[RecipeFigure]) -> list[list[str]]:
-    """Return the sentences of each figure, less those that an earlier figure has.
+    """Return the sentences of each figure without those that an earlier figure has.
 
     Only sentences with a count, as in "3 of 5", are left out. If no sentence remains,
-    or the text is equal to that of the previous figure, a sentence states it.
+    or the text is equal to that of the previous figure, a sentence states this.
     """
     reported = set[str]()
     remaining = list[list[str]]()

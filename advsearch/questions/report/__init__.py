@@ -1,3 +1,4 @@
-"""What runs show, as evidence for a model card or a safety case; `advsearch report`
-writes it.
+"""Collect the claims of runs as evidence for a model card or a safety case.
+
+`advsearch report` writes the evidence.
 """

@@ -47,11 +47,14 @@ if TYPE_CHECKING:
     from advsearch.extend import workbench
 
 
+DRIVES_PART = "ways and speeds"
+THINGS_PART = "road users and things"
+CAMERA_PART = "camera and picture"
 DOMAIN = {
     "place": ("environment", "background"),
     "light": ("light", "sky", "exposure", "shadow", "projector", "spot"),
     "weather": ("haze",),
-    "road users and things": (
+    THINGS_PART: (
         "object",
         "answer",
         "things",
@@ -61,14 +64,14 @@ DOMAIN = {
         "contents",
     ),
     "surfaces": ("texture", "material", "patch", "geometry", "ground"),
-    "ways and speeds": ("path",),
-    "camera and picture": ("camera", "lens", "sensor", "corruption"),
+    DRIVES_PART: ("path",),
+    CAMERA_PART: ("camera", "lens", "sensor", "corruption"),
 }
-"""The parts of an operational design domain, with their axes and controls."""
-# the part of axes and controls that belong to no other
+"""The parts of an operational design domain: for each its axes and controls."""
+# for axes and controls that belong to no other part
 OTHER = "other"
 
-# how common the values of axes are: weights by axis and value
+# how common values are in use: weights by axis and value
 Exposure = Mapping[str, Mapping[str, float]]
 
 
@@ -83,13 +86,13 @@ def is_sweep(result: results.Result) -> TypeGuard[workbench.SweepSummary]:
 
 
 def make_empty_claim(reason: str) -> views.Claim:
-    """Return the claim of a run that carries none, with the reason."""
+    """Return the claim of a run that has no claims, with the reason."""
     return views.Claim(
         kind="nothing claimed", statement=f"Nothing is claimed: {reason}.", extent=None
     )
 
 
-# the interval of a fraction of which nothing is known
+# the interval of a fraction if nothing is known about it
 UNKNOWN_FRACTION = (0.0, 1.0)
 
 
@@ -98,10 +101,10 @@ def count_conditions(
 ) -> list[ConditionShare]:
     """Count right predictions by each value of each axis of a sweep.
 
-    With rows of photographs, those are counted instead that agree with the rendering
-    which they are aligned with: the model is right in both or wrong in both. Values
-    without any counts are left out. Results of other commands than `sweep` have no
-    axes, so the list is empty.
+    With rows of photographs, the photographs are counted that agree with their
+    rendering instead: the model is right about both or wrong about both. Values without
+    any counts are left out. Results of other commands than `sweep` have no axes, so the
+    list is empty.
 
     Args:
         result: result of the run.
@@ -129,12 +132,12 @@ def count_conditions(
 def _make_condition(
     row: Any, right: int, total: int, interval: results.Interval
 ) -> ConditionShare:
-    """Return how many are right where an axis has a value.
+    """Return the count of right predictions for one value of an axis.
 
     Args:
-        row: row of a sweep about that value of the axis.
-        right: how many are right, or agree.
-        total: how many were counted.
+        row: row of a sweep's result about this value.
+        right: number of right predictions, or of photographs that agree.
+        total: number of predictions or photographs.
         interval: 95 % interval of the fraction.
     """
     bounds = row.value if isinstance(row.value, tuple) else (row.value,)
@@ -159,15 +162,18 @@ def _count_agreeing(
     about both.
 
     Args:
-        photographs: their rows.
-        axis: a parameter of the rendering.
-        value: which it has to have.
+        photographs: rows of the photographs.
+        axis: name of a parameter of the rendering.
+        value: value of the parameter in the renderings to count.
     """
     agrees = []
     for photo in photographs:
         if axis in photo.values and _has_value(photo.values[axis]["value"], value):
-            photo_is_right = bool(cast(Any, photo.payload)["photo"]["right"])
-            agrees.append(bool(photo.correct) == photo_is_right)
+            # `correct` is about the photograph. The payload has what is stored about
+            # its rendering.
+            rendering = cast(Any, photo.payload)["photo"]
+            rendering_is_right = bool(rendering["right"])
+            agrees.append(bool(photo.correct) == rendering_is_right)
     return sum(agrees), len(agrees)
 
 
@@ -182,15 +188,17 @@ def _has_value(value: float | str, axis_value: workbench.AxisValue) -> bool:
 
 
 def list_triggering_conditions(result: results.Result) -> list[str]:
-    """Return rules under which the model is wrong more often, if it looks for any."""
+    """Return the rules, if any, under which the model is wrong more often."""
     triggering = workbench.get_experiment(result.command).triggering
     return [] if triggering is None else list(triggering(result))
 
 
 def evaluate_criterion(criterion: float, interval: results.Interval) -> str:
-    """Return whether an interval is above a criterion, below it, or neither.
+    """Compare the interval of a fraction with a criterion.
 
-    The words are "met", "not met" and "open".
+    Returns:
+        "met" if the interval is above the criterion, "not met" if it is below, else
+        "open".
     """
     lower, upper = interval
     if lower >= criterion:
@@ -199,10 +207,10 @@ def evaluate_criterion(criterion: float, interval: results.Interval) -> str:
 
 
 def find_selected_axes(result: results.Result) -> list[str]:
-    """Return the axes of a sweep with several values that somebody chose.
+    """Return the axes of a sweep that have several selected values.
 
-    They are not sampled, so that a fraction over them depends on the choice. Models and
-    answers are no conditions, and are left out.
+    Selected values are not sampled, so that a fraction over them depends on the
+    selection. Models and adversarial scenes are no conditions, and are left out.
     """
     n_values = Counter[str]()
     if is_sweep(result):
@@ -223,9 +231,9 @@ def describe_criterion(
     """Describe whether a criterion is met: a minimum fraction of right predictions.
 
     If the user selected the values of an axis, each condition is evaluated separately,
-    since a fraction over all conditions would depend on the selection. Without
-    conditions, the sentences state that the values were selected. A fraction of
-    failures has no criterion.
+    since a fraction over all conditions would depend on the selection. Else, or without
+    conditions, each claimed fraction of right predictions is evaluated. Conditions in
+    which the criterion is not met are listed in either case.
 
     Args:
         claims: claims of the run.
@@ -237,14 +245,14 @@ def describe_criterion(
     verdict_of_condition = {
         row.condition: evaluate_criterion(criterion, row.interval) for row in conditions
     }
-    # "open": the interval of the fraction includes the criterion.
+    # "open" is a verdict, too: the interval contains the criterion.
     listed_verdicts = ["not met"]
     if selected_axes:
         listed_verdicts.append("open")
     if selected_axes and conditions:
         lines = [_count_verdicts(verdict_of_condition, criterion, selected_axes)]
     else:
-        lines = _criterion_of_claims(claims, criterion, selected_axes)
+        lines = _describe_criterion_of_claims(claims, criterion, selected_axes)
     for listed in listed_verdicts:
         names = [
             condition
@@ -278,7 +286,7 @@ def _count_verdicts(
     )
 
 
-def _criterion_of_claims(
+def _describe_criterion_of_claims(
     claims: Sequence[views.Claim], criterion: float, selected_axes: Sequence[str]
 ) -> list[str]:
     """Describe for each claimed fraction of right predictions if a criterion is met.
@@ -297,6 +305,7 @@ def _criterion_of_claims(
     lines = []
     for claim in claims:
         extent = claim.extent
+        # A criterion is about right predictions, not about failures.
         if extent is not None and extent.counts_right:
             verdict = evaluate_criterion(criterion, extent.interval)
             lines.append(
@@ -352,7 +361,7 @@ def describe_exposure(
     For each axis this is the mean of the fractions of its values, weighted by the
     exposure. Each fraction has an interval, and all intervals hold jointly
     (Bonferroni). The bounds of the weighted mean are the weighted means of their lower
-    and upper bounds.
+    and upper bounds. If predictions are not independent, a sentence states that.
 
     Args:
         result: result of the run.
@@ -360,13 +369,14 @@ def describe_exposure(
         exposure: weights by axis and value: how common each value is in use.
 
     Raises:
-        UnknownNameError: if a weighted value is none of its axis.
+        UnknownNameError: an axis does not have a value that the exposure weights.
     """
     lines = []
-    # The intervals assume independent predictions. Frames of one drive are not, and
-    # results other than sweeps may have selected their images.
+    # The intervals need independent predictions. Frames of a drive are not independent,
+    # and results other than sweeps may have selected their images.
     is_independent = is_sweep(result) and result.units is None
     for axis, weights in exposure.items():
+        # The keys are values as text.
         rows = {row.value: row for row in conditions if row.axis == axis}
         if not rows:
             # The run does not vary this axis.
@@ -380,8 +390,8 @@ def describe_exposure(
             lines.append(_describe_weighted(axis, rows, weights))
         else:
             lines.append(
-                f"Weighted by {axis}: not told, as predictions share draws "
-                "(frames of a drive do)."
+                f"Weighted by {axis}: not computed, as predictions are not independent "
+                "(frames of a drive are not)."
             )
     return lines
 
@@ -396,7 +406,7 @@ def _describe_weighted(
         rows: counts of right predictions by value.
         weights: weights by value; they need not add up to 1.
     """
-    mean, lower, upper = _weighted_mean(rows, weights)
+    mean, lower, upper = _compute_weighted_mean(rows, weights)
     total = sum(weights.values())
     fractions = ", ".join(
         f"{value} {wording.percent(weight / total)}"
@@ -408,13 +418,13 @@ def _describe_weighted(
     )
 
 
-def _weighted_mean(
+def _compute_weighted_mean(
     rows: Mapping[str, ConditionShare], weights: Mapping[str, float]
 ) -> tuple[float, float, float]:
-    """Return the weighted mean of the rates of right predictions, with its bounds.
+    """Return the weighted mean of the fractions of right predictions, with its bounds.
 
-    The mean is sum(weight * rate) / sum(weight). Each of the k rates has an interval
-    with confidence 1 - 0.05 / k, so that all intervals hold jointly with 95 %
+    The mean is sum(weight * fraction) / sum(weight). Each of the k fractions has an
+    interval with confidence 1 - 0.05 / k, so that all intervals hold jointly with 95 %
     (Bonferroni). The lower bound of the mean is the weighted mean of their lower
     bounds; the upper bound likewise.
 
@@ -443,7 +453,7 @@ def _weighted_mean(
 
 
 class Variation(Enum):
-    """Whether a part of an operational design domain varied."""
+    """Whether a part of an operational design domain varied; the value is a text."""
 
     VARIED = ""
     WITH_ENVIRONMENT = "as each environment has it"
@@ -451,7 +461,7 @@ class Variation(Enum):
 
 
 class DomainPart(NamedTuple):
-    """A part of an operational design domain: a description, and whether it varied."""
+    """Whether a part of an operational design domain varied, and a description."""
 
     variation: Variation
     description: str
@@ -471,23 +481,26 @@ def describe_domain(
 
     An operational design domain lists the conditions that a system is made for, in
     parts such as "place", "light" and "weather". A part varied if one of the sentences
-    is about it, or else if a control of the run belongs to it. If the place varied,
-    fixed light and weather are described as those of each environment. What belongs to
-    no part is under `OTHER`, if there is anything.
+    in `searched` is about it, or else if a control of the run belongs to it, or if the
+    run is over drives. If the place varied, fixed light and weather are described as
+    those of each environment. What belongs to no part is under `OTHER`, if there is
+    anything.
 
     Args:
         result: result of the run.
-        recorded: settings that it recorded.
-        searched: sentences about what varied, as of `describe_searched`.
+        recorded: settings that the run recorded.
+        searched: sentences about what varied, from `describe_searched`.
     """
-    fixed = _fixed_domain(result, recorded)
+    fixed = _describe_fixed(result, recorded)
+    # `over` are the controls that vary at random in an attack. Not every result has
+    # these fields.
     controls = [*getattr(result, "controls", ()), *getattr(result, "over", ())]
     domain = dict[str, DomainPart]()
     for part in (*DOMAIN, OTHER):
         varied = [line for line in searched if find_domain_part(line) == part]
         if not varied:
             varied = [name for name in controls if find_domain_part(name) == part]
-        if part == "ways and speeds":
+        if part == DRIVES_PART:
             varied += _describe_drives(result)
         fixed_text = "; ".join(filter(None, fixed[part]))
         if varied:
@@ -503,9 +516,10 @@ def describe_domain(
 
 
 def _describe_drives(result: results.Result) -> list[str]:
-    """Describe how many drives a sweep was over; nothing if it was over none.
+    """Describe how many drives a sweep was over; empty if it was over none.
 
-    A sweep has a row about drives for each model, and all have the same drives.
+    A sweep has a row about drives for each model. All models have the same drives, so
+    the first row is used.
     """
     rows = getattr(result, "drives", None) or []
     return [
@@ -514,10 +528,10 @@ def _describe_drives(result: results.Result) -> list[str]:
     ]
 
 
-def _fixed_domain(
+def _describe_fixed(
     result: results.Result, recorded: Sequence[RecordedSettings]
 ) -> dict[str, list[str]]:
-    """Return what does not vary in a run, by the part of an operational design domain.
+    """Return texts about what is fixed in a run, by the part of the design domain.
 
     Args:
         result: result of the run.
@@ -529,11 +543,13 @@ def _fixed_domain(
         recorded, "environment"
     )
     fixed["place"].append(str(environment))
-    things = (str(getattr(result, "object", "") or ""), join_values(recorded, "things"))
-    fixed["road users and things"].append("; ".join(filter(None, things)))
-    fixed["camera and picture"].append(join_values(recorded, "camera"))
-    fixed["camera and picture"].append(join_values(recorded, "backdrop"))
-    # a dictionary without values, as a set in order: each pair once
+    object_name = str(getattr(result, "object", "") or "")
+    things = (object_name, join_values(recorded, "things"))
+    fixed[THINGS_PART].append("; ".join(filter(None, things)))
+    fixed[CAMERA_PART].append(join_values(recorded, "camera"))
+    fixed[CAMERA_PART].append(join_values(recorded, "backdrop"))
+    # The setting `set` has fixed values of parameters by name. The keys of this dict
+    # are a set that keeps the order, so that each pair is listed once.
     parameters = dict[tuple[str, str], None]()
     for run_settings in recorded:
         fixed_values = run_settings.values.get("set")
@@ -548,27 +564,28 @@ def _fixed_domain(
 def find_domain_part(name: str) -> str:
     """Return the part of a domain that an axis, a control or a parameter belongs to.
 
-    Its first word decides: ``camera`` of ``camera.azimuth``, also of a sentence.
+    The first word decides, for example "camera" in ``camera.azimuth``. So a sentence
+    that begins with a name belongs to a part, too.
     """
     first_word = re.match(r"\w+", name)
     if first_word is not None:
-        for part, names in DOMAIN.items():
-            if first_word[0] in names:
+        for part, axes_and_controls in DOMAIN.items():
+            if first_word[0] in axes_and_controls:
                 return part
     return OTHER
 
 
-# images of a run that show most of its result, best first
+# names of images in a run, those that show most of its result first
 PICTURES = ("drive", "clean", "adversarial", "worst", "sweep")
 
 RULES = (
     "Each claim is about the run's own model, object, environment, label and settings, "
     "and about nothing else.",
     "`found`: fresh renders confirm a configuration that a search found; how many "
-    "others there are is not known.",
-    "`not found`: a search of so many renders found none; another policy or more "
-    "renders may find one.",
-    "`measured`: a share of what was counted; its interval has 95 % confidence "
+    "others there are is unknown.",
+    "`not found`: a search with the stated number of renders found none; another "
+    "policy or more renders may find one.",
+    "`measured`: a fraction of what was counted; its interval has 95 % confidence "
     "(Clopper-Pearson's; where predictions "
     "share a draw, as frames of a drive do, one over draws, by bets) and holds for the "
     "distribution that was drawn "
@@ -584,7 +601,7 @@ QUICK = (
 
 
 def collect_claims(result: results.Result) -> list[views.Claim]:
-    """Return the claims of a run; a run without any has a reason."""
+    """Return the claims of a run; if it has none, a claim that states the reason."""
     if result.is_unfinished:
         is_running = getattr(result, "ending", "") == results.RUNNING
         reason = "the run is running" if is_running else "the run is not finished"
@@ -606,9 +623,10 @@ def collect_claims(result: results.Result) -> list[views.Claim]:
 
 
 def list_photograph_claims(photos: Any) -> list[views.Claim]:
-    """Return the claim of a table of agreement; none if the table is empty.
+    """Return the claim about photographs; empty if there are none.
 
-    The table is from `advsearch.photo_agreement`.
+    Args:
+        photos: table of agreement from `advsearch.photo_agreement`.
     """
     if not photos.photos or photos.interval is None:
         return []
@@ -661,12 +679,16 @@ def warn_of_different_models(
 
 
 NOT_NOTED = "not noted"
-# the environment of a scene with its own lights
+# name of the environment of a scene with lights of its own
 NO_ENVIRONMENT_MAP = "none"
-NO_CLAIM = "The run carries no claim; it is listed so that it is not left out unseen."
-WEIGHTED = "How common the conditions are is what the weights say, of their axes alone."
+NO_CLAIM = (
+    "The run carries no claim; it is listed so that the list of runs is complete."
+)
+WEIGHTED = (
+    "How common the conditions are is stated by the weights, for their axes only."
+)
 NOT_WEIGHTED = (
-    "Nothing is said of how common the conditions are: no weights were given."
+    "Nothing is stated about how common the conditions are: no weights were given."
 )
 
 
@@ -721,8 +743,8 @@ def _get_fields(result: results.Result) -> dict[str, Any]:
 def _format_renders(renders: int | Mapping[str, int] | None) -> str:
     """Format how many renders a run took.
 
-    Results state a number, or a number for each purpose. Those without either were made
-    from other runs.
+    Results state a number, or a number for each purpose. A result without either was
+    made from other runs.
     """
     if renders is None:
         return "those of its parts"
@@ -737,9 +759,9 @@ def _format_renders(renders: int | Mapping[str, int] | None) -> str:
 def _describe_subject(
     result: results.Result, recorded: Sequence[RecordedSettings]
 ) -> dict[str, str]:
-    """Return object, environment, model, task and what counts as right, by name.
+    """Return object, environment, model, task and right labels as text, by name.
 
-    Values that are not known are left out.
+    Unknown values are left out.
 
     Args:
         result: result of the run.
@@ -748,9 +770,12 @@ def _describe_subject(
     """
     values = _get_fields(result)
     objects = values.get("object") or ", ".join(values.get("objects") or ())
-    right = values.get("label_set") or join_values(
+    # The names that count as right: a list from the result, or a text from settings.
+    right_labels = values.get("label_set") or join_values(
         recorded, "label", otherwise="the object's own label"
     )
+    if isinstance(right_labels, list):
+        right_labels = ", ".join(right_labels)
     subject = {
         "Object": str(objects or ""),
         "Environment": _describe_environment(result),
@@ -760,21 +785,25 @@ def _describe_subject(
         "Range of its input": join_values(recorded, "value_range"),
         "Task": str(values.get("task") or ""),
         "Judged thing": join_values(recorded, "judge"),
-        "Counts as right": ", ".join(right) if isinstance(right, list) else right,
+        "Counts as right": right_labels,
         "Sought": str(values.get("goal") or ""),
     }
     return {name: text for name, text in subject.items() if text}
 
 
 def _describe_environment(result: results.Result) -> str:
-    """Return the environment of a result, marked if a control varied it, or empty."""
+    """Return the environment of a result; empty if it has none.
+
+    If a control varied the environment, the text states that.
+    """
     values = _get_fields(result)
     environment = str(values.get("environment") or "")
     varied_controls = set[str]()
     for field in ("over", "controls"):
         for name in values.get(field) or ():
-            # of "environment:names"
+            # the kind of the control, which is "environment" in "environment:names"
             varied_controls.add(name.partition(":")[0])
+    # The control "sky" replaces the environment, too.
     is_varied = bool({"environment", "sky"} & varied_controls)
     if not environment or not is_varied:
         return environment
@@ -784,48 +813,53 @@ def _describe_environment(result: results.Result) -> str:
 
 
 def describe_searched(
-    result: results.Result, settings: Mapping[str, object]
+    result: results.Result, run_settings: Mapping[str, object]
 ) -> list[str]:
     """Describe what varied in a run: parameters with ranges, and controls.
 
-    A control is described by the ranges that were set. If none were set, and no other
-    sentence is about its parameters, it varied over its default ranges.
+    A control is described by the ranges that the settings state. If they state none,
+    and no other sentence is about the control, it varied over its default ranges.
 
     Args:
         result: result of the run.
-        settings: settings of the run.
+        run_settings: settings of the run.
     """
     lines = []
     if is_attack(result):
-        lines += _searched_by_attack(result)
+        lines += _describe_searched_by_attack(result)
     elif is_sweep(result):
-        lines += _searched_by_sweep(result)
-    ranges_of_control = settings.get("controls")
-    if not isinstance(ranges_of_control, Mapping):  # names alone, without ranges
+        lines += _describe_searched_by_sweep(result)
+    ranges_of_control = run_settings.get("controls")
+    if not isinstance(ranges_of_control, Mapping):  # only names, without ranges
         ranges_of_control = {}
     for control in getattr(result, "controls", ()):
         ranges = ranges_of_control.get(control)
-        is_described = any(line.startswith((control, f"{control}.")) for line in lines)
+        # A sentence about a parameter begins with its name, as "pose.yaw".
+        is_described = any(line.startswith(control) for line in lines)
         if ranges:
             lines.append(f"{control}, as set: {json.dumps(ranges, ensure_ascii=False)}")
         elif not is_described:
             lines.append(f"{control}: everything that it searches by default")
-    if not is_attack(result):  # the sentences about an attack state them
+    # An attack's own sentences state its budgets.
+    if not is_attack(result):
         for name in ("epsilon", "epsilons"):
-            if settings.get(name) is not None:
-                lines.append(f"{name}: {json.dumps(settings[name])}")
+            if run_settings.get(name) is not None:
+                lines.append(f"{name}: {json.dumps(run_settings[name])}")
     return lines
 
 
-def _searched_by_attack(result: workbench.AttackSummary) -> list[str]:
-    """Describe what an attack searched, and under which conditions."""
+def _describe_searched_by_attack(result: workbench.AttackSummary) -> list[str]:
+    """Describe what an attack searched, and under which random conditions."""
     view = workbench.get_experiment(result.command).view
-    lines = [view(result).facts["changed"]]
+    changed_text = view(result).facts["changed"]  # for example "pose and texture"
+    lines = [changed_text]
+    # the searched parameters; only numbers have bounds
     for name, value in (result.configuration or {}).items():
         if value.low is not None and value.high is not None:
             lines.append(
                 f"{name}: {value.low:.4g} to {value.high:.4g} {value.unit}".rstrip()
             )
+    # controls that vary at random, and then the parameters of these with their ranges
     if result.over:
         lines.append(f"{' and '.join(result.over)}, drawn anew for every picture")
     for name, varied in result.conditions.items():
@@ -833,14 +867,18 @@ def _searched_by_attack(result: workbench.AttackSummary) -> list[str]:
     return lines
 
 
-def _searched_by_sweep(result: workbench.SweepSummary) -> list[str]:
-    """Describe the axes of a sweep, and what it sampled."""
-    axes = dict[tuple[str, str], list[Any]]()
+def _describe_searched_by_sweep(result: workbench.SweepSummary) -> list[str]:
+    """Describe the axes of a sweep, and what it sampled.
+
+    Models and adversarial scenes are axes, too.
+    """
+    values_of_axis = dict[tuple[str, str], list[Any]]()
+    # `drawn` are the sampled parameters.
     for row in result.axes:
         if row.axis not in result.drawn:
-            axes.setdefault((row.axis, row.unit), []).append(row.value)
+            values_of_axis.setdefault((row.axis, row.unit), []).append(row.value)
     lines = []
-    for (axis, unit), values in axes.items():
+    for (axis, unit), values in values_of_axis.items():
         text = _format_axis_values(values)
         lines.append(f"{axis}: {text} {unit}".rstrip())
     for name, varied in result.drawn.items():
@@ -849,8 +887,8 @@ def _searched_by_sweep(result: workbench.SweepSummary) -> list[str]:
 
 
 def _format_axis_values(values: Sequence[Any]) -> str:
-    """Format the values of an axis; bins as their range."""
-    if all(isinstance(value, tuple) for value in values):  # bins of a range
+    """Format the values of an axis; parts of a range as the full range."""
+    if all(isinstance(value, tuple) for value in values):  # bounds of parts
         lower = min(low for low, _ in values)
         upper = max(high for _, high in values)
         return f"{lower:.4g} to {upper:.4g}"
@@ -858,7 +896,7 @@ def _format_axis_values(values: Sequence[Any]) -> str:
 
 
 def _format_range(varied: results.VariedValue) -> str:
-    """Format the range of a sampled parameter, or its names."""
+    """Format the range of a sampled parameter, or its options."""
     if varied.low is None or varied.high is None:
         return " or ".join(varied.names or ["something"])
     unit = "" if varied.unit == "1" else varied.unit
@@ -867,7 +905,7 @@ def _format_range(varied: results.VariedValue) -> str:
 
 def _describe_measurement(
     result: results.Result,
-    settings: Mapping[str, object],
+    run_settings: Mapping[str, object],
     recorded: Sequence[RecordedSettings],
 ) -> dict[str, str]:
     """Return how a run measured: policy, seed, samples and so on, as text by name.
@@ -876,19 +914,23 @@ def _describe_measurement(
 
     Args:
         result: result of the run.
-        settings: its own settings.
-        recorded: all settings that the run recorded.
+        run_settings: settings of the run.
+        recorded: all settings that the run recorded, also those of other runs.
     """
-    tasks = [run_settings.task for run_settings in recorded if run_settings.is_of_scene]
-    trials = "Trials of the worst configuration" if is_sweep(result) else "Trials"
+    # Settings that only name other runs have no task.
+    tasks = [other.task for other in recorded if other.is_of_scene]
+    # A sweep renders only its worst configuration again.
+    trials_heading = (
+        "Trials of the worst configuration" if is_sweep(result) else "Trials"
+    )
     values = {
         "Policy": getattr(result, "policy", None),
         "Objective": getattr(result, "objective", None),
         "Sampler": getattr(result, "sampler", None),
-        "Steps": settings.get("steps"),
+        "Steps": run_settings.get("steps"),
         "Seed": getattr(result, "seed", None),
-        "Samples a pixel": getattr(result, "spp", None) or settings.get("spp"),
-        trials: settings.get("trials"),
+        "Samples a pixel": getattr(result, "spp", None) or run_settings.get("spp"),
+        trials_heading: run_settings.get("trials"),
         "Judged with": "; ".join(dict.fromkeys(tasks)),
     }
     texts = {
@@ -906,14 +948,16 @@ def _describe_measurement(
 def _describe_verification(result: workbench.AttackSummary) -> str:
     """Describe how many fresh renders verify what an attack found.
 
-    Over conditions that are drawn anew, only renders count whose clean scene is right:
-    the clean control has all of them.
+    If conditions are sampled anew for each render, a render counts only if the model is
+    right about the clean scene under the same conditions. The control has the renders
+    of the clean scene under all conditions.
     """
     verified = result.verified
     assert verified is not None
     control = result.clean.control
     counts = f"{verified.trials} renders with fresh seeds"
-    if result.over and control is not None and control.trials > verified.trials:
+    has_uncounted = control is not None and control.trials > verified.trials
+    if result.over and control is not None and has_uncounted:
         counts += (
             f" that count, those of {control.trials} in which the clean scene is right"
         )
@@ -923,13 +967,13 @@ def _describe_verification(result: workbench.AttackSummary) -> str:
 def _describe_excluded(
     result: results.Result, claims: Sequence[views.Claim]
 ) -> list[str]:
-    """Describe what was not searched, was rejected, or went wrong."""
+    """Describe what was not varied, was rejected, or went wrong."""
     lines = [
         "Nothing varied but what stands under What varied, and the noise of the "
         "renders."
     ]
     if is_attack(result):
-        lines += _excluded_by_attack(result)
+        lines += _describe_excluded_by_attack(result)
     if is_sweep(result) and result.not_finite:
         lines.append(
             f"{result.not_finite} predictions were not numbers; they count as "
@@ -945,8 +989,10 @@ def _describe_excluded(
     return lines + list(getattr(result, "warnings", ()))
 
 
-def _excluded_by_attack(result: workbench.AttackSummary) -> list[str]:
-    """Describe cautions of an attack, numbers that were none, and moved parameters."""
+def _describe_excluded_by_attack(result: workbench.AttackSummary) -> list[str]:
+    """Describe cautions of an attack, values that were not finite, and adjustments of
+    the clean scene.
+    """
     lines = list(workbench.get_experiment(result.command).view(result).cautions)
     non_finite = result.non_finite
     if non_finite.objectives or non_finite.gradient_elements:
@@ -955,6 +1001,8 @@ def _excluded_by_attack(result: workbench.AttackSummary) -> list[str]:
             f"{non_finite.gradient_elements} numbers of gradients."
         )
     for adjusted in result.clean.moved:
+        # The clean scene has the value `used`, since the control does not allow the
+        # scene's own value `scene`.
         used = f"{wording.format_number(adjusted.used)} {adjusted.unit}"
         lines.append(
             f"The clean scene has {adjusted.parameter} {used} in place of "
@@ -963,7 +1011,7 @@ def _excluded_by_attack(result: workbench.AttackSummary) -> list[str]:
     return lines
 
 
-# maximum bytes of a picture that is copied, and number of pictures of a run
+# maximum size of a picture that is copied, and maximum number of pictures of a run
 MAX_PICTURE_BYTES = 16 << 20
 MAX_PICTURES = 3
 
@@ -982,13 +1030,13 @@ def collect_evidence(
 
     Args:
         runs: names or directories of the runs.
-        criterion: minimum fraction of right predictions that is required; None for
-            none.
+        criterion: the required minimum fraction of right predictions; None for none.
         exposure: weights by axis and value, such as ``{"weather": {"rain": 0.2}}``: how
             common each value is in use.
         by: who is responsible for the evidence.
         twins: name or directory of a run of `advsearch twins`, which compares
-            photographs with renders. None for the runs that the runs themselves name.
+            photographs with renders. None takes the runs that the settings of the runs
+            name.
     """
     evidence_runs = list[EvidenceRun]()
     pictures = dict[str, bytes]()
@@ -1016,7 +1064,7 @@ def collect_evidence(
 
 
 def _list_folders(runs: Sequence[str]) -> list[Path]:
-    """Return the directories of runs, each once; of a recipe, those of its parts."""
+    """Return the directories of runs, each once; for a recipe, those of its parts."""
     # by the resolved path, so that two names of one directory count once
     folders = dict[Path, Path]()
     for folder in map(directory.find_run, runs):
@@ -1034,7 +1082,7 @@ def _read_pictures(folder: Path, number: int) -> dict[str, bytes]:
 
     Args:
         folder: folder of the run.
-        number: number of the run, which tells its pictures from those of others.
+        number: number of the run, which makes the names of its pictures unique.
     """
     files = [folder / directory.IMAGES / f"{name}.png" for name in PICTURES]
     # A link may lead out of the run.
@@ -1048,7 +1096,7 @@ def _read_pictures(folder: Path, number: int) -> dict[str, bytes]:
 
 
 def _format_start(folder: Path) -> str:
-    """Format when a run's settings were written, "" if that is not known."""
+    """Format when the settings of a run were written; empty if unknown."""
     with suppress(OSError):
         seconds = (folder / directory.CONFIG).stat().st_mtime
         return f"{datetime.fromtimestamp(seconds, timezone.utc):%Y-%m-%d %H:%M} UTC"
@@ -1058,8 +1106,8 @@ def _format_start(folder: Path) -> str:
 def _compare_models(runs: Sequence[EvidenceRun]) -> list[str]:
     """Warn if runs are of different models.
 
-    They are if the models' names differ, or the digests of their files, which runs note
-    by the name of the model or by what follows its "@".
+    They are if the names differ, or the digests of the models' files. A digest is noted
+    under the name of the model, or under the name of the file in "MODEL@FILE".
     """
     models = list[str]()
     digests = list[str]()
@@ -1067,26 +1115,27 @@ def _compare_models(runs: Sequence[EvidenceRun]) -> list[str]:
         model = run.about.get("Model")
         if not model:
             continue
-        file_names = (model, model.rpartition("@")[2])
-        texts = [text for name, text in run.made_with.items() if name in file_names]
+        digest_names = (model, model.rpartition("@")[2])
+        # `made_with` has versions and digests by name.
+        digest_texts = [
+            text for name, text in run.made_with.items() if name in digest_names
+        ]
         models.append(model)
-        digests.append(" ".join(texts))
+        digests.append(" ".join(digest_texts))
     return warn_of_different_models(models, digests)
 
 
 def _make_evidence_run(
     folder: Path, criterion: float | None, exposure: Exposure, twins: str | None
 ) -> EvidenceRun:
-    """Return a run as evidence.
-
-    A run without a summary has not ended, and claims nothing.
+    """Return a run as evidence; without a summary it has not ended, and claims nothing.
 
     Args:
         folder: directory of the run.
         criterion: minimum fraction of right predictions; None for none.
         exposure: weights of values by axis: how common each value is in use.
-        twins: a run that compares photographs with renders; None for the one that this
-            run names.
+        twins: a run that compares photographs with renders; None takes the one that the
+            settings of this run name.
     """
     if not (folder / directory.summary.NAME).is_file():
         return _make_unfinished_run(folder)
@@ -1097,8 +1146,8 @@ def _make_evidence_run(
 
     sweeps = _read_sweeps(result)
     searched = _list_searched(folder, result, sweeps) or run.searched
-    # A result that was made from several sweeps is about their domain. They have the
-    # same domain, so that the first is described.
+    # A result that was made from sweeps is about their domain, which is the same for
+    # all of them: so the first is described.
     domain = describe_domain(sweeps[0].result if sweeps else result, recorded, searched)
     conditions = count_conditions(result)
     weighted = describe_exposure(result, conditions, exposure)
@@ -1110,7 +1159,7 @@ def _make_evidence_run(
     return run.model_copy(
         update={
             "searched": searched,
-            "excluded": [*_remark_quick(folder), *run.excluded],
+            "excluded": [*_list_quick_remarks(folder), *run.excluded],
             "criterion": criterion_lines,
             "triggering": list_triggering_conditions(result),
             "exposure": weighted,
@@ -1128,14 +1177,15 @@ def _make_evidence_run(
 def _find_twins(
     folder: Path, result: results.Result, twins: str | None
 ) -> results.TwinEvidence | None:
-    """Return how far a run's verdict holds for photographs; None if nobody states it.
+    """Return how far a run's verdict holds for photographs; None if it is not stated.
 
     Args:
-        folder: folder of the run.
+        folder: directory of the run.
         result: result of the run.
-        twins: a run of twins; None for that which the run named.
+        twins: a run of twins; None takes the evidence that the result states.
     """
     stored: results.TwinEvidence | None = getattr(result, "twins", None)
+    # The evidence is about a model, and some results are about none.
     if twins is None or not hasattr(result, "model"):
         return stored
     from advsearch.extend import workbench  # it brings torch, which takes a second
@@ -1153,15 +1203,15 @@ def _find_twins(
 def _describe_stored_run(
     folder: Path, result: results.Result, claims: Sequence[views.Claim]
 ) -> tuple[list[RecordedSettings], EvidenceRun]:
-    """Return what a run recorded, with the runs that it read, and the run as evidence.
+    """Return the settings that a run recorded, and the run as evidence.
 
-    The recorded settings are the run's own first, then those of its claims, then those
-    of the runs.
+    The recorded settings are those of the run, then those of the claims that it tested,
+    then those of the runs that it read (see `collect_settings`).
 
     Args:
         folder: directory of the run.
-        result: its result.
-        claims: its claims.
+        result: result of the run.
+        claims: claims of the run.
     """
     read_paths = [
         *find_read_sweeps(result),
@@ -1192,16 +1242,16 @@ def _collect_versions(
 
 
 class _ReadSweep(NamedTuple):
-    """A sweep whose rows another result was made from, with its settings."""
+    """A sweep that another result was made from, with its settings."""
 
     result: results.Result
     settings: Mapping[str, Any]
 
 
 def _read_sweeps(result: results.Result) -> list[_ReadSweep]:
-    """Read the sweeps whose rows a result was made from.
+    """Read the sweeps that a result was made from.
 
-    The result is about what varied in them. Those that cannot be read are left out.
+    The result is about what varied in them. Sweeps that cannot be read are left out.
     """
     sweeps = list[_ReadSweep]()
     for path in find_read_sweeps(result):
@@ -1213,7 +1263,7 @@ def _read_sweeps(result: results.Result) -> list[_ReadSweep]:
 def _list_selected_axes(
     result: results.Result, sweeps: Sequence[_ReadSweep]
 ) -> list[str]:
-    """Return the axes whose values were chosen, of a run and of sweeps, each once."""
+    """Return the axes with selected values, of a run and of sweeps, each once."""
     axes = find_selected_axes(result)
     for sweep in sweeps:
         axes += find_selected_axes(sweep.result)
@@ -1221,7 +1271,9 @@ def _list_selected_axes(
 
 
 def _make_unfinished_run(folder: Path) -> EvidenceRun:
-    """Return a run without a summary as evidence: it claims nothing."""
+    """Return a run without a summary as evidence, with the claim that nothing is
+    claimed.
+    """
     run_settings = read_run_settings(folder)
     subject = {
         "Object": str(run_settings.get("object") or ""),
@@ -1241,7 +1293,7 @@ def _make_unfinished_run(folder: Path) -> EvidenceRun:
         excluded=[NO_CLAIM],
         cost={},
         made_with=collect_versions(folder, []) or {"versions and files": NOT_NOTED},
-        settings=RecordedSettings("", run_settings).as_text(),
+        settings=RecordedSettings(source="", values=run_settings).as_text(),
         command_line=f"advsearch run {folder / directory.CONFIG}",
     )
 
@@ -1261,21 +1313,24 @@ def _read_photographs(folder: Path) -> tuple[list[views.Claim], list[Any]]:
 def _list_searched(
     folder: Path, result: results.Result, sweeps: Sequence[_ReadSweep]
 ) -> list[str]:
-    """Describe what varied in the claims of a suite, or in the sweeps that it read."""
+    """Describe what varied in the claims that a suite tested, or in the sweeps that a
+    result was made from.
+    """
     noted = read_noted_settings(folder, result)
-    if noted is not None:
-        return _searched_by_claims(noted.get(CLAIM_KIND))
+    if noted is not None:  # the run is one of a suite
+        return _describe_searched_by_claims(noted.get(CLAIM_KIND))
     lines = []
     for sweep in sweeps:
         lines += describe_searched(sweep.result, sweep.settings)
     return list(dict.fromkeys(lines))
 
 
-def _remark_quick(folder: Path) -> list[str]:
+def _list_quick_remarks(folder: Path) -> list[str]:
     """Return a remark if a run is a part of a quick recipe."""
-    # A part of a recipe lies in the folder of parts of the recipe's run.
-    outer = read_run_settings(folder.resolve().parent.parent)
-    is_quick = outer.get("command") == "recipe" and outer.get("quick") is True
+    # The directory of a part is in the directory "parts" of the recipe's run.
+    recipe_settings = read_run_settings(folder.resolve().parent.parent)
+    is_recipe = recipe_settings.get("command") == "recipe"
+    is_quick = is_recipe and recipe_settings.get("quick") is True
     return [QUICK] if is_quick else []
 
 
@@ -1292,6 +1347,7 @@ def _describe_limits(
         domain: what varied and what was fixed, by the part of the domain.
         is_weighted: whether fractions were weighted by exposure.
     """
+    # Each claim counts pairs of a photograph and its rendering.
     n_compared = sum(
         claim.extent.total for claim in claims_of_photographs if claim.extent
     )
@@ -1301,19 +1357,21 @@ def _describe_limits(
     lines = [f"{photographed} compared with renderings: all else is about renderings."]
     fixed = [name for name, part in domain.items() if part.variation is Variation.FIXED]
     if fixed:
-        lines.append(f"Nothing is said of other values of: {', '.join(fixed)}.")
+        lines.append(f"Nothing is shown about other values of: {', '.join(fixed)}.")
     lines.append(WEIGHTED if is_weighted else NOT_WEIGHTED)
     return lines
 
 
-def _searched_by_claims(claims: Mapping[str, Mapping[str, Any]] | None) -> list[str]:
+def _describe_searched_by_claims(
+    claims: Mapping[str, Mapping[str, Any]] | None,
+) -> list[str]:
     """Describe what varied in the claims of a suite: a line for each control and range.
 
     Args:
         claims: the settings of each claim by its name; None if they cannot be read.
     """
     if claims is None:
-        return ["as the claims of its suite say, which cannot be read any more"]
+        return ["what the claims of its suite state, which cannot be read any more"]
     names_of_line = defaultdict[str, list[str]](list)
     for name, claim_settings in claims.items():
         controls = claim_settings.get("controls") or {}

@@ -1,5 +1,5 @@
-"""The settings that a run recorded: its own, of its claims, and of the runs that it
-read.
+"""The settings that a run recorded: its own, and those of the claims and runs that it
+is based on.
 """
 
 from __future__ import annotations
@@ -23,13 +23,14 @@ from advsearch.extend import (
     workbench,
 )
 
-# the kind of settings that a suite noted for each of its claims
+# kind of the settings that a suite noted: those of each claim
 CLAIM_KIND = "claim"
 NOT_SETTINGS = ("schema", "command", "base", *settings.RUN_LOCATION)
-# settings that name an attack's run
+"""Keys of `run.yaml` that are not settings of the experiment."""
+# settings whose value is a run of an attack
 ATTACK_SETTINGS = ("attack", "adversarial_of", "around")
 DEFAULT_TASK = "classification"
-# characters after which a value is cut
+# maximum number of characters of a value
 MAX_VALUE_LENGTH = 2000
 
 
@@ -38,8 +39,9 @@ class RecordedSettings:
     """Settings as a run recorded them.
 
     Attributes:
-        source: name of the note or the run that has them; empty for the run's own.
-        values: values by name, as a file has them.
+        source: name of the claim or the run that has these settings; empty for the
+            run's own.
+        values: values by name, as the file states them.
     """
 
     source: str
@@ -47,7 +49,7 @@ class RecordedSettings:
 
     @property
     def is_of_scene(self) -> bool:
-        """Whether they describe pictures of a scene, not only which runs are read."""
+        """Whether they describe images of a scene, and do not only name other runs."""
         return bool(self.values.get("object"))
 
     @property
@@ -58,12 +60,17 @@ class RecordedSettings:
         )
 
     def as_text(self) -> dict[str, str]:
-        """Return every setting that was used as text, by its name after the source."""
+        """Return every setting that has an effect as text.
+
+        The key is the name of the setting. Settings of another claim or run have its
+        name before theirs, as in "NAME: seed".
+        """
         prefix = f"{self.source}: " if self.source else ""
         texts = dict[str, str]()
         for name, value in self.values.items():
             if name in NOT_SETTINGS or not self._is_used(name, value):
                 continue
+            # `task` has the task's options, too.
             text = self.task if name == "task" else _shorten(value)
             texts[f"{prefix}{name}"] = text
         return texts
@@ -71,9 +78,11 @@ class RecordedSettings:
     def _is_used(self, name: str, value: object) -> bool:
         """Return whether a setting has an effect.
 
-        One that differs from its default has. A default has none if it is empty, if the
-        command renders nothing, since it names no object, or if the setting makes no
-        sense beside the others, as `fps` without a path.
+        A value that differs from the default has one. A default value has none if it is
+        empty, if the command renders nothing, or if the setting has no meaning together
+        with the others, such as `fps` without a path. A command that takes an object
+        but names none renders nothing. A name that is not a setting of the command
+        counts as a default value.
         """
         differs = name in self._defaults and value != self._defaults[name]
         if differs:
@@ -87,7 +96,7 @@ class RecordedSettings:
 
     @cached_property
     def _config_class(self) -> type[Config] | None:
-        """The class of the command's settings; None of a command that is not known."""
+        """The class of the command's settings; None if the command is unknown."""
         command = str(self.values.get("command") or "")
         with suppress(errors.AdvsearchError, KeyError):
             config_class: type[Config] = workbench.get_experiment(command).settings
@@ -96,7 +105,7 @@ class RecordedSettings:
 
     @cached_property
     def _defaults(self) -> dict[str, Any]:
-        """The default of each setting of the command; None of a required one."""
+        """The default of each setting of the command; None for a required one."""
         if self._config_class is None:
             return {}
         return {
@@ -120,8 +129,9 @@ class RecordedSettings:
             if name not in NOT_SETTINGS
         }
         try:
+            # raises a SettingsError, not an error of pydantic
             config = self._config_class(**values)
-            # Fields like `set_` have an underscore that the setting has not.
+            # Fields such as `set_` have an underscore that the setting does not have.
             return {
                 clash.setting.rstrip("_")
                 for clash in self._config_class.clashes
@@ -134,7 +144,7 @@ class RecordedSettings:
 def describe_task(task: Any, objective: object) -> str:
     """Return a task in words with all of its options, also default ones.
 
-    Without options that are known, it is the task as it was recorded.
+    If no options are known, it is the task as it was recorded.
 
     Args:
         task: name of the task, or a mapping with its name and options.
@@ -151,7 +161,7 @@ def describe_task(task: Any, objective: object) -> str:
 
 
 def _shorten(value: object) -> str:
-    """Return a value as text, cut if it is long."""
+    """Return a value as text, shortened if it is long."""
     text = value
     if not isinstance(text, str):
         text = json.dumps(value, ensure_ascii=False, default=str)
@@ -163,7 +173,7 @@ def _shorten(value: object) -> str:
 def _list_task_options(recorded_task: Any, objective: object) -> dict[str, Any]:
     """Return the options of a task by name.
 
-    Options of the parts of an ensemble have the part's name before theirs, as in
+    For an ensemble, options have the name of their task before theirs, as in
     "NAME.OPTION". Options that the run sets itself are left out, and so are empty ones.
     The result is empty if the task cannot be made any more.
 
@@ -192,16 +202,16 @@ def _list_task_options(recorded_task: Any, objective: object) -> dict[str, Any]:
 
 
 def read_run_settings(folder: Path) -> Mapping[str, Any]:
-    """Return the settings in the `run.yaml` of a run, empty if it cannot be read."""
+    """Return the settings in the `run.yaml` of a run; empty if it cannot be read."""
     with suppress(errors.AdvsearchError):
         return settings.read_yaml(folder / directory.CONFIG)
     return {}
 
 
 def find_read_sweeps(result: results.Result) -> list[Path]:
-    """Return the directories of the sweeps that a result read its rows from.
+    """Return the directories of the sweeps that a result was made from.
 
-    Those that do not exist any more are left out.
+    Sweeps that do not exist any more are left out.
     """
     sweeps = getattr(result, "sweeps", ())  # of an explanation
     sides = getattr(result, "sides", ())  # of a comparison
@@ -223,18 +233,18 @@ def _find_runs(names: Iterable[object]) -> list[Path]:
 
 
 def collect_settings(
-    folder: Path, result: results.Result, read: Sequence[Path]
+    folder: Path, result: results.Result, read_paths: Sequence[Path]
 ) -> list[RecordedSettings]:
-    """Return the settings of a run, of its claims, and of the runs that it read.
+    """Return the settings of a run, of the claims it tested, and of runs that it read.
 
-    Claims are those of a suite that were tested, with its counterexamples.
+    The run of a suite tests claims, each with settings of its own.
 
     Args:
         folder: directory of the run.
-        result: its result.
-        read: directories of the runs that it read.
+        result: result of the run.
+        read_paths: directories of the runs that it read.
     """
-    recorded = [RecordedSettings("", read_run_settings(folder))]
+    recorded = [RecordedSettings(source="", values=read_run_settings(folder))]
     for kind, settings_by_name in (read_noted_settings(folder, result) or {}).items():
         recorded += [
             RecordedSettings(f"{kind} {name}", values)
@@ -242,16 +252,20 @@ def collect_settings(
         ]
     return recorded + [
         RecordedSettings(directory.format_run_name(path), read_run_settings(path))
-        for path in read
+        for path in read_paths
     ]
 
 
 def read_noted_settings(
     folder: Path, result: results.Result
 ) -> Mapping[str, Mapping[str, Mapping[str, Any]]] | None:
-    """Return settings that a run noted besides its own, by kind and name.
+    """Return the settings that a run noted in addition to its own.
 
-    None if its experiment notes none.
+    The run of a suite notes the settings of its claims and of its counterexamples.
+
+    Returns:
+        The settings by kind, such as "claim", then by the name of the claim. Empty if
+        they cannot be read; None if the run's command notes none.
     """
     hook = workbench.get_experiment(result.command).noted_settings
     if hook is None:
@@ -265,9 +279,14 @@ def read_noted_settings(
 def join_values(
     recorded: Iterable[RecordedSettings], name: str, otherwise: str = ""
 ) -> str:
-    """Return the values of a setting of scenes as text, each different one once.
+    """Return the different values of a setting as text, separated by semicolons.
 
-    `otherwise` stands for settings without a value.
+    Only settings that describe a scene count.
+
+    Args:
+        recorded: settings that a run recorded.
+        name: name of the setting.
+        otherwise: text for a missing or empty value; empty leaves it out.
     """
     texts = [
         _shorten(run_settings.values.get(name) or otherwise)
@@ -277,16 +296,17 @@ def join_values(
     return "; ".join(dict.fromkeys(filter(None, texts)))
 
 
-def collect_versions(folder: Path, read: Sequence[Path]) -> dict[str, str]:
+def collect_versions(folder: Path, read_paths: Sequence[Path]) -> dict[str, str]:
     """Return versions and digests of files that a run was made with, by name.
 
-    They include those of its parts and of the runs that it read; different ones are
-    all listed.
+    They include those of its parts and of the runs that it read. If a name has several
+    versions, all are listed in the order of the runs. Runs without readable versions
+    are skipped.
     """
     texts_of_name = dict[str, dict[str, None]]()
     candidates = sorted((folder / directory.PARTS).glob("*"))
     parts = [part for part in candidates if directory.is_run(part)]
-    for run in [folder, *parts, *read]:
+    for run in [folder, *parts, *read_paths]:
         with suppress(errors.AdvsearchError):
             for name, text in RunDirectory.read_versions(run).items():
                 texts_of_name.setdefault(name, {})[str(text)] = None

@@ -14,76 +14,81 @@ from advsearch.extend import markup, results, views, wording
 
 
 class ConditionShare(results.Fields):
-    """In how many configurations under one condition the model is right."""
+    """Counts of right predictions under one condition."""
 
-    condition: str = Field(description="in words, with its unit")
+    condition: str = Field(description="the condition in words, with its unit")
     axis: str
     value: str
     right: int
-    total: int = Field(alias="of", description="configurations")
-    interval: results.Interval = Field(description="of the share, 95 %")
+    total: int = Field(alias="of", description="number of configurations")
+    interval: results.Interval = Field(description="95 % interval of the fraction")
 
 
 class EvidenceRun(results.Fields):
-    """One run: what it was about, how it was measured and what it stands for."""
+    """One run as evidence: its claims, its subject, and how it was measured."""
 
     run: str
     command: str
     ending: str
     claims: list[views.Claim]
     started: str = Field(
-        "", description="when the run was begun, UTC; empty where that is not known"
+        "", description="when the run was started, in UTC; empty if unknown"
     )
     criterion: list[str] = Field(
-        [], description="what the criterion comes to; absent without one"
+        [], description="whether the criterion is met; absent without one"
     )
     triggering: list[str] = Field(
         [],
-        description="rules under which the model is wrong more often; absent without",
+        description="rules under which the model is wrong more often; absent without "
+        "any",
     )
     exposure: list[str] = Field(
         [],
-        description="shares weighted by how common "
-        "conditions are; absent without weights",
+        description="fractions weighted by how common conditions are; absent without "
+        "weights",
     )
     conditions: list[ConditionShare] = Field(
-        [], description="by each value of each axis; absent without"
+        [],
+        description="counts for each value of each axis; absent without axes",
     )
     photographs: list[ConditionShare] = Field(
-        [], description="`right`: how many of the photographs agree with the rendering "
-                        "that they were aligned with, by "
-        "each value of each axis; absent without"
-    )  # fmt: skip
+        [],
+        description="counts for each value of each axis, where `right` counts the "
+        "photographs that agree with their rendering; absent without photographs",
+    )
     twins: results.TwinEvidence | None = results.optional_field(
-        "how far the verdict holds for photographs, by a run of twins; absent without"
+        "how far the verdict holds for photographs, from a run of twins; absent "
+        "without one"
     )
     domain: dict[str, str] = Field(
         {}, description="the operational design domain in words, by its parts"
     )
     limitations: list[str] = Field(
-        [], description="what a reader must not take from it"
+        [], description="what a reader must not conclude from the run"
     )
-    pictures: list[str] = Field([], description="files beside this one")
+    pictures: list[str] = Field(
+        [], description="files of pictures, relative to this file"
+    )
     about: dict[str, str] = Field(
         description="object, environment, model, task and what counts as right"
     )
-    searched: list[str] = Field(description="what could change, and how far")
+    searched: list[str] = Field(description="what varied, and in which ranges")
     method: dict[str, str] = Field(
-        description="policy, seed, samples and the like, by name"
+        description="policy, seed, samples and so on, by name"
     )
     settings: dict[str, str] = Field(
-        {}, description="every setting that the run recorded and that says something, "
-                        "by its name; of claims, "
-        "counterexamples and the runs that it read with their names before it"
-    )  # fmt: skip
+        {},
+        description="every recorded setting that has an effect, by its name; those of "
+        "claims, counterexamples and other runs have the name of these before theirs",
+    )
     excluded: list[str] = Field(
         description="what was not searched, was rejected, or went wrong"
     )
-    cost: dict[str, str] = Field(description="renders and time")
+    cost: dict[str, str] = Field(description="number of renders, and time")
     made_with: dict[str, str] = Field(
-        description="versions, and SHA-256 of files; as the run noted them"
+        description="versions and SHA-256 digests of files, as the run recorded them"
     )
-    command_line: str = Field(description="what repeats it")
+    command_line: str = Field(description="command that repeats the run")
 
 
 class Evidence(results.Result):
@@ -92,15 +97,13 @@ class Evidence(results.Result):
     command: ClassVar[str] = "report"
 
     runs: list[EvidenceRun]
-    warnings: list[str] = Field(
-        description="what has to be known of all of them together"
-    )
-    rules: list[str] = Field(description="how the claims are to be read")
-    version: str = Field(description="of advsearch, that wrote this")
-    written: str = Field("", description="when, UTC")
-    by: str = Field("", description="who, as given; absent otherwise")
+    warnings: list[str] = Field(description="remarks about all runs together")
+    rules: list[str] = Field(description="how to read the claims")
+    version: str = Field(description="version of advsearch that wrote the evidence")
+    written: str = Field("", description="when the evidence was written, in UTC")
+    by: str = Field("", description="who is responsible; absent if not stated")
     criterion: float | None = results.optional_field(
-        "share of right predictions that was asked for; absent otherwise"
+        "required fraction of right predictions; absent without a criterion"
     )
 
 
@@ -153,7 +156,7 @@ def _run_markdown(run: EvidenceRun) -> list[str]:
     for title, texts in make_sections(run).items():
         lines += [f"{title}:", "", *(f"- {_plain(text)}" for text in texts), ""]
     if run.command_line:
-        # so that it does not end the block of code
+        # Three backquotes would end the block of code.
         command = run.command_line.replace("```", "` ` `")
         lines += ["To repeat it:", "", "```sh", command, "```", ""]
     return lines
@@ -306,7 +309,7 @@ def _list_claim_rows(run: EvidenceRun) -> list[list[str]]:
 
 
 def _list_images(run: EvidenceRun, pictures: Mapping[str, bytes]) -> list[markup.Html]:
-    """Return the pictures of a run side by side; nothing if it names none."""
+    """Return the pictures of a run side by side; empty if it names none."""
     if not run.pictures:
         return []
     images = []

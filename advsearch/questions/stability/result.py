@@ -27,8 +27,8 @@ from advsearch.extend import (
 
 
 class StabilityConfig(Config):
-    """Settings of `stability`: which cases it runs, for how long, and where results
-    go.
+    """Settings of `stability`: the cases that it runs, the time limit, and the run
+    directory.
     """
 
     command: ClassVar[str] = "stability"
@@ -59,8 +59,8 @@ class StabilityConfig(Config):
     seconds: float | None = setting(
         None,
         "check",
-        "time after which no measurement is begun any more; `advsearch resume` goes on "
-        "for as long again",
+        "time after which no further measurement starts; `advsearch resume` continues "
+        "for the same time again",
         otherwise="no limit",
         unit="seconds",
         gt=0.0,
@@ -74,7 +74,7 @@ class StabilityConfig(Config):
 
     @property
     def cases(self) -> tuple[str, ...]:
-        """The names in `register_case`; empty for all."""
+        """The names in `case`; empty for all."""
         return () if self.case is None else settings.split_names(self.case)
 
     @property
@@ -88,7 +88,7 @@ FELL_SHORT = "fell short"
 
 
 class Check(results.Fields):
-    """A number that decides, and its allowed range, with inclusive bounds or null."""
+    """A number, and the range that it has to be in; bounds are inclusive or null."""
 
     what: str
     value: results.JsonFloat
@@ -131,52 +131,52 @@ def check_range(
 
 
 def check_condition(what: str, truth: bool) -> Check:
-    """Check a condition, as a number that has to be 1."""
+    """Check that a condition is true, as a number that has to be 1."""
     return check_range(what, float(truth), 1.0, 1.0)
 
 
 def make_failure(what: str) -> Check:
-    """Return a check that fails: a count of 1 of what must not happen."""
+    """Return a check that fails: one occurrence of something that must not happen."""
     return check_range(what, 1.0, 0.0, 0.0)
 
 
 class CaseRow(results.Fields):
     """The result of a case."""
 
-    case: str = Field(description="its name")
-    group: str = Field(description="its group")
+    case: str = Field(description="name of the case")
+    group: str = Field(description="group of the case")
     holds: str = Field(description="what must hold")
     status: str = Field(description="`ok` or `fell short`")
-    decides: str = Field(description="the number that decides")
+    decides: str = Field(description="the check that decides the status, in words")
     finite: bool = Field(
-        description="every picture and gradient was finite, and none had to be made so"
+        description="whether every picture and gradient was finite without correction"
     )
     relative_error: results.JsonFloat | None = Field(
-        description="of a gradient against its reference; null where there is none"
+        description="relative error of a gradient; null if none was compared"
     )
     ending: str = Field(
-        description="of the case's search; `refused` where its input was"
+        description="status of the case's search; `refused` if its input was rejected"
     )
     checks: list[Check]
     measurements: dict[str, results.JsonFloat] = Field(
         description="further numbers, such as condition numbers and biases"
     )
-    seconds: float = Field(description="what the case took")
+    seconds: float = Field(description="seconds that the case took")
 
 
 class StabilityResult(views.InNotebook, results.Result):
-    """The results of extreme cases: whether each holds."""
+    """Whether extreme scenes and settings hold, for each case."""
 
     command: ClassVar[str] = "stability"
 
-    run: str = Field(description="the folder")
+    run: str = Field(description="the run directory")
     ending: str = Field(description="`done`, `interrupted` or `out of time`")
     rows: list[CaseRow]
-    not_run: list[str] = Field(description="cases that were not begun")
+    not_run: list[str] = Field(description="cases that were not started")
     seconds: Annotated[dict[str, results.JsonFloat], results.key_validator("total")] = (
-        Field(description="in `total`, of this sitting")
+        Field(description="seconds of this session, in `total`")
     )
-    command_line: str | None = Field(description="that asks the same again")
+    command_line: str | None = Field(description="command that repeats the run")
 
     @property
     def brief(self) -> str:
@@ -197,7 +197,10 @@ CASE_COLUMNS: Mapping[str, views.Column] = {
 
 
 def make_view(result: StabilityResult) -> ShownResult:
-    """Lay out a result: cases, condition numbers, and those that fell short."""
+    """Return the view of a result: cases, condition numbers, and failed cases.
+
+    A row's `holds` states what must hold, and `decides` the check that failed.
+    """
     condition_numbers = []
     for row in result.rows:
         for name, value in row.measurements.items():
@@ -215,7 +218,7 @@ def make_view(result: StabilityResult) -> ShownResult:
         [
             ResultPart.make_table(result.rows, CASE_COLUMNS, title="Cases"),
             ResultPart("Condition numbers", rows=condition_numbers),
-            ResultPart("Short", failures),
+            ResultPart("Short", failures),  # cases that "fell short"
             ResultPart("Not run", [", ".join(result.not_run)]),
         ],
     )
@@ -223,16 +226,15 @@ def make_view(result: StabilityResult) -> ShownResult:
 
 @dataclass(frozen=True)
 class CaseOutcome:
-    """What a case measured.
+    """The checks and numbers of a case.
 
     Attributes:
-        checks: the numbers that decide.
-        finite: whether every picture and gradient was finite, and none had to be made
-            so.
-        relative_error: error of a gradient, or of what the case is about; None without
-            one.
-        ending: status of the case's search, "refused" if its input was rejected, or
-            empty.
+        checks: checks that decide whether the case holds.
+        finite: whether every picture and gradient was finite without correction.
+        relative_error: relative error of a gradient, or of what the case is about; None
+            without one.
+        ending: status of the case's search; "refused" if its input was rejected; empty
+            without a search.
         measurements: further numbers to report.
     """
 
@@ -247,10 +249,10 @@ class CaseOutcome:
         return replace(self, checks=[*self.checks, *more], **known)
 
     def evaluate(self) -> tuple[str, str]:
-        """Return the status, and what decides it in words.
+        """Return the status, and the check that decides it in words.
 
-        That is the first check that fails, or values that are not finite, else the last
-        check.
+        That is the first check that fails, or values that are not finite, or else the
+        last check.
         """
         failed = [check for check in self.checks if not check.ok]
         if failed:
@@ -264,8 +266,7 @@ class CaseOutcome:
 class Case:
     """An extreme scene or setting, and what must hold.
 
-    A `slow` one takes more than about a second on two idle cores; tests run it rarely.
-
+    A slow case takes more than about a second on two idle cores; tests run it rarely.
     Attributes:
         name: unique name.
         group: group of cases.
@@ -281,10 +282,10 @@ class Case:
     measure: Callable[[], CaseOutcome]
 
     def run(self) -> CaseRow:
-        """Run the case. An exception means that it falls short, and is the reason.
+        """Run the case, and return its row.
 
-        An InputError counts as a refusal, any other exception as values that are not
-        finite.
+        An exception means that the case does not hold. An InputError counts as a
+        rejection of its input, any other exception as values that are not finite.
         """
         start = time.perf_counter()
         try:
@@ -302,6 +303,8 @@ class Case:
             "decides": decisive,
             "seconds": time.perf_counter() - start,
         }
+        # Fields of the case, of the outcome, and of the row itself. `CaseRow` ignores
+        # the others, such as `measure`.
         return CaseRow.from_values({**vars(self), **vars(outcome), **fields})
 
 
@@ -314,7 +317,7 @@ def register_case(
 ) -> Callable[[Callable[[], CaseOutcome]], Callable[[], CaseOutcome]]:
     """Register a function as a case.
 
-    The first sentence of its docstring, which users see, states what must hold.
+    The first paragraph of its docstring, which users see, states what must hold.
     """
 
     def register(measure: Callable[[], CaseOutcome]) -> Callable[[], CaseOutcome]:

@@ -1,5 +1,5 @@
-"""Small scenes for cases: a picture, its gradient compared with differences, a
-search.
+"""Small scenes for cases: an image, its gradient compared with finite differences, and
+a search.
 """
 
 from __future__ import annotations
@@ -34,17 +34,18 @@ from advsearch.questions.stability.result import (
 
 # width and height of images, pixels
 IMAGE_SIZE = 24
-# samples per pixel of a picture and of the gradients of a search
+# samples per pixel of images and of the gradients of a search
 SPP = 8
-# samples per pixel of a reference
+# samples per pixel of images and gradients that others are compared with
 REFERENCE_SPP = 64
-# relative error that the mean of a gradient may have beyond what its noise explains
+# maximum relative error of the mean of a gradient that its noise does not explain
 MAX_GRADIENT_ERROR = 0.1
-# noise of a comparison, as a fraction of the derivative, above which it decides nothing
+# maximum noise of a comparison, as a fraction of the derivative; with more it is
+# useless
 MAX_NOISE = 0.4
 # logits of the searched model per unit of the linear loss
 LOGIT_SCALE = 20.0
-# mean difference of two pictures that should be equal: an 8-bit level is 4e-3
+# maximum mean difference of two images that should be equal; an 8-bit level is 4e-3
 MAX_PICTURE_DIFFERENCE = 2e-3
 ControlSettings = Mapping[str, Mapping[str, object]]
 ObjectSource = str | Path | assets.ObjectAsset | Callable[[], assets.ObjectAsset]
@@ -62,20 +63,20 @@ def make_renderer(
 ) -> gradients.Renderer:
     """Return a renderer of a small image, which is called as `render(u, seed, spp)`.
 
-    Derivatives by finite differences are taken of each pixel and not of the loss, since
-    the losses of the cases are smooth.
+    Parameters whose derivatives are finite differences get a derivative for each pixel,
+    and not only one of the loss. The loss may then be any smooth function of the image.
 
     Args:
         controls: controls that vary, with their settings.
-        thing: the object, its name, or a function that makes it.
+        thing: the object, the name of one, or a function that makes it.
         environment: environment of the scene; None for a plain one.
         settings: settings of the scene.
         plugins: further shapes, as Mitsuba's dictionaries by name.
         denoise: the denoiser.
     """
-    shape = thing() if callable(thing) else thing
+    object_source = thing() if callable(thing) else thing
     scene = workbench.load_scene(
-        shape, environment or make_plain_environment(), settings=settings
+        object_source, environment or make_plain_environment(), settings=settings
     )
     description = scene.description
     for name, plugin in plugins.items():
@@ -83,6 +84,7 @@ def make_renderer(
     renderer = replace(scene, description=description).renderer(
         controls, resolution=IMAGE_SIZE, denoise=denoise
     )
+    # finite differences for each pixel
     renderer.plan = renderer.plan.with_pixel_steps()
     return renderer
 
@@ -115,11 +117,11 @@ def make_gray_environment(
 def make_mesh(
     vertices: Sequence[Sequence[float]], faces: Sequence[Sequence[int]]
 ) -> assets.Mesh:
-    """Return a mesh with UVs from y and z, whose normals face +x.
+    """Return a mesh whose normals face +x, with UVs from y and z.
 
     Args:
-        vertices: points (x, y, z), about a plane of constant x.
-        faces: three indices of vertices each.
+        vertices: points (x, y, z), near a plane of constant x.
+        faces: three indices of vertices for each face.
     """
     points = np.asarray(vertices, np.float32)
     facing = np.tile([1.0, 0.0, 0.0], (len(points), 1))
@@ -161,6 +163,7 @@ def make_dark_mug() -> assets.ObjectAsset:
     return paint_mug(np.full((4, 4), 0.02))
 
 
+# lower and upper bound of a number; None for no bound
 Bounds = tuple[float | None, float | None]
 
 
@@ -185,31 +188,32 @@ def check_scene(
 
     It is always checked that the image is in [0, 1], and that nothing is NaN or
     infinite. With `compare`, the gradient is compared with finite differences, which
-    takes most of the time. Bounds that are passed are checked as well.
+    takes most of the time. Bounds that are passed are checked, too.
 
     Args:
         controls: settings of the controls.
-        thing: the object, its name, or a function that makes it.
-        u: the configuration (d,), or some of its values by index; the others are those
-            of the start.
+        thing: the object, the name of one, or a function that makes it.
+        u: the configuration (d,), or some of its values by index. Values that are not
+            passed are those of the start.
         spp: samples per pixel.
-        compare: whether to compare the gradient with differences.
-        seeds: minimum and maximum number of seeds of the differences.
+        compare: whether to compare the gradient with finite differences.
+        seeds: minimum and maximum number of seeds of the finite differences.
         repeats: number of gradients that are compared.
         evaluations: number of evaluations of the search.
         mean: bounds of the image's mean.
         gradient: bounds of the largest absolute entry of the gradient.
-        ending: expected status of the search.
+        ending: expected status of the search; empty expects none.
         other_scene: arguments of `make_renderer` for a second scene, whose image is
-            compared with the first; None for no comparison.
+            compared with the first; None for no comparison. The controls are those of
+            the first scene unless they are passed; the rest has its default values.
         difference: bounds of the mean absolute difference of both images.
-        **scene: further arguments of `make_renderer`.
+        **scene: further arguments of `make_renderer` for the first scene.
     """
     renderer = make_renderer(controls, thing, **scene)  # type: ignore[arg-type]
-    start = _make_start(u, renderer)
+    start = _replace_start_values(u, renderer)
     loss = gradients.make_smooth_loss(renderer.formation.resolution)
-    image = render_image(renderer, start, 0, spp)
-    _, slope = renderer.gradient(loss, start, 0, spp)
+    image = render_image(renderer, start, seed=0, spp=spp)
+    _, slope = renderer.gradient(loss, start, 0, spp)  # 0 is the seed
     relative_error = None
     gradient_checks: list[Check] = []
     if compare:
@@ -250,22 +254,17 @@ def _check_finite(
     """Check that an image is in [0, 1], and nothing was NaN or infinite.
 
     Args:
-        renderer: has counted values that were not finite.
+        renderer: renderer, which has counted the values that were not finite.
         image: image of the start.
-        search: has counted objectives that were not finite.
+        search: result of the search, with its objectives that were not finite.
     """
     in_range = float(image.min()) >= 0.0 and float(image.max()) <= 1.0
+    n_non_finite = float(renderer.non_finite)
+    n_objectives = float(search.non_finite_objectives)
     return [
         check_condition("the picture is in [0, 1]", in_range),
-        check_range(
-            "values that were NaN or infinite", float(renderer.non_finite), 0.0, 0.0
-        ),
-        check_range(
-            "objectives that were NaN or infinite",
-            float(search.non_finite_objectives),
-            0.0,
-            0.0,
-        ),
+        check_range("values that were NaN or infinite", n_non_finite, 0.0, 0.0),
+        check_range("objectives that were NaN or infinite", n_objectives, 0.0, 0.0),
     ]
 
 
@@ -276,7 +275,7 @@ def _check_bounds(
 
     Args:
         measured: both numbers, "mean" and "largest gradient".
-        mean, gradient: their bounds; None is not checked.
+        mean, gradient: bounds of these numbers; None for no check.
     """
     checks = []
     if mean is not None:
@@ -288,14 +287,13 @@ def _check_bounds(
     return checks
 
 
-def _make_start(
+def _replace_start_values(
     u: Sequence[float] | Mapping[int, float] | None, renderer: gradients.Renderer
 ) -> Tensor:
     """Return the start (d,) with some or all of its values replaced.
 
-    Args:
-        u: values by index, the first values, or None for none.
-        renderer: which has the start.
+    u: new values by index, or the first values; None replaces none.
+    renderer: renderer with the start.
     """
     start: Tensor = renderer.start.clone()
     value_of_index = u if isinstance(u, Mapping) else dict(enumerate(u or ()))
@@ -328,20 +326,22 @@ def _compare_images(
 def _check_gradient(
     rows: Sequence[results.Measured],
 ) -> tuple[list[Check], float | None]:
-    """Check noise and errors of derivatives that were compared with differences.
+    """Check noise and error of derivatives that were compared with finite differences.
 
     One check is for the derivative with the largest noise, another for the one with the
     largest error. Without derivatives there are no checks.
 
     Args:
-        rows: the compared derivatives.
+        rows: the compared derivatives. `bias` is the relative error of the mean
+            derivative, `doubt` the noise of the comparison relative to the derivative,
+            and `excess` the error beyond what the noise explains.
 
     Returns:
-        The checks, and the bias of the derivative with the largest error.
+        The checks, and the relative error of the derivative with the largest error.
     """
     if not rows:
         return [], None
-    # `excess` is the error beyond what noise explains; it is often 0 for several rows.
+    # `excess` is often 0 for several rows: then `bias` decides.
     worst = max(rows, key=lambda row: (row.excess, row.bias or 0.0))
     noisiest = max(rows, key=lambda row: row.doubt or 0.0)
     noise_name = f"noise of the comparison, {noisiest.name}"
@@ -360,7 +360,7 @@ def search_scene(
     spp: int,
     evaluations: int,
 ) -> workbench.SearchResult:
-    """Search from a configuration with the margin of a linear model of two classes.
+    """Search from a configuration by the margin of a linear model of two classes.
 
     A search maximizes the margin and stops above 0. Here the margin is LOGIT_SCALE *
     (loss - loss at the start) - 1. So it is -1 at the start, and above 0 once the loss
@@ -373,7 +373,8 @@ def search_scene(
         spp: samples per pixel.
         evaluations: number of evaluations with gradients that the search makes.
     """
-    loss_at_start = float(loss(render_image(renderer, start, 0, spp)))
+    loss_at_start = float(loss(render_image(renderer, start, seed=0, spp=spp)))
+    # number of renders that a gradient takes in addition to the image
     gradient_cost = make_domain(renderer, start).gradient_cost
 
     def margin(image: Tensor) -> Tensor:
@@ -382,7 +383,8 @@ def search_scene(
     # Steps count renders: each evaluation takes the image and those of its gradient.
     # One more is left for an image without a gradient.
     steps = evaluations * (1 + gradient_cost) + 1
-    # one candidate that is rendered once more: the smallest complete search
+    # The smallest search that also verifies its result: one candidate is rendered again
+    # once.
     return run_search(
         renderer, margin, steps, spp=spp, start=start, candidates=1, repeats=1
     )
@@ -409,7 +411,7 @@ def compare_gradient(
     seeds: tuple[int, int] = (3, 12),
     repeats: int = 24,
 ) -> list[results.Measured]:
-    """Compare the plan's gradient of a smooth linear loss with differences.
+    """Compare a renderer's gradient of a smooth linear loss with finite differences.
 
     The finite differences are between renders with the same random numbers, so that
     their noise mostly cancels.
@@ -418,22 +420,22 @@ def compare_gradient(
         renderer: renderer of the scene; while it is measured, its image formation has
             no tone curve.
         u: the configuration (d,).
-        spp: samples per pixel.
+        spp: samples per pixel of the gradients.
         seeds: minimum and maximum number of seeds of the differences.
         repeats: number of gradients that are compared.
     """
     formation = renderer.formation
-    bench = gradients.Bench(
-        renderer, gradients.make_smooth_loss(formation.resolution), u, seed=1, spp=spp
-    )
-    # of this renderer, which counts what is not finite
+    loss = gradients.make_smooth_loss(formation.resolution)
+    bench = gradients.Bench(renderer, loss, u, seed=1, spp=spp)
+    # The formation of this renderer is replaced, and not that of a copy, since it
+    # counts the values that are not finite.
     renderer.formation = replace(formation, transfer="linear")
     try:
         rows = gradients.measure_derivatives(
             bench,
             reference_spp=REFERENCE_SPP,
             reference_repeats=seeds,
-            repeats=(repeats, repeats),
+            repeats=(repeats, repeats),  # minimum and maximum number
         )
         return list(rows)
     finally:
@@ -449,25 +451,26 @@ def measure_inward_slope(
 ) -> tuple[float, float]:
     """Return the derivative of the smooth linear loss along a direction inwards.
 
-    Values at a bound of their range can only move inwards. The direction moves those
-    values by `factor` that increase the loss in this way; all other values stay.
+    All values of the start have to be at a bound of their range, 0 or 1, so that they
+    can move inwards only. The direction moves the values that increase the loss when
+    they move inwards, by `factor`; all other values stay.
 
     Args:
         renderer: renderer of the scene.
-        gradient: (d,) of the loss at the start.
-        factor: factor on the direction.
-        seeds: number of seeds over which the differences are averaged.
+        gradient: (d,) gradient of the loss at the start.
+        factor: how far the values move for a step of 1.
+        seeds: number of seeds over which the finite differences are averaged.
         spp: samples per pixel.
 
     Returns:
-        The derivative by the gradient, and by one-sided differences of second order,
-        since a bound has no other side.
+        The derivative from the gradient, and the derivative from one-sided finite
+        differences of second order, since a bound has no other side.
     """
     linear = renderer.copy_with(transfer="linear")
     u = renderer.start
-    step = 0.04
+    step = 0.04  # in units of the range, small but above the noise
     loss = gradients.make_smooth_loss(linear.formation.resolution)
-    inwards = torch.where(u > 0.5, -1.0, 1.0)
+    inwards = torch.where(u > 0.5, -1.0, 1.0)  # down from 1, up from 0
     increases_loss = gradient * (0.5 - u) > 0.0  # 0.5 - u points inwards, too
     direction = inwards * increases_loss * factor
     slopes = []
@@ -488,21 +491,22 @@ def evaluate(
 ) -> policies.Evaluation:
     """Evaluate a configuration by a loss of the image; a loss above 0 is a success.
 
-    The index of the query is the seed of the noise. The cost is in renders with `spp`
-    samples.
+    The index of the query is the seed of the noise. The cost is the number of renders
+    with `spp` samples.
 
     Args:
         renderer: renderer of the scene.
         loss: loss of the image.
         spp: samples per pixel.
-        query: what to evaluate; it may ask for a multiple of the samples.
+        query: the query, which may request a multiple of the samples.
     """
     query_spp = spp * query.samples
     non_finite_before = renderer.non_finite
     renders_before = renderer.renders
     gradient = None
     if query.gradient:
-        # "free": only derivatives that cost no further render
+        # `query.gradient` is True or "free". The latter requests only derivatives that
+        # cost no further render.
         value, gradient = renderer.gradient(
             loss, query.u, query.index, query_spp, free=query.gradient == "free"
         )
@@ -514,6 +518,7 @@ def evaluate(
         gradient=gradient,
         success=objective > 0.0,
         non_finite=renderer.non_finite - non_finite_before,
+        # `samples` renders with `spp` samples each
         cost=(renderer.renders - renders_before) * query.samples,
     )
 
@@ -535,9 +540,9 @@ def run_search(
         loss: loss of the image, which is maximized.
         steps: steps of the search.
         spp: samples per pixel.
-        start: the first configuration (d,); None for the renderer's own start.
-        policy: None for "pgd".
-        **options: options of `attacks.search`; without them no candidate is rendered
+        start: the first configuration (d,); None takes the start of the renderer.
+        policy: policy of the search; None takes "pgd".
+        **options: options of `attacks.search`. By default no candidate is rendered
             again.
     """
     evaluate_all = partial(map, partial(evaluate, renderer, loss, spp))
@@ -556,13 +561,17 @@ def make_domain(
 ) -> policies.Domain:
     """Return the domain of a search.
 
-    It starts from a configuration, by default that of the renderer.
+    Args:
+        renderer: renderer of the scene.
+        start: configuration (d,) at which the search starts; None takes that of the
+            renderer.
     """
-    space: Any = renderer.space  # of controls, since `make_renderer` made it
+    # `make_renderer` has made a space of controls; the type of `space` is more general.
+    space: Any = renderer.space
     start = renderer.start if start is None else start
     return workbench.make_domain(
         space.controls,
         start,
-        gradient_cost=renderer.plan.renders,
-        partial_gradients=True,
+        gradient_cost=renderer.plan.renders,  # renders that a gradient takes
+        partial_gradients=True,  # `evaluate` also handles "free" gradients
     )

@@ -1,6 +1,4 @@
-"""Cases of scenes: light, surfaces, meshes, positions and views that break naive
-code.
-"""
+"""Cases of scenes that break naive code: light, surfaces, meshes, poses and views."""
 
 from __future__ import annotations
 
@@ -63,17 +61,18 @@ from advsearch.questions.stability.scene import (
 
 BRIGHT = 1e5
 NOT_ZERO = (1e-12, None)
-"""Bounds of the largest entry of a gradient that is not zero."""
-PLATEAU_STEPS = 40  # evaluations in which a search has to be off a plateau
+"""Bounds of the largest entry of a gradient, if it must not be zero."""
+# number of evaluations in which a search has to leave a plateau
+PLATEAU_STEPS = 40
 TEXTURE: ControlSettings = {"texture": {"resolution": 8}}
 FLASH = make_gray_environment(0.3, BRIGHT)
 DARKNESS = make_gray_environment(0.0)
 
 
 def exposure_case(control: str, low: float, high: float) -> dict[str, object]:
-    """Return arguments of `check_scene` at the extreme end of a range of exposures.
+    """Return arguments of `check_scene` for the extreme end of a range of exposures.
 
-    It is the upper end of a range of positive exposures (in stops), and the lower end
+    That is the upper end of a range of positive exposures (in stops), and the lower end
     of a range of negative ones. The exposure is the first value of the configuration.
     """
     is_upper_end = high > 0.0
@@ -158,9 +157,13 @@ register_cases(
 
 
 def refuse_texel(value: float, as_file: bool) -> CaseOutcome:
-    """Require that a texel that is no light, in a file or an array, is rejected.
+    """Require that an environment map is rejected for a texel that is no light.
 
-    The message has to say in a sentence how many texels there are.
+    The error message has to be a sentence that states the number of such texels.
+
+    Args:
+        value: value of the texel.
+        as_file: whether the map is in a file, or else in an array.
     """
     radiance = make_gray_environment(0.3).radiance.copy()
     radiance[4, 10] = value
@@ -207,8 +210,8 @@ def leave_plateau(low: float, high: float) -> CaseOutcome:
     have to find a lower exposure without a gradient.
 
     Args:
-        low, high: range of the exposure in stops. Below about 4 stops some pixels are
-            not white.
+        low, high: range of the exposure in stops. Above about 4 stops all pixels are
+            white.
     """
     renderer = make_renderer({"camera": {"exposure": [low, high]}})
     # the highest exposure, as 1 is the upper bound of each range
@@ -222,10 +225,11 @@ def leave_plateau(low: float, high: float) -> CaseOutcome:
             renderer, _darkness, PLATEAU_STEPS, spp=2, start=start, policy=policy
         )
         n_flat += sum(record.gradient_norm == 0.0 for record in result.history)
+        # An objective above 0 is an image that is not white; see `_darkness`.
+        is_darker = result.best_objective > 0.0
         checks.append(
             check_condition(
-                f"{policy.name} finds a picture that is not white",
-                result.best_objective > 0.0,
+                f"{policy.name} finds a picture that is not white", is_darker
             )
         )
         endings.append(f"{policy.name}: {result.ending.value}")
@@ -242,7 +246,7 @@ def leave_plateau(low: float, high: float) -> CaseOutcome:
 
 
 def _darkness(image: Tensor) -> Tensor:
-    """Return a loss that is above 0 if a picture is not white."""
+    """Return a loss of the image that is above 0 if its mean is below 0.9."""
     return 0.9 - image.mean()
 
 
@@ -270,6 +274,7 @@ register_cases(
 def make_glass_ball() -> dict[str, dict[str, object]]:
     """Return a glass ball between camera and mug, as Mitsuba's dictionary by name."""
     camera = geometry.camera_to_world(describe_mug())[:3, 3]
+    # The mug stands at the origin, so this is on the way to the camera, a bit higher.
     center = [float(value) for value in camera * 0.6 + np.array([0.0, 0.0, 0.2])]
     material = {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}
     return {
@@ -285,7 +290,7 @@ def material_case(
     Args:
         parameters: parameters of the material, which vary in [0, 1].
         slow: whether the case is slow.
-        **values: values of the material where it starts.
+        **values: values of the material at the start.
     """
     settings = {f"material.{name}": value for name, value in values.items()}
     return {
@@ -331,7 +336,9 @@ def look_through_glass() -> CaseOutcome:
         "texture": {"resolution": 8},
         "environment": {"exposure": [-1.0, 1.0]},
     }
-    # The picture differs from that of the same scene without the glass.
+    # `check_scene` compares the gradient by all texels with finite differences. An
+    # empty `other_scene` is the same scene without the glass, from which the image has
+    # to differ.
     return check_scene(
         controls, plugins=make_glass_ball(), other_scene={}, difference=(0.01, None)
     )
@@ -346,13 +353,19 @@ def texels_at_the_ends() -> CaseOutcome:
     """
     controls = {"texture": {"resolution": 8, "epsilon": 0.2}}
     renderer = make_renderer(controls, make_checkered_mug)
+    # The first value is the derivative from the gradient, the second that from finite
+    # differences.
     slope, expected_slope = measure_inward_slope(
-        renderer, _mean_raw_gradient(renderer), factor=1.0, seeds=8, spp=REFERENCE_SPP
+        renderer,
+        _compute_mean_gradient(renderer),
+        factor=1.0,
+        seeds=8,
+        spp=REFERENCE_SPP,
     )
     error = abs(slope / expected_slope - 1.0)
     start = renderer.start
     loss = gradients.make_smooth_loss(renderer.formation.resolution)
-    best = run_search(renderer, loss, 3).best_u
+    best = run_search(renderer, loss, steps=3).best_u
     checks = [
         check_range(
             "gradient error along a direction that points inwards",
@@ -380,20 +393,23 @@ def texels_at_the_ends() -> CaseOutcome:
     return scene.with_checks(*checks, relative_error=error)
 
 
-def _mean_raw_gradient(renderer: gradients.Renderer) -> Tensor:
-    """Return the mean gradient (d,) over 8 seeds of a smooth loss of the raw image."""
-    raw = renderer.copy_with(transfer="linear")
-    loss = gradients.make_smooth_loss(raw.formation.resolution)
+def _compute_mean_gradient(renderer: gradients.Renderer) -> Tensor:
+    """Return the mean gradient (d,) of a smooth loss over 8 seeds.
+
+    The loss is of the linear image, without a tone curve.
+    """
+    linear = renderer.copy_with(transfer="linear")
+    loss = gradients.make_smooth_loss(linear.formation.resolution)
     samples = []
     for seed in range(8):
-        _, gradient = raw.gradient(loss, renderer.start, seed, REFERENCE_SPP)
+        _, gradient = linear.gradient(loss, renderer.start, seed, REFERENCE_SPP)
         samples.append(gradient)
     return torch.stack(samples).mean(dim=0)
 
 
 # ---- light that is thrown
 
-# width and height of a projector's picture, texels
+# width and height of a projector's image in texels
 SIDE = 8
 WHITE_PICTURE = [1.0] * (3 * SIDE**2)
 CENTER_TEXEL = {3 * (SIDE**2 // 2 + SIDE // 2) + channel: 1.0 for channel in range(3)}
@@ -405,7 +421,7 @@ def projector_case(
     """Return arguments of `check_scene` for a projector whose texels have a gradient.
 
     Args:
-        u: texels of its picture, the first ones or by index.
+        u: texels of the projected image: the first ones, or values by index.
         **projector: settings of the control.
     """
     return {
@@ -516,7 +532,8 @@ def mesh_case(
 
     Args:
         thing: the object.
-        other_object: looks the same from the front; None compares with none.
+        other_object: an object that looks the same from the front; None compares with
+            none.
     """
     other_scene: dict[str, object] = {}
     if other_object:
@@ -531,7 +548,12 @@ def mesh_case(
 
 
 def import_box(scale: float = 1.0, shift: float = 0.0) -> assets.ObjectAsset:
-    """Import a box from a file in some unit, at some distance from its origin."""
+    """Import a box from an OBJ file.
+
+    Args:
+        scale: factor on the size of the box in the file.
+        shift: distance of the box from the origin of the file, along each axis.
+    """
     corners = [[x, y, z] for x in (-0.3, 0.3) for y in (-0.5, 0.5) for z in (0.0, 1.0)]
     points = np.array(corners) * scale + shift
     lines = _format_box(points)
@@ -545,8 +567,9 @@ def _format_box(points: np.ndarray) -> list[str]:
     """Return the lines of an OBJ file with a box.
 
     Args:
-        points: (8, 3) its corners, z fastest, then y.
+        points: (8, 3) corners of the box. x changes slowest, z fastest.
     """
+    # Each quad lists its corners counterclockwise as seen from outside.
     quads = [
         [0, 4, 6, 2],
         [1, 3, 7, 5],
@@ -564,7 +587,16 @@ def _format_box(points: np.ndarray) -> list[str]:
 
 
 def file_case(scale: float = 1.0, shift: float = 0.0) -> dict[str, object]:
-    """Return arguments of `check_scene` for a file that looks like that of a box."""
+    """Return arguments of `check_scene` for a box in another file.
+
+    Objects are scaled to a common size and position when they are imported. So the box
+    has to look like the one of `import_box()`, which is the other scene. Its gradient
+    is not compared, to save time.
+
+    Args:
+        scale: factor on the size of the box in the file.
+        shift: distance of the box from the origin of the file.
+    """
     thing = partial(import_box, scale, shift)
     return {
         "controls": SHIFT,
@@ -575,7 +607,7 @@ def file_case(scale: float = 1.0, shift: float = 0.0) -> dict[str, object]:
 
 
 def outline_case(controls: ControlSettings) -> dict[str, object]:
-    """Return arguments of `check_scene` for an outline in front of nothing."""
+    """Return arguments of `check_scene` for a dark mug in front of nothing."""
     return {
         "controls": controls,
         "thing": make_dark_mug,
@@ -687,8 +719,8 @@ register_cases(
 def million() -> CaseOutcome:
     """Finite, right, and like the coarse mesh of the same shape.
 
-    The mesh is a sphere of a million triangles. The gradients are those by its texture
-    and by a shift.
+    The mesh is a sphere of a million triangles. `check_scene` checks the gradient by
+    its texture; the gradient by a shift has to be finite.
     """
     # 1000 columns and 501 rows give about 2 * 1000 * 500 triangles.
     fine_mesh = assets.normalise_mesh(workbench.make_sphere(501, 1000))
@@ -698,8 +730,8 @@ def million() -> CaseOutcome:
     loss = gradients.make_smooth_loss(fine.formation.resolution)
     _, slope = fine.gradient(loss, fine.start, 0, SPP)
     difference = mean_difference(
-        render_image(fine, fine.start, 0, 64),
-        render_image(coarse, coarse.start, 0, 64),
+        render_image(fine, fine.start, seed=0, spp=REFERENCE_SPP),
+        render_image(coarse, coarse.start, seed=0, spp=REFERENCE_SPP),
     )
     scene = check_scene(TEXTURE, make_checkered_object(fine_mesh), evaluations=2)
     return scene.with_checks(
@@ -730,14 +762,16 @@ def gimbal() -> CaseOutcome:
             "on_ground": "no",
         }
     }
-    # At this pitch, a yaw of 36 degrees is a roll of -36. In u, whose values are
-    # fractions of the ranges, these are 0.7 and 0.3.
+    # At this pitch, a yaw of 36 degrees gives the same pose as a roll of -36. In u,
+    # whose values are fractions of the ranges, these are 0.7 and 0.3.
     yawed_u = [0.7, 0.5, 0.5]
     rolled_u = [0.5, 0.5, 0.3]
     by_angles = make_renderer(angles, make_dark_mug, settings=NO_GROUND)
     yawed = render_image(by_angles, torch.tensor(yawed_u))
     rolled = render_image(by_angles, torch.tensor(rolled_u))
 
+    # The rotation vector is searched around the pitch of 90 degrees; the comparison is
+    # a little off the start.
     vector = {"pose": {"rotation": [-90.0, 90.0], "pitch": 90.0, "on_ground": "no"}}
     by_vector = make_renderer(vector, make_dark_mug, settings=NO_GROUND)
     rows = compare_gradient(by_vector, by_vector.start + 0.1, seeds=(3, 5))
@@ -752,7 +786,7 @@ def gimbal() -> CaseOutcome:
         ),
         check_range(
             "gradient error of the rotation vector",
-            max(row.excess for row in rows),
+            max(row.excess for row in rows),  # the error that noise does not explain
             most=MAX_GRADIENT_ERROR,
         ),
     )
@@ -777,6 +811,7 @@ def full_turn(controls: ControlSettings) -> CaseOutcome:
     difference = mean_difference(
         render_image(renderer, zero), render_image(renderer, full)
     )
+    # 1 in u is 360 degrees, which is the same as 0. So a step past it goes on from 0.
     past_end = make_domain(renderer).project(full + 0.01)
     return check_scene(controls, u=[0.0], compare=False).with_checks(
         check_range(
@@ -787,7 +822,7 @@ def full_turn(controls: ControlSettings) -> CaseOutcome:
             slope_difference / float(zero_slope.abs().max()),
             most=0.05,
         ),
-        # A step of 0.01 past the end goes to 0.01, except for rounding.
+        # The configuration is one angle.
         check_range(
             "where a step of 0.01 past the end goes",
             float(past_end.max()),
@@ -821,24 +856,21 @@ for control, name in (
 def run_cases(context: RunContext[StabilityConfig]) -> StabilityResult:
     """Run cases of the suite in order.
 
-    The run ends with the last case, when its time is over, or with Ctrl-C.
-
-    The result of a case is stored at once: a resumed run continues with the next.
+    The run ends after the last case, when its time is over, or with Ctrl-C. The result
+    of a case is stored at once: a resumed run continues with the next case.
     """
     cases = select_cases(context.config.cases, context.config.groups)
     measurements = context.open_measurements(context.config.seconds)
     progress = context.progress
 
     def measure_rows() -> Iterator[CaseRow]:
-        """Yield the row of each case, stored or measured now, and report the latter."""
-        hint = (
-            "`register_case` and `group` pick some, `seconds` stops before the next one"
-        )
+        """Yield the row of each case, and report those that are measured now."""
+        hint = "`case` and `group` select some, `seconds` stops before the next one"
         progress.stage("trying stiff and extreme scenes", len(cases), hint=hint)
         for case in cases:
             is_stored = measurements.read(case.name) is not None
             row = measurements.get_row(case.name, CaseRow, case.run)
-            # Who collects the rows may stop here: then it is not reported.
+            # The caller may stop here if the time is over. Then nothing is reported.
             yield row
             if not is_stored:
                 progress.message(f"{case.name}: {row.status}, {row.seconds:.1f} s")
@@ -856,12 +888,12 @@ def run_cases(context: RunContext[StabilityConfig]) -> StabilityResult:
 
 
 def sentences() -> dict[str, str]:
-    """Return group and what must hold of each case by name."""
+    """Return for each case, by its name, its group and what must hold."""
     return {case.name: f"{case.group}: {case.holds}" for case in ALL_CASES}
 
 
 def select_cases(names: Sequence[str] = (), groups: Sequence[str] = ()) -> list[Case]:
-    """Select the cases of names and groups, all if neither is given.
+    """Select cases by their names and groups; all if neither is given.
 
     Raises:
         UnknownNameError: if a name or a group does not exist.
@@ -880,11 +912,11 @@ def select_cases(names: Sequence[str] = (), groups: Sequence[str] = ()) -> list[
 
 
 # ---- Controls whose scales differ by a million, and noise
-#
 # A search works in the unit box, so that units of controls do not matter. What matters
-# is how strongly the objective depends on each value there: its curvatures, whose ratio
-# (the condition number) is printed.
+# is how strongly the objective depends on each value there: its curvatures. The ratio
+# of the largest to the smallest (the condition number) is reported.
 
+# factor on an objective that must not change a search
 RATIO = 1e6
 
 
@@ -900,11 +932,10 @@ def estimate_hessian(
     f(-)) / h^2, elsewhere (f(++) - f(+-) - f(-+) + f(--)) / (4 h_i h_j), where + and -
     are steps forwards and backwards along the directions i and j.
 
-    Args:
         value: the objective f.
-        u: the configuration (d,) at which they are taken.
-        directions: directions (k, d) along which they are taken.
-        steps: (k,) how far u moves along each direction, to either side.
+        u: the configuration (d,) at which the derivatives are estimated.
+        directions: directions (k, d) of the differences.
+        steps: (k,) size of the step along each direction.
     """
     moves = [
         step * direction for step, direction in zip(steps, directions, strict=True)
@@ -947,7 +978,9 @@ def wide_range() -> CaseOutcome:
 
 
 def _measure_shift_slope(half_width: float) -> float:
-    """Return the mean derivative over 6 seeds by a shift of one object size.
+    """Return the derivative of a smooth loss by a shift of one object size.
+
+    It is the mean over 6 seeds.
 
     Args:
         half_width: the shift is searched in [-half_width, half_width], in object sizes.
@@ -958,7 +991,7 @@ def _measure_shift_slope(half_width: float) -> float:
     for seed in range(6):
         _, gradient = renderer.gradient(loss, renderer.start, seed, 32)
         derivatives.append(float(gradient[0]))
-    # They are by u, which goes from 0 to 1 over the range.
+    # The derivatives are by u, which goes from 0 to 1 over the range.
     return statistics.fmean(derivatives) / (2.0 * half_width)
 
 
@@ -968,7 +1001,8 @@ def light_rotation_texel() -> CaseOutcome:
     not matter.
 
     The search is over the power of a light, a rotation and texels, whose units and
-    curvatures differ. The condition number is that of the Hessian.
+    curvatures differ. A search of the same objective times 1e6 has to take the same
+    path. The condition number is that of the Hessian.
     """
     controls: ControlSettings = {
         "light": {"type": "point", "power": [0.0, 12.0], "x": 1.0, "y": -1.0, "z": 2.0},
@@ -979,11 +1013,11 @@ def light_rotation_texel() -> CaseOutcome:
     u = renderer.start.clone()
     u[:2] = torch.tensor([0.5, 0.1])  # power and rotation; texels follow
     hessian = _estimate_three_curvatures(renderer, u)
-    # Derivatives by u become derivatives by watts: one watt is 1/12 of the range.
-    # from the unit box to watts, degrees and sRGB
+    # Derivatives by u become derivatives by watts, degrees and sRGB: one watt is 1/12
+    # of the range of the power, and so on.
     from_unit_box = torch.diag(torch.tensor([1.0 / 12.0, 1.0 / 360.0, 1.0]).double())
-    path, _ = _record_path(renderer, u, 1.0)
-    scaled_path, ending = _record_path(renderer, u, RATIO)
+    path, _ = _record_path(renderer, u, scale=1.0)
+    scaled_path, ending = _record_path(renderer, u, scale=RATIO)
     distances = (path - path[0]).abs().amax(dim=0)
     path_difference = float((path - scaled_path).abs().max())
     scene = check_scene(controls, u={0: 0.5, 1: 0.1}, compare=False)
@@ -1005,21 +1039,25 @@ def light_rotation_texel() -> CaseOutcome:
 
 
 def _estimate_three_curvatures(renderer: gradients.Renderer, u: Tensor) -> Tensor:
-    """Return second derivatives (3, 3) by power, rotation, and all texels at once.
+    """Estimate second derivatives (3, 3) by power, by rotation, and by all texels.
 
-    The configuration is power, rotation, and texels, in this order.
+    The configuration is power, rotation, and texels, in this order. The third direction
+    changes all texels equally.
     """
     loss = gradients.make_smooth_loss(renderer.formation.resolution)
     directions = torch.zeros(3, len(u))
     directions[0, 0] = 1.0
     directions[1, 1] = 1.0
     directions[2, 2:] = 1.0
+    # Steps have to be large enough for the noise. The rotation moves the object, and
+    # has a step of its own.
     _, rotation_group, *_ = renderer.plan.groups
     steps = [0.2, rotation_group.step * 2.0, 0.08]
 
     def objective(configuration: Tensor) -> float:
         """Return the objective in logits."""
-        return LOGIT_SCALE * float(loss(render_image(renderer, configuration, 0, 64)))
+        image = render_image(renderer, configuration, seed=0, spp=REFERENCE_SPP)
+        return LOGIT_SCALE * float(loss(image))
 
     return estimate_hessian(objective, u, directions, steps)
 
@@ -1027,7 +1065,7 @@ def _estimate_three_curvatures(renderer: gradients.Renderer, u: Tensor) -> Tenso
 def _record_path(
     renderer: gradients.Renderer, u: Tensor, scale: float
 ) -> tuple[Tensor, str]:
-    """Search with a scaled objective; return the path (steps, d) and the status.
+    """Search with a scaled objective; return the configurations (steps, d) and status.
 
     Args:
         renderer: renderer of the scene.
@@ -1039,7 +1077,7 @@ def _record_path(
     result = run_search(
         renderer,
         lambda image: scale * loss(image),
-        18,
+        steps=18,
         spp=8,
         start=u,
         on_step=lambda record, configuration, evaluation: path.append(configuration),
@@ -1092,6 +1130,7 @@ def heavy_render(count: int = 24) -> CaseOutcome:
         _, gradient = renderer.gradient(loss, renderer.start, seed, 4)
         gradient_samples.append(gradient)
     slopes = torch.stack(gradient_samples).double()
+    # `median` is over all samples and entries.
     distance = (slopes - slopes.median()).abs()
     return check_scene(controls, compare=False, spp=4).with_checks(
         check_range(

@@ -1,12 +1,13 @@
 """Axes of a grid, and the configurations of a sweep.
 
 An axis makes its parameter a discrete choice among its values, so a point of the grid
-is a point of an ordinary space.
+is a point of the space of controls like any other.
 
 A configuration follows from the number of its image by arithmetic; nothing is stored.
-Every image has a draw of its own, so that images are independent; only pairs without
-and with an adversarial scene, frames of a drive, and samples of a point where nothing
-is sampled have the same one (`runs.tables.Units`).
+Images have different draws, so that they are independent, with three exceptions: an
+image with an adversarial scene has the draw of the one without it; the frames of a
+drive share one draw; and so do the samples of a grid point if nothing is sampled
+(`runs.tables.Units`).
 """
 
 from __future__ import annotations
@@ -40,8 +41,8 @@ FULL_TURN = 360.0  # degrees after which a periodic parameter repeats
 MAX_RANGE_PARTS = 10
 MIN_RANGE_PARTS = 2
 MIN_CELL_DRAWS = 5
-"""Draws that a cell of the map over two sampled parameters has on average, at least,
-where there are enough.
+"""A cell of the map over two sampled parameters has at least this many draws on
+average, if the sweep has enough images.
 """
 # numbers of a group up to which Sobol points are used; larger ones (a texture) are
 # sampled pseudo-randomly
@@ -49,7 +50,7 @@ MAX_SOBOL_SIZE = 64
 MAX_TABLE_COMPONENTS = 4  # of a parameter, up to which the table shows them
 MAX_CACHED_DESCRIPTIONS = 4096  # of controls at points of the grid
 Float64Array = NDArray[np.float64]
-# settings that take several values by themselves, and how
+# These settings take several values themselves, written as here; they are no axes.
 _LISTED_SETTINGS = {
     "object": "`object` mug,bowl",
     "environment": "`environment` studio,noon",
@@ -135,15 +136,18 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
         InputError, UnknownNameError: the name or the values cannot be used.
     """
     where = f"`grid` {name}"
-    # An instance may stand on either side: KIND:INSTANCE.PARAMETER, or
-    # KIND.PARAMETER:INSTANCE. `rest` is what follows the first dot.
+    # An instance may follow the kind, as in KIND:INSTANCE.PARAMETER, or the parameter,
+    # as in KIND.PARAMETER:INSTANCE.
     control_name, _, rest = name.partition(".")
-    kind, first_colon, first_instance = control_name.partition(":")
-    parameter_name, last_colon, last_instance = rest.partition(":")
+    kind, kind_colon, kind_instance = control_name.partition(":")
+    parameter_name, parameter_colon, parameter_instance = rest.partition(":")
     instance = control_name
     if control_name not in instances:
-        instance = families.make_instance_name(kind, last_instance or first_instance)
-    if name in _LISTED_SETTINGS:  # such as "model", which is no control
+        instance = families.make_instance_name(
+            kind, parameter_instance or kind_instance
+        )
+    # Names such as "model" are settings and no controls.
+    if name in _LISTED_SETTINGS:
         raise InputError(
             f"{where}: several of them are given as a list: {_LISTED_SETTINGS[name]}"
         )
@@ -158,8 +162,9 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
             f"{where}: expected CONTROL.PARAMETER, got no parameter; "
             f"choose one of {', '.join(parameters)}"
         )
+    # A colon without a name after it is rejected.
     families.check_instance_name(
-        where, last_instance or first_instance, last_colon or first_colon
+        where, parameter_instance or kind_instance, parameter_colon or kind_colon
     )
     if parameter_name not in parameters:
         raise UnknownNameError(
@@ -214,12 +219,12 @@ def _find_parameters(
     """Return the parameters of a control by name.
 
     Args:
-        values: values of the axis; a class may declare a parameter by its values.
+        values: values of the axis; some classes declare a parameter by its values.
         instances: the sampled controls by name.
         control: the class of the control.
         parameter_name: parameter name of the axis.
         instance: name of the control. If it is one of `instances`, it may have
-            parameters besides those of its class; these are returned, too.
+            parameters in addition to those of its class; these are returned, too.
     """
     declared = [*control.declare_parameters({parameter_name: values})]
     if instance in instances:
@@ -295,7 +300,8 @@ def parse_axis_values(
         InputError: they are no values of the parameter, or not different.
     """
     is_angle = parameter.periodic and parameter.unit == "degrees"
-    can_be_range = not parameter.options  # the name of an option may have a colon
+    # The name of an option may itself have a colon, so that it is no range.
+    can_be_range = not parameter.options
     values: Sequence[Any]
     if isinstance(raw_values, str) and ":" in raw_values and can_be_range:
         values = _parse_range(where, raw_values, is_angle)
@@ -309,18 +315,19 @@ def parse_axis_values(
             "FIRST:LAST:COUNT or a list"
         )
     _check_count(where, len(values))
-    # NumPy's scalars become Python's
+    # NumPy's scalars (they have `item`) become Python's.
     choices = [value.item() if hasattr(value, "item") else value for value in values]
     spec = parse_spec(where, parameter, {"choices": choices})
     assert isinstance(spec, OneOf)  # it is what choices are parsed to
-    _check_different(where, spec.values, is_angle)
+    _check_distinct(where, spec.values, is_angle)
     has_names = any(isinstance(value, str) for value in spec.values)
-    if not parameter.options and not has_names:
+    has_numbers = not parameter.options and not has_names
+    if has_numbers:
         _check_single_precision(where, spec.values)
     return spec.values
 
 
-def _check_different(
+def _check_distinct(
     where: str, values: Sequence[ParameterValue], is_angle: bool
 ) -> None:
     """Check that no value comes twice, and no angle in two forms, such as 0 and 360.
@@ -468,10 +475,12 @@ def add_grid_axes(
         scene: the scene, which decides the default ranges of a control.
     """
     control_by_name = {control.name: control for control in controls}
+    # Axes of one control have the same `instance`, the name of that control.
     for instance in dict.fromkeys(axis.instance for axis in axes):
         instance_axes = [axis for axis in axes if axis.instance == instance]
         sampled = control_by_name.get(instance)
         if sampled is None:
+            # Any: the type of `CONTROLS` does not have the arguments of its classes.
             control_type: Any = CONTROLS[instance_axes[0].control]
             settings = dict[str, object]()
         else:
@@ -486,10 +495,10 @@ def add_grid_axes(
 def _sampled_settings(control: Control, scene: SceneDescription) -> dict[str, object]:
     """Return the settings of a sampled control, with its default ranges stated.
 
-    A control without any range samples all its parameters in their default ranges. As
-    soon as one parameter has a range, only stated ranges count. An axis of the grid is
-    such a range: so the default ranges of the other parameters are stated here, or
-    these would stop to vary.
+    If no parameter of a control has a stated range, all of them are sampled in their
+    default ranges. If one has, only those with stated ranges are sampled. An axis of
+    the grid counts as a stated range. So the default ranges of the other parameters
+    are stated here; else they would no longer vary.
     """
     # Kind and name are no parameters: the class and the instance state them.
     settings = {
@@ -513,19 +522,20 @@ def _sampled_settings(control: Control, scene: SceneDescription) -> dict[str, ob
 
 @dataclass(frozen=True)
 class SampledNumber:
-    """A sampled number, as tables show it: they count predictions by its parts.
+    """A sampled number, with the parts of its range by which tables count predictions.
 
-    Its draws are in [0, 1], which is cut into equal shares, one for each part. An
-    option of a choice that has more weight than others has several shares.
+    Its draws are in [0, 1]. This interval is divided into equally long bins, usually
+    one for each part. If options of a choice have weights, an option has as many bins
+    as its weight.
 
     Attributes:
         name: name of the parameter, with the index of a component.
         unit: unit of the values.
-        column: its index among the draws.
-        parts: parts of its range, as bounds [low, high] each, or its options.
+        column: its column among the draws.
+        parts: parts of the range as lists [lower, upper], or the options of a choice.
         same_in_all_scenes: whether `parts` are the same in every scene.
-        part_of_share: the index of the part of each share, if options have weights;
-            else empty.
+        part_of_bin: for each bin the index of its part, if options have weights; else
+            empty, and each part has one bin.
     """
 
     name: str
@@ -533,11 +543,11 @@ class SampledNumber:
     column: int
     parts: tuple[Any, ...]
     same_in_all_scenes: bool = True
-    part_of_share: tuple[int, ...] = ()
+    part_of_bin: tuple[int, ...] = ()
 
     @property
     def varied_value(self) -> VariedValue:
-        """What the value was sampled from, as a result has it."""
+        """The range or the options that the value was sampled from."""
         bounds = [
             bound for part in self.parts if isinstance(part, list) for bound in part
         ]
@@ -549,7 +559,7 @@ class SampledNumber:
     def edges(self) -> list[float] | None:
         """The bounds of the parts, ascending.
 
-        None of a choice, and of parts that differ between scenes.
+        None for a choice, and for parts that differ between scenes.
         """
         are_ranges = all(isinstance(part, list) for part in self.parts)
         if not self.same_in_all_scenes or not are_ranges:
@@ -558,7 +568,7 @@ class SampledNumber:
 
 
 def choose_n_parts(n_images: int) -> int:
-    """Return into how many parts tables and figures cut the range of a parameter.
+    """Return the number of parts into which tables divide the range of a parameter.
 
     It is the largest number for which a map over two parameters, with that many parts
     each, has `MIN_CELL_DRAWS` draws in a cell on average; but between `MIN_RANGE_PARTS`
@@ -575,14 +585,15 @@ class _SampledBlock(NamedTuple):
     """A block of coordinates that is sampled.
 
     Attributes:
-        block: the coordinates' norm and budget.
+        block: norm and budget of the coordinates.
         coordinates: their columns in a configuration.
-        columns: their columns among the draws; of a ball one more.
+        columns: their columns among the draws. A ball has one column more than
+            coordinates, for the length.
     """
 
     block: Block
     coordinates: slice
-    columns: slice  # a ball needs one more, for the length
+    columns: slice
 
 
 class _GridCoordinate(NamedTuple):
@@ -610,20 +621,21 @@ class Points:
         samples: number of samples at each point of the grid.
         sampler: how the draws are made, "sobol" or "random".
         seed: seed of the draws.
-        repeat_after_scenes: after so many scenes the draws repeat, so that scenes that
-            are compared have the same ones; 0 for never.
-        n_scenes: scenes of the sweep.
-        n_photographs: number of photographs of a folder, in which the scenes are in
-            turn; 1 without one.
+        repeat_after_scenes: number of scenes after which the draws repeat, so that
+            scenes that are compared have the same ones; 0 if they never repeat.
+        n_scenes: number of scenes of the sweep.
+        n_photographs: number of photographs in the folder of photographs; 1 without
+            one. The sweep then has a scene for each photograph.
 
     Attributes:
         count: number of images of the scene.
-        n_parts: number of parts into which tables cut the range of a sampled number.
-        sampled_numbers: the sampled numbers that tables show.
-        sampled_layout: which numbers are sampled; the same for all scenes.
-        is_sampled: whether anything is sampled: a control may have all its values from
-            the grid, as a path its time.
-        units: how rows follow from draws.
+        n_parts: number of parts into which tables divide the range of a sampled number.
+        sampled_numbers: the sampled numbers that tables count by.
+        sampled_layout: describes which numbers are sampled: the number of draws of
+            small blocks, and name, column and number of parts of each sampled number.
+        is_sampled: whether anything is sampled. A control may have all its values from
+            the grid, as a path has its time.
+        units: maps images to draws.
     """
 
     def __init__(
@@ -639,6 +651,7 @@ class Points:
         n_photographs: int = 1,
     ) -> None:
         """Assign every coordinate to an axis or to draws; arguments: see the class."""
+        # Attributes are set in the order in which the methods below need them.
         self.grid = ProductIndex(tuple(len(axis.values) for axis in axes))
         self.samples = samples
         self.count = self.grid.count * samples
@@ -648,9 +661,9 @@ class Points:
         self._lower = domain.lower.numpy()
         self._upper = domain.upper.numpy()
         self._axes = {axis.name: (index, axis) for index, axis in enumerate(axes)}
-        # `_assign_blocks` fills these lists. Blocks of few numbers share the sequence
-        # of the sampler; large ones have random draws, since Sobol sequences are for
-        # few dimensions.
+        # `_assign_blocks` fills these lists. Small blocks, those of few numbers, share
+        # the sequence of the sampler. Large ones have random draws, since Sobol
+        # sequences are for few dimensions.
         self._grid_coordinates: list[_GridCoordinate] = []
         self._small_blocks: list[_SampledBlock] = []
         self._large_blocks: list[_SampledBlock] = []
@@ -667,18 +680,18 @@ class Points:
             images_until_repeat=repeat_after_scenes * self.count,
             n_photographs=n_photographs,
         )
-        # of each number in the tables: its column among the draws, and its shares
+        # of each sampled number: its column among the draws, and its number of bins
         self._columns = [number.column for number in self.sampled_numbers]
-        n_shares = [
-            len(number.part_of_share or number.parts) for number in self.sampled_numbers
+        n_bins = [
+            len(number.part_of_bin or number.parts) for number in self.sampled_numbers
         ]
-        self._n_shares = np.array(n_shares, dtype=np.int64)
+        self._n_bins = np.array(n_bins, dtype=np.int64)
         self._description_cache: dict[tuple[object, ...], Mapping[str, Value]] = {}
 
     def _list_sampled_layout(self) -> tuple[tuple[str, int, int], ...]:
-        """Return name, column and number of parts of each number in the tables.
+        """Return name, column and number of parts of each sampled number.
 
-        In scenes for which these are equal, a draw has the same meaning.
+        If two scenes have the same layout, their draws can be counted together.
         """
         return tuple(
             (number.name, number.column, len(number.parts))
@@ -692,9 +705,10 @@ class Points:
 
         Args:
             axes: axes of the grid; images along an axis of time are frames of a drive.
-            images_until_repeat: images after which the draws repeat; 0 for never.
-            n_photographs: photographs of a folder, in which the scenes are in turn; 1
-                without a folder.
+            images_until_repeat: number of images after which the draws repeat; 0 if
+                they never repeat.
+            n_photographs: number of photographs in the folder of photographs; 1 without
+                one.
         """
         # If nothing is sampled, the samples of a grid point are repeats of one draw,
         # each with its own noise.
@@ -702,6 +716,8 @@ class Points:
         time_axis = next(
             (index for index, axis in enumerate(axes) if axis.is_time), None
         )
+        # `Units` uses the number of images per scene only with photographs.
+        images_per_scene = self.count if n_photographs > 1 else 1
         return Units(
             self.grid.sizes,
             frames=time_axis,
@@ -709,7 +725,7 @@ class Points:
             again=images_until_repeat,
             noise=self.samples // n_draws,
             photographs=n_photographs,
-            scene=self.count if n_photographs > 1 else 1,
+            scene=images_per_scene,
         )
 
     def _assign_blocks(self, domain: Domain) -> Iterator[SampledNumber]:
@@ -718,14 +734,15 @@ class Points:
         A block is the coordinates of one parameter. If the parameter is an axis of the
         grid, its values come from the axis. Otherwise they come from columns of the
         draws: one for each coordinate, and for a ball (L2 norm) one more for the
-        length. This fills `_grid_coordinates`, `_small_blocks` and `_large_blocks`.
+        length. As a side effect this fills `_grid_coordinates`, `_small_blocks` and
+        `_large_blocks`.
 
         Args:
             domain: the blocks of all controls, with their norms and budgets.
 
         Yields:
-            The sampled numbers that tables show. These have few components, and a
-            control that knows their ranges.
+            The sampled numbers that tables count by: those of parameters with few
+            components and a known range.
         """
         controls = {control.name: control for control in self.space.controls}
         for group, (block, coordinates) in zip(
@@ -746,8 +763,8 @@ class Points:
             columns = slice(first_column, first_column + n_columns)
             blocks.append(_SampledBlock(block, coordinates, columns))
             control = controls[group.control]
-            # A component of a ball has no range of its own, and neither has a parameter
-            # of a control without slots.
+            # The range of a component is known unless it is in a ball, or the control
+            # declares no slots (parameters with a range).
             has_ranges = bool(control.slots) and not is_ball
             if has_ranges and block.size <= MAX_TABLE_COMPONENTS:
                 yield from self._describe_sampled(
@@ -757,9 +774,9 @@ class Points:
     def _describe_sampled(
         self, control: Control, name: str, coordinates: slice, first_column: int
     ) -> Iterator[SampledNumber]:
-        """Yield the sampled numbers of a parameter, as tables show them.
+        """Yield the sampled numbers of a parameter.
 
-        A choice is one number, a vector has one for each component.
+        A choice is one number; a vector has one for each component.
 
         Args:
             control: bound to the scene.
@@ -771,16 +788,17 @@ class Points:
         full_name = f"{control.name}.{name}"
         if isinstance(spec, OneOf):
             options = tuple(dict.fromkeys(spec.values))
-            part_of_share: tuple[int, ...] = ()
-            has_weights = options != spec.values  # such an option comes several times
+            # An option with a weight is in `spec.values` several times.
+            has_weights = options != spec.values
+            part_of_bin: tuple[int, ...] = ()
             if has_weights:
-                part_of_share = tuple(map(options.index, spec.values))
+                part_of_bin = tuple(map(options.index, spec.values))
             yield SampledNumber(
-                full_name,
-                _stored_unit(parameter),
-                first_column,
-                options,
-                part_of_share=part_of_share,
+                name=full_name,
+                unit=_stored_unit(parameter),
+                column=first_column,
+                parts=options,
+                part_of_bin=part_of_bin,
             )
             return
         is_vector = bool(parameter.shape)
@@ -789,13 +807,13 @@ class Points:
         ):
             suffix = f".{component}" if is_vector else ""
             yield SampledNumber(
-                full_name + suffix,
-                parameter.unit,
-                first_column + component,
-                self._cut_range(coordinate, spec, log=parameter.log),
+                name=full_name + suffix,
+                unit=parameter.unit,
+                column=first_column + component,
+                parts=self._divide_range(coordinate, spec, log=parameter.log),
             )
 
-    def _cut_range(
+    def _divide_range(
         self, column: int, spec: Any, *, log: bool
     ) -> tuple[list[float], ...]:
         """Cut the range of a coordinate into parts, and return the bounds of each.
@@ -817,25 +835,25 @@ class Points:
         return tuple(map(list, pairwise(edge_values)))
 
     def find_parts(self, first: int, count: int) -> NDArray[np.int64]:
-        """Return the part of each of k sampled numbers that images lie in.
+        """Return the index of the part that each of k sampled numbers is in, by image.
 
         Args:
             first: number of the first image in the full sweep.
-            count: count of neighbouring images of a scene.
+            count: number of consecutive images of one scene.
 
         Returns:
             (count, k) indices among `parts` of each of `sampled_numbers`.
         """
-        draws = self._sample(self._small_draws, first, count)
-        # [0, 1] is cut into equal shares for each number: find the share of each draw.
-        shares = (draws[:, self._columns] * self._n_shares).astype(np.int64)
-        shares = np.minimum(shares, self._n_shares - 1)  # a draw of 1 is in the last
-        # Usually share and part are the same. An option with a weight has several
-        # shares: there the part of each share is looked up.
-        parts = shares
+        draws = self._sample(self._small_draws, first, count)[:, self._columns]
+        # [0, 1] is divided into equal bins for each number: find the bin of each draw.
+        bins = (draws * self._n_bins).astype(np.int64)
+        bins = np.minimum(bins, self._n_bins - 1)  # a draw of 1 is in the last
+        # Usually a bin is a part. An option with a weight has several bins: there the
+        # part of each bin is looked up.
+        parts = bins.copy()
         for column, number in enumerate(self.sampled_numbers):
-            if number.part_of_share:
-                parts[:, column] = np.take(number.part_of_share, parts[:, column])
+            if number.part_of_bin:
+                parts[:, column] = np.take(number.part_of_bin, bins[:, column])
         return parts
 
     def noise_number(self, number: int) -> int:
@@ -844,13 +862,13 @@ class Points:
         In a comparison, the images with the adversarial scene repeat the draws of those
         without it. They have the same noise, too, so that only the scene differs.
         """
-        images_until_repeat = self.units.again  # 0 for never
+        images_until_repeat = self.units.again  # 0 if draws never repeat
         return number % images_until_repeat if images_until_repeat else number
 
     def _sample(self, draws: SampleSequence, first: int, count: int) -> Float64Array:
-        """Return the draws (count, k) of neighbouring images.
+        """Return the draws (count, k) of consecutive images.
 
-        Neighbouring images have neighbouring draws, except in a sweep over frames, in
+        Consecutive images have consecutive draws, except in a sweep over frames, in
         which all frames of a drive have the same draw.
 
         Args:
@@ -867,7 +885,7 @@ class Points:
         return np.concatenate(points) if points else draws.points(0, 0)
 
     def _axis_indices(self, first: int, count: int) -> tuple[NDArray[np.intp], ...]:
-        """Return the indices (count,) of neighbouring images on each axis.
+        """Return the indices (count,) of consecutive images on each axis.
 
         Args:
             first: number of the first image in the scene.
@@ -879,18 +897,20 @@ class Points:
         return np.unravel_index(grid_points, self.grid.sizes)
 
     def make_configurations(self, first: int, count: int, before: int = 0) -> Tensor:
-        """Return the configurations (count, d) float32 of neighbouring images.
+        """Return the configurations (count, d) float32 of consecutive images.
 
         Args:
             first: number of the first image in the scene.
-            count: count of images.
-            before: images of the scenes before this one, which used up as many draws.
+            count: number of images.
+            before: number of images of the scenes before this one. They have used the
+                draws before `before`; the grid starts anew in every scene.
         """
         u = np.repeat(self._start[None], count, axis=0)
         indices = self._axis_indices(first, count)
         for column, axis in self._grid_coordinates:
             # The coordinate of a choice is the center of its part of [0, 1].
             u[:, column] = (indices[axis] + 0.5) / self.grid.sizes[axis]
+        # Small blocks share the sampler's sequence; large ones have random draws.
         for draws, blocks in (
             (self._small_draws, self._small_blocks),
             (self._large_draws, self._large_blocks),
@@ -925,30 +945,32 @@ class Points:
             # a uniform number of exactly 1 belongs to the last option
             option = np.minimum(np.floor(uniform * block.options), block.options - 1)
             return np.asarray((option + 0.5) / block.options)
+        # Only a ball has an epsilon; the type checker needs the second condition.
         if block.norm != "l2" or block.epsilon is None:
             lower = self._lower[sampled.coordinates].astype(np.float64)
             upper = self._upper[sampled.coordinates].astype(np.float64)
             return np.asarray(lower + (upper - lower) * uniform)
-        # Normal numbers, by the inverse distribution; 0 and 1 would be infinite.
+        # Normal numbers, by the inverse distribution; 0 and 1 would give infinities.
         direction = ndtri(np.clip(uniform[:, :-1], 1e-12, 1.0 - 1e-12))
         # The volume within a length r grows as r^k: r is the root of a uniform number.
         length = block.epsilon * uniform[:, -1:] ** (1.0 / block.size)
-        # not divided by 0, where all numbers are 0.5
+        # no division by 0, where all numbers are 0.5
         norm = np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-30)
         center = self._start[sampled.coordinates]
         return np.asarray(center + direction * (length / norm))
 
     @property
     def environment(self) -> str | None:
-        """What lights all images instead of the scene's environment.
+        """The environment that lights all images instead of that of the scene.
 
-        None if the scene's environment does, or if it varies.
+        None if the scene's own does, or if the environment varies.
         """
+        # A group is the coordinates of one parameter.
         varies = any(group.setting == ENVIRONMENT for group in self.space.groups)
         return None if varies else self.space.environment
 
     def describe_images(self, u: Tensor, first_image: int) -> list[dict[str, Value]]:
-        """Return the stored values of neighbouring images: parameter to value and unit.
+        """Return the stored values of consecutive images: parameter to value and unit.
 
         They are what `Space.describe` returns, with one exception: a parameter of the
         grid has the value that the user listed, not its float32 rounding.
@@ -1001,7 +1023,7 @@ class Points:
     ) -> Mapping[str, Value]:
         """Return the stored values of a control in one image.
 
-        They are cached where all parameters of the control are in the grid.
+        They are cached if they follow from the grid alone.
 
         Args:
             control: the control, with a `describe` of its own.
@@ -1009,6 +1031,7 @@ class Points:
             control_u: (k,) the coordinates of the control in `u`.
             axis_points: the axes of the control, with the index of the value of each.
         """
+        # A description is stored below only if these indices determine it.
         key = (control.name, *(index for _, index in axis_points))
         cached = self._description_cache.get(key)
         if cached is not None:
@@ -1044,7 +1067,7 @@ class Points:
             indices: for each axis of the grid, the (n,) indices of the values.
         """
         begin = 0
-        for group in control.groups:
+        for group in control.groups:  # a group is the coordinates of one parameter
             name = f"{control.name}.{group.parameter}"
             columns = coordinates[:, begin : begin + group.size].T
             begin += group.size
@@ -1056,7 +1079,7 @@ class Points:
             parameter, spec = _find_spec(control, group.parameter)
             unit = _stored_unit(parameter)
             for component, column in enumerate(columns):
-                if isinstance(spec, OneOf):
+                if isinstance(spec, OneOf):  # a choice has a single coordinate
                     yield name, unit, _select_options(spec, column)
                     continue
                 suffix = f".{component}" if parameter.shape else ""

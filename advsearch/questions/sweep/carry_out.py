@@ -82,7 +82,7 @@ SCENE_SETTINGS = (
     "set_",
     "exposure",
 )
-"""Settings that a scene has which the caller loaded."""
+"""Settings that describe a scene. If the caller passed a loaded scene, it has them."""
 WORKER = "advsearch.questions.sweep.carry_out:sweep_worker"
 BACKDROP = "backdrop"  # the control that draws a photograph
 # name of the scene without the adversarial configuration of a run
@@ -122,25 +122,25 @@ def sweep(
 ) -> SweepResult:
     """Measure how often the model is right over a grid, random draws, or both.
 
-    Every configuration is rendered and evaluated. With `run` naming a sweep of the same
-    settings that was stopped, it goes on where that was stopped. All other arguments
-    are the settings of `advsearch sweep`.
+    Every configuration is rendered and evaluated. If `run` names a stopped sweep with
+    the same settings, that sweep continues. All other arguments are the settings of
+    `advsearch sweep`.
 
     Args:
         scene: scene from `load_scene`, or what that takes; or several. None takes that
             of `adversarial_of`.
-        model: model from `load_model`, or what that takes; or several, which are shown
-            the same pictures. None takes that of `adversarial_of`; without an attack it
+        model: model from `load_model`, or what that takes; or several, which are run on
+            the same images. None takes that of `adversarial_of`; without an attack it
             takes the reference model.
-        task: what judges the models' outputs: a name, a mapping with a `name` and
-            options, an instance, or a function (output, truth) that says how wrong it
-            is, over 0 where it is wrong (docs/tasks.md).
+        task: what evaluates the models' outputs: a name, a mapping with a `name` and
+            options, an instance, or a function (output, truth) that returns how wrong
+            the output is, above 0 if it is wrong (docs/tasks.md).
         grid: parameter to its values: a list, a range, or "FIRST:LAST:COUNT".
-        samples: draws of `controls` at each point of the grid; by default 1, or 100
-            without a grid.
-        controls: what is drawn by chance, as for `attack`.
-        adversarial_of: an attack that was kept, or its folder. Its adversarial scene
-            is swept besides the clean scene, under the same draws; `summary.arms`
+        samples: number of draws of `controls` at each point of the grid; by default 1,
+            or 100 without a grid.
+        controls: what is sampled, as for `attack`.
+        adversarial_of: a stored attack, or its directory. Its adversarial scene is
+            swept in addition to the clean scene, with the same draws; `summary.arms`
             compares the two. If neither `grid` nor `controls` is passed, the conditions
             over which the attack was made robust (its `over`) vary.
         metrics: columns of the rows, by name: functions of (image (H, W, 3) sRGB in [0,
@@ -151,8 +151,8 @@ def sweep(
             pixels, and their scores (n,). This function returns the tracks in the
             frame, each as a number and a box (docs/drives.md). None takes
             `advsearch.questions.sweep.tracks.ConstantVelocity`.
-        run: folder to keep the run in; None keeps it in memory, which then grows with
-            every configuration.
+        run: directory to store the run in; None keeps it in memory, which then grows
+            with every configuration.
     """
     if not isinstance(grid, (Mapping, type(None))):
         raise InputError(
@@ -162,15 +162,12 @@ def sweep(
     # Settings that the caller does not pass are taken from the attack, if there is one.
     attack_run = _find_attack_run(adversarial_of)
     defaults = _load_defaults(attack_run, scene, grid, controls)
-    scenes = _as_list(defaults["object"] if scene is None else scene)
+    scenes = _make_list(defaults["object"] if scene is None else scene)
     default_model = defaults.get("model", "reference")
-    networks = _as_list(default_model if model is None else model)
+    networks = _make_list(default_model if model is None else model)
     controls = controls or defaults.get("controls", ())
-    if task == "classification":
-        task = defaults.get("task", task)
-    if callable(task):
-        task = make_task(task)
-    loaded = _name_loaded(scenes)
+    task = _resolve_task(task, defaults)
+    loaded = _name_loaded_scenes(scenes)
     set_options = _drop_unset(settings)
     # The settings as `run.yaml` states them, with names in place of objects.
     described: dict[str, object] = {
@@ -186,7 +183,7 @@ def sweep(
         naming.check_no_scene_settings(set_options)
     described |= _describe_scenes(scenes, loaded)
     run_setting = {"run": None if run is None else str(run)}
-    # of a setting in several of these mappings, the last value counts
+    # A later mapping overrides the values of earlier ones.
     config = SweepConfig(**{**defaults, **described, **set_options, **run_setting})
     config = config.with_python_only_parts(
         _find_python_only(config, networks, loaded, task, tracker, controls)
@@ -204,6 +201,20 @@ def sweep(
         tracker=tracker,
         progress=progress,
     )
+
+
+def _resolve_task(task: AnyTask, defaults: Mapping[str, Any]) -> AnyTask:
+    """Return the task to use; a function is made a `Task`.
+
+    Args:
+        task: task as the caller passed it.
+        defaults: settings of the attack; empty without one.
+    """
+    # A task that is passed as "classification" cannot be distinguished from the
+    # default: it is replaced by that of the attack, too.
+    if task == "classification":
+        task = defaults.get("task", task)
+    return make_task(task) if callable(task) else task
 
 
 def _drop_unset(settings: Mapping[str, object]) -> dict[str, Any]:
@@ -247,7 +258,7 @@ def _find_attack_run(
     """Return the run of an attack.
 
     Raises:
-        InputError: the attack was not kept in a run directory.
+        InputError: the attack was not stored in a run directory.
     """
     if not isinstance(adversarial_of, AttackResult):
         return adversarial_of
@@ -277,6 +288,7 @@ def _load_defaults(
     defaults = dict[str, Any]()
     if attack_run is not None:
         file = find_run(str(attack_run)) / CONFIG
+        # The function needs to know whether the sweep states what varies.
         defaults = SweepConfig.load_attack_defaults(
             file, {"grid": grid, "controls": controls}
         )
@@ -286,13 +298,13 @@ def _load_defaults(
         )
     if scene is None:
         return defaults
-    # The scene that the caller passed has settings of its own.
+    # The scene that the caller passed replaces that of the attack.
     return {
         name: value for name, value in defaults.items() if name not in SCENE_SETTINGS
     }
 
 
-def _name_loaded(scenes: Sequence[Any]) -> tuple[NamedScene, ...]:
+def _name_loaded_scenes(scenes: Sequence[Any]) -> tuple[NamedScene, ...]:
     """Return the scenes that the caller has loaded: all of them, or none.
 
     Args:
@@ -326,18 +338,20 @@ def _describe_scenes(
         loaded: the loaded ones: all of them or none.
     """
     if not loaded:
-        # A name may itself be a list with commas, as in a YAML file.
+        # `scene` may list several names, as "mug,bowl"; spaces and empty names go.
         names = [
             ",".join(split_names(scene)) if isinstance(scene, str) else str(scene)
             for scene in scenes
         ]
         return {"object": ",".join(names)}
+    # The settings that are not replaced below are the same in all scenes.
     settings: dict[str, object] = dict(loading.scene_to_settings(loaded[0].scene))
     for name in ("object", "environment"):
         values = dict.fromkeys(getattr(scene, name) for scene in loaded)
         settings[name] = ",".join(values)
     if len(loaded) > 1:
-        # These differ between scenes, and no setting states several of them.
+        # Size and `set` (values of the scene's parameters) differ between scenes, and
+        # no setting can state several.
         settings |= {"size": None, "set": {}}
     return settings
 
@@ -350,7 +364,7 @@ def _find_python_only(
     tracker: object,
     controls: Controls,
 ) -> list[PythonOnly]:
-    """Return what exists in this session only, so that no command can repeat it.
+    """Return what exists only in this session, so that no command can repeat it.
 
     That may be models, the scene, the task, metrics, the tracker and controls.
 
@@ -369,6 +383,7 @@ def _find_python_only(
     ]
     if any(scene.scene.is_session_only for scene in scenes):
         parts.append(PythonOnly("scene"))
+    # `is_named` compares the task with the one that is made from its setting.
     if isinstance(task, Task) and not is_named(task, make_task):
         parts.append(PythonOnly("task", task.name))
     parts += [
@@ -393,18 +408,18 @@ def _check_config(config: SweepConfig) -> None:
     """
     if config.workers is not None or config.cluster is not None:
         judging.check_metrics_importable(config.metrics)
-    # settings that store files, with what they store, as the message has it
-    stored_files = {
+    # settings that store files in the run, and what the error message calls the files
+    name_of_files = {
         "keep_pictures": "them",
         "aov": "the layers",
         "surface": "the map",
     }
-    for setting, stored in stored_files.items():
+    for setting, files in name_of_files.items():
         stores_files = getattr(config, setting) not in ("none", None, False)
         if config.run is None and stores_files:
             raise InputError(
                 f"{setting}: expected `run` beside it, the folder that keeps "
-                f"{stored}; name one"
+                f"{files}; name one"
             )
 
 
@@ -432,7 +447,8 @@ def _run_config(
         progress: reports the progress.
     """
     resumed = _find_resumable(config)
-    # The directory of a new run is created before the work. It is None without one.
+    # The directory of a new run is created before the work starts. A sweep without
+    # `run` has no directory: `directory` is None below.
     context: Any = nullcontext(resumed)
     if config.run is not None and resumed is None:
         check_free(config.run, overwrite=config.overwrite)
@@ -467,6 +483,7 @@ def _find_resumable(config: SweepConfig) -> Path | None:
     has_run = is_run(path) and config_file.is_file()
     if config.overwrite or not has_run:
         return None
+    # The stored settings are in the form that `make_repeatable` returns.
     stored = SweepConfig.from_yaml(config_file, config.session_settings)
     has_same_settings = stored.to_json() == config.make_repeatable().to_json()
     can_continue = has_same_settings and not is_finished(path)
@@ -531,9 +548,12 @@ def _add_adversarial_arm(
     fixed_controls = make_configured_controls(attack_config, attack_config.controls)
     _check_not_varied(fixed_controls, sampled, axes, directory)
     u = torch.from_numpy(read_configuration(directory))
-    arm = directory.resolve().name  # the arm is named after the run of the attack
+    # Each of the two arms has a name; that of the attack's run may be "clean", too.
+    arm = directory.resolve().name
     if arm == CLEAN:
-        arm = f"{arm}'s"  # the two arms need different names
+        arm = f"{arm}'s"
+    # The attack's controls are fixed in both arms. Without `u` they have their values
+    # in the clean scene.
     clean = [
         replace(named_scene, fixed_controls=fixed_controls, arm=CLEAN)
         for named_scene in named_scenes
@@ -542,7 +562,7 @@ def _add_adversarial_arm(
     return (*clean, *adversarial)
 
 
-def _as_list(value: Any) -> list[Any]:
+def _make_list(value: Any) -> list[Any]:
     """Return scenes or models as a list.
 
     Raises:
@@ -575,7 +595,7 @@ def row_parameters(config: SweepConfig) -> set[str]:
     job = load_scenes_of_sweep(config).job
     space = job.bind_controls(job.scenes[0], job.image_sizes[0])
     center = torch.full_like(space.start, 0.5)
-    # A choice may describe other parameters than another one.
+    # One choice may describe parameters that another choice does not have.
     return {*space.describe(space.start), *space.describe(center)}
 
 
@@ -623,15 +643,16 @@ def _make_job(
     Args:
         config: the settings.
         named_scenes: the clean scenes.
-        models: names, files or modules.
+        models: names, files or modules of the models.
         task: task of all models.
         controls: controls that are sampled.
 
     Raises:
         InputError: something in the settings does not fit together.
     """
-    # These settings need a control that travels along the path. With a `path` they are
-    # left out of the check, since `add_frames` adds such a control where none does.
+    # These settings need a control that travels along the path. With a `path`, they are
+    # set to None for the check, since `add_frames` adds such a control if there is
+    # none.
     unchecked = ("path", "shutter", "rolling") if config.path is not None else ()
     naming.check_run_settings(config.model_copy(update=dict.fromkeys(unchecked)))
     sampled = make_configured_controls(config, controls)
@@ -644,7 +665,7 @@ def _make_job(
     )
     named_scenes = _add_adversarial_arm(config, named_scenes, sampled, axes)
     check_scenes(named_scenes, sampled, axes)
-    axes = _with_camera_units(axes, named_scenes)
+    axes = _set_camera_units(axes, named_scenes)
     networks, tasks, warnings = _load_models_and_tasks(
         config, named_scenes, models, task
     )
@@ -658,11 +679,12 @@ def _make_job(
         axes=axes,
         aovs=parse_aovs(config.aov),
     )
+    # Notes do not depend on the size of images: the first model's is used.
     for named_scene in named_scenes:
         warnings += job.bind_controls(named_scene, job.image_sizes[0]).list_notes(
             named_scene.scene.description
         )
-    unique_warnings = tuple(dict.fromkeys(warnings))  # scenes may share one
+    unique_warnings = tuple(dict.fromkeys(warnings))  # scenes may have the same notes
     return replace(job, warnings=unique_warnings)
 
 
@@ -681,7 +703,7 @@ def _check_something_varies(
         n_combinations: scenes times models.
 
     Raises:
-        InputError: `samples` asks for draws of nothing, or nothing varies at all.
+        InputError: `samples` is set but nothing is sampled, or nothing varies at all.
     """
     if config.samples is not None and not sampled:
         raise InputError(
@@ -697,10 +719,10 @@ def _check_something_varies(
         )
 
 
-def _with_camera_units(
+def _set_camera_units(
     axes: Sequence[Axis], named_scenes: Sequence[NamedScene]
 ) -> tuple[Axis, ...]:
-    """Return the axes, those of cameras in metres if all objects have a size."""
+    """Return the axes, with those of cameras in meters if all objects have a size."""
     are_sized = all(
         named_scene.scene.description.object.size_in_metres is not None
         for named_scene in named_scenes
@@ -734,14 +756,14 @@ def _load_models_and_tasks(
         The models, the tasks, and remarks on both.
     """
     shared_task = make_task(task)
-    _check_different([get_model_name(model) for model in models])
+    _check_distinct_names([get_model_name(model) for model in models])
     networks, warnings = load_models(models, shared_task, config)
-    # A file or a function may return a model that has the name of another one.
-    _check_different([network.name for network in networks])
+    # Several files or functions may return models of the same name.
+    _check_distinct_names([network.name for network in networks])
     scenes = [named_scene.scene for named_scene in named_scenes]
     tasks = tuple(
         judging.calibrate_task(
-            shared_task.on(network),
+            shared_task.on(network),  # a copy for this model
             network,
             scenes,
             config.label,
@@ -750,6 +772,7 @@ def _load_models_and_tasks(
         )
         for network in networks
     )
+    # A task of each thing has no remarks itself, so they are collected before.
     warnings += [remark for network_task in tasks for remark in network_task.remarks]
     if config.judge == ALL_THINGS:
         tasks = tuple(map(make_each_thing_task, tasks))
@@ -768,7 +791,7 @@ def _find_scene_notes(
 ) -> list[str]:
     """Return the notes on the scenes, such as what an importer could not read.
 
-    A control may choose among environments; the notes on these are included.
+    A control of environments may load files; the notes on these are included.
 
     Args:
         named_scenes: all scenes of the sweep.
@@ -780,6 +803,7 @@ def _find_scene_notes(
         description = named_scene.scene.description
         for control in add_grid_axes(controls, axes, description):
             if control.kind == ENVIRONMENT:
+                # `prepare` loads the environments and adds the notes on their files.
                 description = control.prepare(description)
         notes += description.notes
     return notes
@@ -790,7 +814,7 @@ def load_scenes(config: SweepConfig) -> tuple[NamedScene, ...]:
 
     They are sorted by object, then by environment. Without an `environment`, each
     object has that of its own scene. A scene that a Python caller passed is the only
-    one. Each is in every photograph, if `backdrop` is a folder.
+    one. If `backdrop` is a folder, each scene is repeated in every photograph.
 
     Args:
         config: settings of the sweep.
@@ -799,11 +823,11 @@ def load_scenes(config: SweepConfig) -> tuple[NamedScene, ...]:
 
 
 def _load_named_scenes(config: SweepConfig) -> list[NamedScene]:
-    """Load the scenes of a configuration, each in its first photograph, if any.
+    """Load the scenes of a configuration, before `expand_photographs`.
 
     They are every object in every environment. Without the setting `environment`, each
     object has the environment of its own scene. A scene that a Python caller passed is
-    the only one.
+    the only one. If `backdrop` is a folder, each scene is in its first photograph.
     """
     session_scene: Scene | None = config.python_object(naming.SCENE, config.object)
     if session_scene is not None:  # passed by a Python caller
@@ -811,6 +835,7 @@ def _load_named_scenes(config: SweepConfig) -> list[NamedScene]:
         return [NamedScene(config.object, name, session_scene)]
     objects = naming.check_distinct(config.objects, "object")
     environments = naming.check_distinct(config.environments, "environment")
+    # Without the setting, `environments` has a default that does not apply here.
     first_environment = environments[0] if config.environment else None
     scenes = {
         name: naming.load_configured_scene(config, name, first_environment)
@@ -822,7 +847,7 @@ def _load_named_scenes(config: SweepConfig) -> list[NamedScene]:
             for name, scene in scenes.items()
         ]
     first_scene = scenes[objects[0]].description
-    # Each environment is loaded once, with the first object, and given to all others.
+    # Each environment is loaded once, with the first object, and used for all others.
     environment_by_name = {first_environment: first_scene.environment}
     for name in environments[1:]:
         scene = load_scene(first_scene.object, name)
@@ -852,7 +877,7 @@ def expand_photographs(
         *(axis_name.partition(".")[0] for axis_name in config.grid),
     ]
     kinds = [
-        # a name that is no control has no kind
+        # a name that is no control has no `kind`
         getattr(config.find_control_type(name), "kind", "")
         for name in control_names
     ]
@@ -877,7 +902,7 @@ def expand_photographs(
     return tuple(expanded)
 
 
-def _check_different(names: Sequence[str]) -> None:
+def _check_distinct_names(names: Sequence[str]) -> None:
     """Check that no two models have the same name: results are listed by it."""
     if len(set(names)) < len(names):
         raise InputError(

@@ -1,10 +1,10 @@
 """The view and the claims of the result of `sweep`.
 
 The *detection distance* of an object is the distance at which half of a sweep's images
-show it: where the falling line through the fractions (isotonic regression, Ayer et al.
-1955, linear in the logarithm of the distance) crosses one half. Its interval is exact:
-each of m fractions is compared with one half by the binomial test at 0.025 / m on each
-side.
+are detected: where a falling line through the fractions (isotonic regression, Ayer et
+al. 1955, linear in the logarithm of the distance) crosses one half. Its interval is
+exact: each of m fractions is compared with one half by the binomial test at 0.025 / m
+on each side.
 """
 
 from __future__ import annotations
@@ -65,11 +65,20 @@ from advsearch.runs.results import INTERRUPTED, CountedPredictions
 from advsearch.settings import split_names
 from advsearch.statistics.monotone import Dip, _fit_falling, find_dips
 
-MAX_TICKS = 16  # values of an axis that have a label
-# characters of a label that a figure of the usual size has room for
+MAX_TICKS = 16  # number of values of an axis that have a label
+# number of characters of a label that fit into a figure of the usual size
 USUAL_LABEL_LENGTH = 8
-# characters of all labels of an axis that fit side by side
+# total number of characters of the labels of an axis that fit side by side
 MAX_LABELS_LENGTH = 50
+# Sizes of figures in inches. A map has the size of its frame plus that of each cell;
+# labels longer than usual add the width or the height of each further character.
+ACCURACY_FIGURE_SIZE = (5.6, 3.6)
+MAP_FRAME_WIDTH = 3.2
+MAP_FRAME_HEIGHT = 1.8
+CELL_WIDTH = 0.34
+CELL_HEIGHT = 0.3
+CHARACTER_WIDTH = 0.09
+ROTATED_CHARACTER_HEIGHT = 0.065
 
 
 def figure_size(summary: SweepSummary) -> tuple[float, float] | None:
@@ -79,25 +88,27 @@ def figure_size(summary: SweepSummary) -> tuple[float, float] | None:
     rotated. None if there is neither a map nor a single axis to draw.
     """
     if not summary.cells:
-        return (5.6, 3.6) if _only_axis(summary) else None
+        return ACCURACY_FIGURE_SIZE if _list_single_axis(summary) else None
     x_axis, y_axis = summary.cells.axes
     n_columns = min(len(x_axis.values), MAX_TICKS)
     n_rows = min(len(y_axis.values), MAX_TICKS)
-    aslant_length = 0
+    rotated_length = 0
     if _are_long(x_axis.values):
-        aslant_length = _longest_label(x_axis.values)
-    left_length = _longest_label(y_axis.values)
-    # Long labels need room; those of the x axis, aslant, also at the left of it.
-    extra_left = max(max(left_length, aslant_length) - USUAL_LABEL_LENGTH, 0)
-    extra_below = max(aslant_length - USUAL_LABEL_LENGTH, 0)
-    # inches of the frame, of each cell, and of each character
-    width = 3.2 + 0.34 * n_columns + 0.09 * extra_left
-    height = 1.8 + 0.3 * n_rows + 0.065 * extra_below
+        rotated_length = _find_longest_label(x_axis.values)
+    left_length = _find_longest_label(y_axis.values)
+    # Labels of the x axis end below their tick: rotated ones begin to the left of it,
+    # so that the first of them needs room at the left of the axes.
+    extra_left = max(max(left_length, rotated_length) - USUAL_LABEL_LENGTH, 0)
+    extra_below = max(rotated_length - USUAL_LABEL_LENGTH, 0)
+    width = MAP_FRAME_WIDTH + CELL_WIDTH * n_columns + CHARACTER_WIDTH * extra_left
+    height = (
+        MAP_FRAME_HEIGHT + CELL_HEIGHT * n_rows + ROTATED_CHARACTER_HEIGHT * extra_below
+    )
     return width, height
 
 
-def _longest_label(values: Sequence[Any]) -> int:
-    return max(map(len, _ticks(values)[1]))
+def _find_longest_label(values: Sequence[Any]) -> int:
+    return max(map(len, _select_ticks(values)[1]))
 
 
 def draw_sweep(summary: SweepSummary) -> Figures:
@@ -116,17 +127,17 @@ def draw_sweep_on(summary: SweepSummary, axes: Any) -> None:
     """Draw a sweep on matplotlib axes, as `draw_sweep` does."""
     if summary.cells:
         _draw_map(axes, summary, summary.cells)
-    elif _only_axis(summary):
-        _draw_accuracy(axes, summary, _only_axis(summary))
+    elif _list_single_axis(summary):
+        _draw_accuracy(axes, summary, _list_single_axis(summary))
 
 
-def _only_axis(summary: SweepSummary) -> Sequence[AxisRow]:
-    """Return the values of the only axis of a sweep.
+def _list_single_axis(summary: SweepSummary) -> Sequence[AxisRow]:
+    """Return the rows of the axis of a sweep that has a single axis.
 
-    There are none if it has more axes, or too many values. Axes with listed values go
-    before those with parts of a range.
+    The list is empty if there are more axes, or too many values. If the sweep has axes
+    with listed values and axes with parts of a range, the latter are ignored.
     """
-    # a part of a range is its two bounds
+    # The value of a part of a range is its two bounds.
     rows = [row for row in summary.axes if not isinstance(row.value, (list, tuple))]
     rows = rows or summary.axes
     names = {row.axis for row in rows}
@@ -142,7 +153,7 @@ def _draw_map(axes: Any, summary: SweepSummary, cells: SweepMap) -> None:
         cells: the map.
     """
     x_axis, y_axis = cells.axes
-    # Cells are 1 wide and high, and their centers are whole numbers.
+    # Cells are 1 wide and high, and centered at whole numbers.
     extent = (-0.5, len(x_axis.values) - 0.5, -0.5, len(y_axis.values) - 0.5)
     counts = np.array(cells.configurations, dtype=float)
     # The accuracy of a single prediction is only 0 or 1: its margin says more.
@@ -162,9 +173,9 @@ def _draw_map(axes: Any, summary: SweepSummary, cells: SweepMap) -> None:
         format_axis_title(y_axis.axis, y_axis.unit),
     )
     rotation = 45 if _are_long(x_axis.values) else 0
-    axes.set_xticks(*_ticks(x_axis.values), rotation=rotation)
-    axes.set_yticks(*_ticks(y_axis.values))
-    title = _subject(summary)
+    axes.set_xticks(*_select_ticks(x_axis.values), rotation=rotation)
+    axes.set_yticks(*_select_ticks(y_axis.values))
+    title = _name_objects_and_models(summary)
     n_more_axes = len(cells.over)
     if n_more_axes:
         title += f", over {n_more_axes} more {'axes' if n_more_axes > 1 else 'axis'}"
@@ -197,33 +208,33 @@ def _draw_accuracy(axes: Any, summary: SweepSummary, rows: Sequence[AxisRow]) ->
         )
     accuracy = [row.accuracy for row in rows]
     axes.plot(range(len(rows)), accuracy, "o", color=BLUE, label="accuracy")
-    axes.set_xticks(*_ticks(values), rotation=45 if _are_long(values) else 0)
+    axes.set_xticks(*_select_ticks(values), rotation=45 if _are_long(values) else 0)
     axes.set(
         xlabel=format_axis_title(rows[0].axis, rows[0].unit),
         ylabel="accuracy",
         ylim=(-0.03, 1.03),
     )
     axes.margins(x=0.08)
-    axes.set_title(_subject(summary))
+    axes.set_title(_name_objects_and_models(summary))
     axes.grid(True, axis="y")
     axes.figure.legend(loc="outside lower center", ncols=2)
 
 
-def _ticks(values: Sequence[Any]) -> tuple[list[int], list[str]]:
+def _select_ticks(values: Sequence[Any]) -> tuple[list[int], list[str]]:
     """Return the indices of the values of an axis that are labelled, and the labels."""
     step = math.ceil(len(values) / MAX_TICKS)
     indices = list(range(0, len(values), step))
-    return indices, [_tick_label(values[index]) for index in indices]
+    return indices, [_format_tick(values[index]) for index in indices]
 
 
-def _tick_label(value: Any) -> str:
+def _format_tick(value: Any) -> str:
     """Return the label of a value at an axis; a part of a range has two bounds."""
     if isinstance(value, (list, tuple)):
         return " to ".join(f"{bound:.3g}" for bound in value)
     return shorten_name(value) if isinstance(value, str) else f"{value:.4g}"
 
 
-def _subject(summary: SweepSummary) -> str:
+def _name_objects_and_models(summary: SweepSummary) -> str:
     """Return the names of the objects and the models."""
     names = (*split_names(summary.object), *split_names(summary.model))
     return ", ".join(map(shorten_name, names))
@@ -231,25 +242,26 @@ def _subject(summary: SweepSummary) -> str:
 
 def _are_long(values: Sequence[Any]) -> bool:
     """Return whether the labels of an axis are too long to stand side by side."""
-    _, labels = _ticks(values)
+    _, labels = _select_ticks(values)
     return sum(len(label) + 1 for label in labels) > MAX_LABELS_LENGTH
 
 
 READING = (
     "How often it is right at each value, over all others, with the 95 % interval:"
 )
-BAR_LENGTH = 20  # in characters
-# values of an axis that a text lists; of more, half as many: those where the model is
-# worst
+BAR_LENGTH = 20  # number of characters
+# A text lists all values of an axis up to this number. Of a longer axis it lists half
+# this number: the values where the model is right least often.
 MAX_TEXT_ROWS = 24
-MAX_PAGE_ROWS = 96  # values of an axis that a page lists as a table; of more, none
+# number of values up to which a page lists an axis as a table
+MAX_PAGE_ROWS = 96
 
 
 def _difference_text(part: SurfacePart) -> str:
     """Return the difference of two rates in percent, with its interval if it has one."""
     low, high = part.interval
     difference = f"{part.difference:+.0%}"
-    has_interval = not math.isnan(low)  # images that share draws have none
+    has_interval = not math.isnan(low)  # there is none if images share draws
     if has_interval:
         difference += f" ({low:+.0%} to {high:+.0%})"
     return difference.replace("%", " %")
@@ -265,7 +277,7 @@ AXIS_COLUMNS: dict[str, Column] = {
     "accuracy": lambda row: percent(row.accuracy),
     "95 % interval": lambda row: wording.format_interval(row.interval),
 }
-CHANGES_TITLE = "Shown again, changed:"
+CHANGES_TITLE = "Predictions about changed pictures:"
 CHANGE_COLUMNS: dict[str, Column] = {
     "model": "{0.model}",
     "what it says": lambda rates: rates.claim.replace("_", " "),
@@ -287,32 +299,32 @@ SURFACE_COLUMNS: dict[str, Column] = {
 def make_sweep_view(summary: SweepSummary) -> ShownResult:
     """Return the view of a sweep: what a text, a page and a notebook show of it."""
     axes = _group_axes(summary)
-    sections = [*_text_sections(summary, axes)]
+    sections = [*_make_text_sections(summary, axes)]
     size = figure_size(summary)
     if size is not None:
         sections.append(
             ResultPart(
-                draw=lambda axes: draw_sweep_on(summary, axes),
+                draw=lambda figure_axes: draw_sweep_on(summary, figure_axes),
                 size=size,
                 only="notebook",
             )
         )
-    sections += (replace(part, only="page") for part in _page_parts(summary, axes))
+    sections += (replace(part, only="page") for part in _make_page_parts(summary, axes))
     run_images = f"{summary.run}/images"
-    # empty texts are left out
     has_drive_file = bool(summary.drives and summary.run)
+    # Facts with an empty text are left out.
     facts = {
-        "worst": _worst_configuration(summary),
-        "there": _worst_prediction(summary),  # in the worst configuration
+        "worst": _describe_worst_configuration(summary),
+        "there": _describe_worst_prediction(summary),  # the prediction in the worst one
         "renders": str(summary.renders["sweep"]),
         "worst drive": f"{run_images}/drive.webp" if has_drive_file else "",
         "map of the surface": f"{run_images}/surface.png" if summary.surface else "",
     }
-    # The verdict names an interrupt only of a sweep that it cut off.
+    # The verdict says so itself if a sweep that was cut off has counted nothing.
     if summary.configurations > 0:
         ended_early = summary.looked_at < summary.planned
     else:
-        # Nothing counts: either no image has the object, or none was evaluated.
+        # Nothing is counted: either no image shows the object, or none was evaluated.
         ended_early = not summary.out_of_view
     return ShownResult(_verdict(summary), sections, facts, says_interrupted=ended_early)
 
@@ -325,7 +337,7 @@ def _group_axes(summary: SweepSummary) -> dict[str, list[AxisRow]]:
     return axes
 
 
-def _text_sections(
+def _make_text_sections(
     summary: SweepSummary, axes: Mapping[str, Sequence[AxisRow]]
 ) -> Iterator[ResultPart]:
     """Yield the sections of text and tables.
@@ -336,7 +348,7 @@ def _text_sections(
     """
     if summary.arms is not None and summary.ending != INTERRUPTED:
         for pair in summary.arms.pairs:
-            yield _arms_table(summary.arms.adversarial_run, pair, summary.task)
+            yield _make_arms_table(summary.arms.adversarial_run, pair, summary.task)
     distance = find_detection_distance(summary)
     if distance:
         yield ResultPart(text=[distance_sentence(distance)])
@@ -345,25 +357,27 @@ def _text_sections(
     yield ResultPart.make_table(
         summary.changes or [], CHANGE_COLUMNS, title=CHANGES_TITLE
     )
-    # The axis "answer" is the two scenes, clean and adversarial: `_arms_table` has it.
+    # The axis "answer" has the clean scene and the adversarial one: `_make_arms_table`
+    # shows these.
     if axes.keys() - {"answer"}:
         introduction = READING
         if summary.arms:
+            first_letter = READING[0].lower()
             introduction = (
                 "Of the clean scene and the adversarial one together: "
-                f"{READING[0].lower()}{READING[1:]}"
+                f"{first_letter}{READING[1:]}"
             )
         yield ResultPart(text=[introduction])
         for name, rows in axes.items():
             if name != "answer":
-                yield _axis_table(name, rows, summary.task)
+                yield _make_axis_table(name, rows, summary.task)
     if summary.surface is not None:
         sentences = "\n".join(surface_sentences(summary.surface))
         title = "What is seen of the surface when the model is wrong:"
         yield ResultPart(title, [sentences])
 
 
-def _arms_table(answer: str, pair: PairedRates, task: str) -> ResultPart:
+def _make_arms_table(answer: str, pair: PairedRates, task: str) -> ResultPart:
     """Return a table of one model without and with an adversarial configuration.
 
     Args:
@@ -376,29 +390,29 @@ def _arms_table(answer: str, pair: PairedRates, task: str) -> ResultPart:
     rows = []
     for name, counts in arms:
         right = f"right in {counts.correct} of {counts.configurations}"
-        row = [name, right, *_accuracy_cells(counts)]
+        row = [name, right, *_make_accuracy_cells(counts)]
         if has_outcomes:
             row.append(wording.format_outcomes(counts.outcomes, task))
         rows.append(row)
     return ResultPart(rows=rows)
 
 
-def _worst_configuration(summary: SweepSummary) -> str:
+def _describe_worst_configuration(summary: SweepSummary) -> str:
     """Return the names and values of the worst configuration; empty without one."""
     if summary.worst is None:
         return ""
     values = summary.worst.values
-    # These explain themselves, as "mug, studio", and stand without their names.
+    # Values such as "mug, studio" explain themselves, and are listed without names.
     names = ("object", "environment", "backdrop", "model")
-    outside = [name for name in names if name in values]
-    texts = [shorten_name(values[name].value) for name in outside]
+    names_to_omit = [name for name in names if name in values]
+    texts = [shorten_name(values[name].value) for name in names_to_omit]
     for name, described in values.items():
-        if name not in outside:
+        if name not in names_to_omit:
             texts.append(f"{name} {wording.format_parameter_value(described.value)}")
     return ", ".join(texts)
 
 
-def _worst_prediction(summary: SweepSummary) -> str:
+def _describe_worst_prediction(summary: SweepSummary) -> str:
     """Return what the model predicts of the worst configuration; empty without one."""
     worst = summary.worst
     if worst is None:
@@ -411,10 +425,10 @@ def _worst_prediction(summary: SweepSummary) -> str:
     return f"prediction {prediction}; {margin}; {verified}"
 
 
-def _page_parts(
+def _make_page_parts(
     summary: SweepSummary, axes: Mapping[str, Sequence[AxisRow]]
 ) -> Iterator[ResultPart]:
-    """Yield what a page shows besides its explorer.
+    """Yield what a page shows in addition to its explorer.
 
     These are the detection distance, full drives, the surface, and each axis in
     numbers.
@@ -433,7 +447,8 @@ def _page_parts(
             note=sentence,
         )
     for index, rates in enumerate(summary.drives or ()):
-        # the title stands above all tables, and the images are of the worst drive
+        # The title stands once, above all tables. The only images are those of the
+        # worst drive of the first model.
         is_first = index == 0
         yield ResultPart(
             "Whole drives" if is_first else "",
@@ -446,10 +461,11 @@ def _page_parts(
         summary.changes or [], CHANGE_COLUMNS, title=CHANGES_TITLE
     )
     if summary.surface is not None:
-        yield from _surface_parts(summary.surface)
+        yield from _make_surface_parts(summary.surface)
     for name, rows in axes.items():
         if len(rows) <= MAX_PAGE_ROWS:
             columns = dict(AXIS_COLUMNS)
+            # Only detectors have outcomes of wrong predictions, such as "missed".
             if any(row.outcomes for row in rows):
                 columns["the others"] = lambda row: wording.format_outcomes(
                     row.outcomes, summary.task
@@ -459,7 +475,7 @@ def _page_parts(
             )
 
 
-def _surface_parts(surface: SurfaceMap) -> Iterator[ResultPart]:
+def _make_surface_parts(surface: SurfaceMap) -> Iterator[ResultPart]:
     """Yield what a page shows of the surface."""
     text = " ".join(surface_sentences(surface))
     title = "The surface that was seen"
@@ -467,14 +483,14 @@ def _surface_parts(surface: SurfaceMap) -> Iterator[ResultPart]:
     for table in surface.tables:
         if table.strongest:
             names = f"{shorten_name(table.object)}, {shorten_name(table.model)}"
-            title = f"{names}: the {table.part}s that are told most clearly"
+            title = f"{names}: the {table.part}s with the clearest difference"
             yield ResultPart.make_table(
                 table.strongest, SURFACE_COLUMNS, title=title, folded=True
             )
 
 
 def _verdict(summary: SweepSummary) -> str:
-    """Return the result in a sentence or two."""
+    """Return the result of a sweep in one or two sentences."""
     if not summary.configurations:
         if summary.out_of_view:
             return "The object is in no picture."
@@ -501,25 +517,25 @@ def _verdict(summary: SweepSummary) -> str:
 def outcomes_clause(summary: SweepSummary) -> str:
     """Return the outcomes of wrong predictions, as the end of a sentence.
 
-    Empty if only a prediction is known.
+    Empty for tasks without outcomes; only detection has them.
     """
     text = wording.format_outcomes(summary.outcomes, summary.task)
     return f"; of the others, {text}" if text else ""
 
 
 def grid_clause(summary: SweepSummary) -> str:
-    """Return the caution about an accuracy over a grid, where nothing is sampled."""
+    """Return a caution that an accuracy depends on the grid; empty if it does not."""
     if summary.sampler is not None or not summary.grid:
         return ""
     return " of this grid; another has another share"
 
 
-def _accuracy_cells(counts: CountedPredictions) -> tuple[str, str]:
+def _make_accuracy_cells(counts: CountedPredictions) -> tuple[str, str]:
     """Return the accuracy and its interval, as cells of a table."""
     return percent(counts.accuracy), wording.format_interval(counts.interval)
 
 
-def _axis_table(name: str, rows: Sequence[AxisRow], task: str) -> ResultPart:
+def _make_axis_table(name: str, rows: Sequence[AxisRow], task: str) -> ResultPart:
     """Return a table of the accuracy by the values of an axis, with bars.
 
     Of more than `MAX_TEXT_ROWS` values only the worst are listed.
@@ -542,9 +558,10 @@ def _axis_table(name: str, rows: Sequence[AxisRow], task: str) -> ResultPart:
     has_outcomes = any(row.outcomes for row in rows)
     lines = []
     for row in listed:
-        # an accuracy that is not known has no bar, as has one of 0
-        bar = "#" * round((row.accuracy or 0.0) * BAR_LENGTH)
-        accuracy, interval = _accuracy_cells(row)
+        # An unknown accuracy has an empty bar, as 0 has.
+        n_filled = round((row.accuracy or 0.0) * BAR_LENGTH)
+        bar = "#" * n_filled
+        accuracy, interval = _make_accuracy_cells(row)
         cells = [
             wording.format_parameter_value(row.value),
             bar.ljust(BAR_LENGTH, "."),
@@ -559,7 +576,7 @@ def _axis_table(name: str, rows: Sequence[AxisRow], task: str) -> ResultPart:
 
 
 def _select_worst(rows: Sequence[AxisRow], count: int) -> list[AxisRow]:
-    """Return the rows with the smallest accuracies, in their own order."""
+    """Return the rows with the smallest accuracies, in their original order."""
     by_accuracy = sorted(
         range(len(rows)), key=lambda index: rows[index].accuracy or 0.0
     )
@@ -578,16 +595,18 @@ def make_sweep_claims(result: SweepSummary) -> Iterator[Claim]:
     population, note = _describe_population(result)
     if result.arms:
         for pair in result.arms.pairs:
-            yield from _arm_claims(result.arms.adversarial_run, pair, population, note)
+            yield from _make_arm_claims(
+                result.arms.adversarial_run, pair, population, note
+            )
         if result.arms.pairs:
-            return  # the other claims are about both scenes together
-    yield from _accuracy_claims(result, population, note)
+            return  # the other claims would mix the clean scene and the adversarial one
+    yield from _make_accuracy_claims(result, population, note)
     distance = find_detection_distance(result)
     if distance:
         yield claim("measured", distance_sentence(distance), None)
     for rates in result.drives or ():
         heads = "mean, with its interval over drives, then the worst drive"
-        values = "; ".join(_drive_row_text(*row) for row in drive_rows(rates))
+        values = "; ".join(_format_drive_clause(*row) for row in drive_rows(rates))
         yield claim("measured", f"{drive_title(rates)} ({heads}): {values}.", None)
     verified = result.worst.verified if result.worst else None
     if verified is not None:
@@ -603,26 +622,28 @@ def _describe_population(result: SweepSummary) -> tuple[str, str]:
     """Return what the rates of a sweep are over, and a caution about the interval.
 
     A sweep has a grid, samples (then its `sampler` is not None), or both; imported rows
-    have neither. The caution is empty for independent random draws alone, for which the
-    interval is right.
+    have neither. The caution is empty if the interval is right: for independent random
+    draws without a grid, and for random drives.
     """
     is_sampled = result.sampler is not None
-    if not is_sampled and not result.grid:
+    is_imported = not is_sampled and not result.grid
+    are_draws_dependent = result.sampler != "random" or bool(result.grid)
+    if is_imported:
         population = "configurations"
         if result.drives:
             population = _name_frames(result.drives)
         note = (
-            " How these were chosen is not known; the interval takes them as a sample."
+            " How these were selected is unknown; the interval takes them as a sample."
         )
     elif not is_sampled:
         population = "points of the grid"
         if result.drives:
             frames = _name_frames(result.drives)
-            population = f"{frames}, whose ways and moments are given"
+            population = f"{frames}, whose paths and times were selected"
         note = (
-            " Nothing is said of what lies between or beside these points, and another "
-            "grid gives another share; the "
-            "interval takes them as a sample."
+            " This states nothing about what lies between or outside of these points, "
+            "and another grid gives another fraction; the interval takes the points as "
+            "a sample."
         )
     elif result.drives:
         # The frames are the grid; what else differs between drives is sampled.
@@ -633,13 +654,13 @@ def _describe_population(result: SweepSummary) -> tuple[str, str]:
         note = ""
         if result.sampler != "random":
             note = " The interval is over drives, as if these were independent."
-    elif result.sampler != "random" or result.grid:
+    elif are_draws_dependent:
         population = f"configurations drawn at random ({result.sampler})"
         if result.grid:
             population += " at each point of a grid"
         note = " The interval is that of independent draws, which these are not."
     else:
-        population = "configurations drawn by chance from the ranges that are named"
+        population = "configurations drawn at random from the stated ranges"
         note = ""
     return population, note
 
@@ -649,7 +670,7 @@ def _name_frames(drives: Sequence[DriveRates]) -> str:
     return f"frames of {drives[0].drives} drives"
 
 
-def _arm_claims(
+def _make_arm_claims(
     answer: str, pair: PairedRates, population: str, note: str
 ) -> Iterator[Claim]:
     """Yield the accuracy without and with an adversarial configuration.
@@ -665,7 +686,7 @@ def _arm_claims(
         f"the adversarial scene of {answer}": pair.adversarial,
     }
     for arm, counts in arms.items():
-        extent = _accuracy_extent(
+        extent = _make_accuracy_extent(
             f"configurations of {arm} in which {pair.model} is right", counts
         )
         accuracy = format_extent(extent)
@@ -677,7 +698,7 @@ def _arm_claims(
     yield claim("measured", format_paired_rates(answer, pair), None)
 
 
-def _accuracy_claims(
+def _make_accuracy_claims(
     result: SweepSummary, population: str, note: str
 ) -> Iterator[Claim]:
     """Yield the accuracy of each model.
@@ -687,7 +708,7 @@ def _accuracy_claims(
         population: description of what the rates are over, "points of the grid" say.
         note: a caution about the interval.
     """
-    # Objects and environments are not sampled.
+    # Objects and environments are not sampled: each has the same number of images.
     fixed = list[str]()
     for name in ("object", "environment"):
         n_values = sum(row.axis == name for row in result.axes)
@@ -699,11 +720,14 @@ def _accuracy_claims(
         f"The model {row.value}": row for row in result.axes if row.axis == "model"
     }
     # Each model has a claim of its own: models get the same images, so that their
-    # predictions together are not independent.
-    if len(split_names(result.model)) <= 1 or not counts_by_model:
+    # predictions are not independent of each other.
+    has_several_models = len(split_names(result.model)) > 1
+    if not has_several_models or not counts_by_model:
         counts_by_model = {"The model": result}
     for model, counts in counts_by_model.items():
-        extent = _accuracy_extent("configurations in which the model is right", counts)
+        extent = _make_accuracy_extent(
+            "configurations in which the model is right", counts
+        )
         outcomes = wording.format_outcomes(counts.outcomes, result.task)
         others = f" Of the others: {outcomes}." if outcomes else ""
         yield claim(
@@ -713,13 +737,13 @@ def _accuracy_claims(
         )
 
 
-def _drive_row_text(name: str, mean: str, interval: str, worst: str) -> str:
+def _format_drive_clause(name: str, mean: str, interval: str, worst: str) -> str:
     """Return a row of `drive_rows` as a clause."""
     interval_text = "" if interval == "-" else f" (95 % interval {interval})"
     return f"{name}: {mean}{interval_text}, {worst}"
 
 
-def _accuracy_extent(description: str, counts: CountedPredictions) -> Extent:
+def _make_accuracy_extent(description: str, counts: CountedPredictions) -> Extent:
     """Return the extent of the claim that predictions are right."""
     return Extent.from_count(
         description,
@@ -745,7 +769,7 @@ def rate_text(summary: SweepSummary) -> str:
 
 
 def drive_title(rates: DriveRates) -> str:
-    """Return how many drives there are, of how many frames, and the model."""
+    """Return the numbers of drives and frames, the seconds, and the model."""
     repeats = (
         f", {rates.repeats} times each with other noise" if rates.repeats > 1 else ""
     )
@@ -753,17 +777,15 @@ def drive_title(rates: DriveRates) -> str:
         f"{format_count(rates.drives, 'drive')} of {rates.frames} frames in {rates.seconds:g} "
         f"s{repeats}, {rates.model}"
     )
-    return (
-        title
-        if rates.adversarial_run is None
-        else f"{title}, with {rates.adversarial_run}"
-    )
+    if rates.adversarial_run is not None:
+        title += f", with {rates.adversarial_run}"
+    return title
 
 
 def drive_rows(drive_rates: DriveRates) -> list[tuple[str, str, str, str]]:
     """Return the rates over drives: name, mean, 95 % interval and worst drive.
 
-    A rate that is not known has no row; without an interval there is a dash.
+    An unknown rate has no row; a missing interval is a dash.
     """
     tracks = drive_rates.tracks
     never = f", never in {drive_rates.never_right}" if drive_rates.never_right else ""
@@ -815,7 +837,11 @@ def _format_drive_row(
 
 
 def surface_sentences(surface: SurfaceMap) -> list[str]:
-    """Return which cells of each surface go with wrong predictions, in a sentence."""
+    """Return a sentence for each surface: which cells the predictions depend on.
+
+    A cell "goes with wrong predictions" if the model is wrong significantly more often
+    where the cell is visible than where it is hidden.
+    """
     sentences = []
     for table in surface.tables:
         # The faces of a mesh may be counted, too; the sentence is about cells.
@@ -857,26 +883,27 @@ HALF = 0.5
 
 @dataclass(frozen=True)
 class DetectionDistance:
-    """The distance at which an object is first detected by a camera that comes nearer.
+    """The distance at which a camera that comes nearer first detects an object.
 
     Attributes:
         unit: "metres" or "object sizes".
-        distances: (m,) at which there are images, the nearest first.
-        right_fractions: (m,) of the images that are right.
-        intervals: (m,) theirs, 95 %.
-        distance: the estimate; None if it is detected at all distances, or at none. If
-            the fraction does not fall with the distance, the last one: beyond the dips
-            that are not chance.
-        lower: lower bound of its interval; None if images do not bound it.
-        upper: upper bound, likewise.
-        min_images: how many images at a distance any bound takes, if none has as many.
-        loose_counts: (m,) images in which a loose box is on it, which count neither as
-            right nor as missed; empty if that is not known.
-        image_counts: (m,) images.
-        dips: distances at which it is detected less often than beyond them, the nearest
-            first.
-        is_above_half: whether the falling line nowhere crosses one half, because it is
-            detected in that many images at all distances.
+        distances: (m,) distances with images, ascending.
+        right_fractions: (m,) fraction of right images at each distance.
+        intervals: (m,) 95 % intervals of the fractions.
+        distance: the estimate. None if the object is detected at all distances, or at
+            none. If the fraction does not fall with the distance, it is estimated from
+            the distances beyond the last significant dip.
+        lower: lower bound of the estimate; None if the images do not bound it.
+        upper: upper bound; None if the images do not bound it.
+        min_images: number of images at a distance that a bound needs, if no distance
+            has as many; else None.
+        loose_counts: (m,) number of images with a loose box on the object, which counts
+            neither as right nor as missed; empty if unknown.
+        image_counts: (m,) number of images.
+        dips: distances at which the object is detected less often than farther away,
+            ascending.
+        is_above_half: whether the falling line stays at one half or above up to the
+            farthest distance.
     """
 
     unit: str
@@ -894,23 +921,25 @@ class DetectionDistance:
 
     @property
     def is_monotone(self) -> bool:
-        """Whether all dips may be chance."""
+        """Whether no dip is significant."""
         return not any(dip.is_significant for dip in self.dips)
 
 
 def find_detection_distance(summary: SweepSummary) -> DetectionDistance | None:
-    """Return how far away a detector sees an object.
+    """Return the detection distance of a sweep.
 
     None if the sweep does not measure it: one model, one object, several distances and
     independent images are needed.
     """
     rows = [row for row in summary.axes if row.axis == DISTANCE and row.configurations]
-    is_detection = summary.task.partition("=")[0] == "detection"
+    # A task may have options, as in "detection=..."
+    task_name = summary.task.partition("=")[0]
+    is_detection = task_name == "detection"
     # names of several objects or models stand with commas
     is_single = "," not in summary.object and "," not in summary.model
     is_comparison = summary.arms is not None
-    # Frames of a drive are not independent, nor are samples of a point where nothing is
-    # sampled.
+    # Frames of a drive are not independent. Neither are images that share a draw, of
+    # which `units` is the number of draws.
     are_independent = summary.drives is None and summary.units is None
     if not (is_detection and is_single and are_independent) or is_comparison:
         return None
@@ -940,20 +969,17 @@ def compute_detection_distance(rows: Sequence[AxisRow]) -> DetectionDistance:
     distances = tuple(_center_distance(row) for row in rows)
     k = np.array([row.correct for row in rows])  # right images at each distance
     n = np.array([row.configurations for row in rows])  # images
-    # Of a binomial test at one of the distances: 2.5 % on each side, divided by the
-    # number of tests (Bonferroni).
+    # significance of a one-sided binomial test at one of the distances: 2.5 %, divided
+    # by the number of tests (Bonferroni)
     significance = 0.025 / len(rows)
     low, high = _bound_distance(np.array(distances), k, n, significance)
     dips = find_dips(distances, k, n)
-    # The line is fitted to the distances beyond the last dip that is not chance: nearer
-    # ones contradict a falling line.
-    indices_beyond_dips = [
-        distances.index(dip.distance) + 1 for dip in dips if dip.is_significant
-    ]
-    first = max(indices_beyond_dips, default=0)
-    falling = _fit_falling(k[first:], n[first:])
+    first = _find_first_beyond_dips(distances, dips)
+    falling = _fit_falling(k[first:], n[first:])  # the fitted fractions
     # n images that are all right differ from one half if 2**-n < significance.
-    min_images = math.floor(-math.log2(significance)) + 1
+    min_images: int | None = math.floor(-math.log2(significance)) + 1
+    if (n >= min_images).any():
+        min_images = None  # some distance has enough images
     return DetectionDistance(
         unit=rows[0].unit,
         distances=distances,
@@ -962,12 +988,24 @@ def compute_detection_distance(rows: Sequence[AxisRow]) -> DetectionDistance:
         distance=_find_crossing(np.array(distances[first:]), falling),
         lower=low,
         upper=high,
-        min_images=None if (n >= min_images).any() else min_images,
+        min_images=min_images,
         loose_counts=_count_loose(rows),
         image_counts=tuple(n.tolist()),
         dips=dips,
-        is_above_half=bool(falling[-1] >= HALF),
+        is_above_half=bool(falling[-1] >= HALF),  # the last one is the smallest
     )
+
+
+def _find_first_beyond_dips(distances: Sequence[float], dips: Sequence[Dip]) -> int:
+    """Return the index of the first distance beyond the last significant dip.
+
+    The falling line is fitted from there on, since nearer distances contradict it. It
+    is 0 without a significant dip.
+    """
+    indices_beyond_dips = [
+        distances.index(dip.distance) + 1 for dip in dips if dip.is_significant
+    ]
+    return max(indices_beyond_dips, default=0)
 
 
 def _bound_distance(
@@ -979,13 +1017,13 @@ def _bound_distance(
     """Return the bounds of the detection distance; None if images do not bound it.
 
     The lower bound is the farthest distance at which significantly more than half of
-    the images are right. The upper bound is the nearest distance beyond it at which
-    significantly fewer than half are.
+    the images are right, whatever is nearer. The upper bound is the nearest distance
+    beyond it at which significantly fewer than half are.
 
     Args:
         distance: (m,) ascending.
-        k: (m,) images that are right.
-        n: (m,) images.
+        k: (m,) number of images that are right.
+        n: (m,) number of images.
         significance: significance of a one-sided binomial test of one half.
     """
     from scipy.special import bdtr, bdtrc  # takes a tenth of a second
@@ -1071,11 +1109,12 @@ def _clause_beyond_dips(
     """Return how often the model is right beyond the last dip of its detections.
 
     A dip is a distance at which the object is detected less often than farther away.
+    The clause follows the sentence about dips (`_dips_sentences`).
 
     Args:
         estimate: estimate of the detection distance.
-        distance: the estimated distance; None if it is not among the measured ones.
-        farthest: the farthest distance that was measured, with its unit.
+        distance: the estimated distance; None if the line does not cross one half.
+        farthest: the farthest distance with images, with its unit.
         unit: unit of the distance.
     """
     if distance is not None:
@@ -1091,7 +1130,7 @@ def _clause_beyond_dips(
 def _interval_clause(estimate: DetectionDistance, unit: str) -> str:
     """Return the interval of the detection distance as a clause.
 
-    An interval may have one bound only, or none if there are too few images.
+    An interval may have only one bound, or none if there are too few images.
 
     Args:
         estimate: estimate of the detection distance.
@@ -1099,11 +1138,11 @@ def _interval_clause(estimate: DetectionDistance, unit: str) -> str:
     """
     low = None if estimate.lower is None else f"{estimate.lower:.3g}"
     high = None if estimate.upper is None else f"{estimate.upper:.3g}"
-    if low and high:
+    if low is not None and high is not None:
         bounds = f"{low} to {high} {unit}"
-    elif low:
+    elif low is not None:
         bounds = f"at least {low} {unit}"
-    elif high:
+    elif high is not None:
         bounds = f"at most {high} {unit}"
     else:
         bounds = "no bound"
@@ -1119,9 +1158,9 @@ def _dips_sentences(estimate: DetectionDistance, unit: str) -> list[str]:
     """Return a sentence about dips, distances with fewer detections than farther away.
 
     It lists all significant dips. If none is significant, it has the dip with the
-    smallest p-value that contradicts the estimate, if any. A dip contradicts it if
-    fewer than half of its images are right, although the estimate says that the object
-    is seen there, or at least half of the images farther away are right.
+    smallest p-value among those that contradict the estimate, if any. A dip contradicts
+    the estimate if fewer than half of its images are right, and either it is nearer
+    than the estimate or at least half of the images farther away are right.
 
     Args:
         estimate: estimate of the detection distance.
@@ -1134,7 +1173,8 @@ def _dips_sentences(estimate: DetectionDistance, unit: str) -> list[str]:
     if significant:
         clauses = "; ".join(_dip_clause(dip, unit) for dip in significant)
         return [f"No one distance from which on it is seen: right in {clauses}."]
-    # the farthest distance at which the estimate has at least half of the images right
+    # The estimate states that up to this distance at least half of the images are
+    # right.
     detected_until = estimate.distance or 0.0
     if estimate.is_above_half:
         detected_until = estimate.distances[-1]
@@ -1144,12 +1184,13 @@ def _dips_sentences(estimate: DetectionDistance, unit: str) -> list[str]:
         n_right_beyond, n_images_beyond = dip.counts_beyond
         is_below_half = n_right < HALF * n_images
         is_above_half_beyond = n_right_beyond >= HALF * n_images_beyond
-        contradicts_line = dip.distance < detected_until
-        if is_below_half and (contradicts_line or is_above_half_beyond):
+        is_nearer_than_estimate = dip.distance < detected_until
+        if is_below_half and (is_nearer_than_estimate or is_above_half_beyond):
             contradicting.append(dip)
     if not contradicting:
         return []
-    deepest = _dip_clause(min(contradicting, key=lambda dip: dip.p_value), unit)
+    most_significant = min(contradicting, key=lambda dip: dip.p_value)
+    deepest = _dip_clause(most_significant, unit)
     return [f"Nearer it is right less often: in {deepest}, which may be chance."]
 
 
@@ -1191,7 +1232,7 @@ def _loose_sentence(estimate: DetectionDistance, unit: str) -> str:
 def _add_loose_fractions(estimate: DetectionDistance) -> list[float]:
     """Return at each distance the fraction of images with any box on the object.
 
-    That is the fraction of right images, and that with a loose box only.
+    That is the fraction of right images plus that of images with only a loose box.
     """
     return [
         fraction + n_loose / n_images

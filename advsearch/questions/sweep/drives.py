@@ -1,10 +1,10 @@
 """Rates of a sweep over full drives, and the worst of them.
 
-A drive is everything that varies but the time of the frames along a path. Frames are
-not independent, so intervals are over drives, and hold for any number of them: each
-value has bounds that are known from the plan (`attacks.trials`). Where nothing is
-sampled, samples of a drive differ in noise alone: they are one drive, whose values are
-the means of theirs.
+A drive is one combination of all that varies but the time: its frames are the images
+along a path. Frames are not independent, so intervals are over drives. They hold for
+any number of drives, since each value has bounds that are known from the plan
+(`attacks.trials`). If nothing is sampled, the samples of a drive differ only in noise:
+they count as one drive, whose values are their means.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from advsearch.tasks.boxes import MIN_OVERLAP
 
 MAX_ANIMATED_FRAMES = 60
 MAX_LISTED_DRIVES = 1000  # drives of a model that a result lists
-# what a model's flag of a frame can be
+# values of a model's flag of a frame
 WRONG = 0
 RIGHT = 1
 UNKNOWN = -1  # there is no row
@@ -59,11 +59,11 @@ def add_frames(
 ) -> tuple[tuple[Control, ...], dict[str, object]]:
     """Return the controls and the grid of a sweep over the frames of a path.
 
-    A control that travels along the path is added if there is none. The times of the
-    frames become the last axis of the grid, unless the grid has them already. They go
-    from 0 to the end of the path, with `fps` frames a second, at least two. If there
-    are several paths, they become an axis, too, unless a setting chooses among them or
-    they are sampled.
+    A control that travels along the path is added if there is none. If there are
+    several paths, they become the first axis of the grid, unless the path is in the
+    grid, set or sampled. The times of the frames become the last axis, unless the grid
+    has them already. They go from 0 to the end of the path, with `fps` frames a second
+    and at least two frames.
 
     Args:
         config: settings with a `path`.
@@ -81,8 +81,8 @@ def add_frames(
     seconds = travelling.seconds  # from the first point of the path to its end
     grid = config.grid
     if time_name not in grid:
-        # both ends have a frame
-        n_frames = max(2, round(seconds * config.fps) + 1)
+        n_frames = round(seconds * config.fps) + 1  # both ends have a frame
+        n_frames = max(2, n_frames)
         grid = {**grid, time_name: f"0:{seconds:g}:{n_frames}"}
     is_path_in_grid = path_name in grid
     is_path_set = Control.PATH_PARAMETER in travelling.specs
@@ -125,7 +125,8 @@ def compute_distance_bounds(job: Job, axis: Axis) -> tuple[float, float] | None:
         axis: the time of the control that travels.
 
     Returns:
-        The distances in the unit of the rows; None if the control does not know any.
+        The smallest and the largest distance in the unit of the rows; None if the
+        control that travels does not state distances.
     """
     times = torch.tensor([float(value) for value in axis.values])
     lowest = math.inf
@@ -142,6 +143,7 @@ def compute_distance_bounds(job: Job, axis: Axis) -> tuple[float, float] | None:
             )
             if control is None or not control.travels:
                 return None
+            # over all paths that the control can take
             distances = control.compute_distances(times)
             lowest = min(lowest, float(distances.min()))
             highest = max(highest, float(distances.max()))
@@ -149,11 +151,11 @@ def compute_distance_bounds(job: Job, axis: Axis) -> tuple[float, float] | None:
 
 
 class _CompleteDrives(NamedTuple):
-    """The n drives of which all frames are known, in which the object is visible.
+    """The n drives whose frames are all known and that show the object in some frame.
 
     Attributes:
         flags: (n, frames) RIGHT, WRONG or HIDDEN.
-        distance: (n, frames) to the object; NaN where that is not known.
+        distance: (n, frames) distance of the object; NaN if unknown.
         steps: (n, frames) numbers of the rows.
     """
 
@@ -166,19 +168,19 @@ class Drives:
     """The frames of every drive of a sweep.
 
     The private arrays `_flags` (WRONG, RIGHT, ...) and `_steps` (numbers of the rows)
-    have the axes (scenes, the other axes of the grid ..., samples, models, frames),
-    with the frames in the order of their times. `_distance` has no axis for models,
-    since all get the same images. `_path_of_step` and `_frame_of_step` have the name of
-    the path and the detected boxes of a row, by the number of the row.
+    have the axes (scenes, axes of the grid without the time ..., samples, models,
+    frames), with the frames in the order of their times. `_distance` has no axis for
+    models, since all get the same images. `_path_of_step` has the name of the path of a
+    row, and `_frame_of_step` its detected boxes; the keys are numbers of rows.
 
     Attributes:
-        times: (frames,) of the frames, ascending, in seconds.
+        times: (frames,) times in seconds, ascending.
         seconds: seconds from the first frame to the last.
     """
 
     _units = Units()
-    # Bounds come from the plan. Those of the sampled distances would not bound the
-    # others that could have been drawn.
+    # Bounds come from the plan. The smallest and largest of the sampled distances do
+    # not bound the others that could have been sampled.
     _distance_bounds: tuple[float, float] | None = None
 
     def __init__(self, job: Job, rows: Iterable[Row]) -> None:
@@ -192,7 +194,9 @@ class Drives:
         assert axis_index is not None
         self._job = job
         axis = job.axes[axis_index]
-        self._units = next(iter(job.load_points(0).values())).units
+        # The units are the same in all scenes and for all sizes of images.
+        points_of_first_scene = job.load_points(0)
+        self._units = next(iter(points_of_first_scene.values())).units
         self._distance_bounds = compute_distance_bounds(job, axis)
         # An array of this shape has an element for each row; the row's number is its
         # index in the flat array.
@@ -202,13 +206,13 @@ class Drives:
             job.samples,
             len(job.models),
         )
-        # of each row: 1 right, 0 wrong, HIDDEN without the object, UNKNOWN if missing
         flags: Flags = np.full(shape, UNKNOWN, np.int8)
-        # The models of an image have the same distance: no axis is of models.
+        # All models get the same image, so there is no axis for models.
         distance = np.full(shape[:-1], np.nan)
         self._path_of_step: dict[int, str] = {}
         self._frame_of_step: dict[int, DetectedFrame] = {}
         self._distance_unit = "object sizes"
+        # fills `flags` and `distance`, and the attributes above
         self._read_rows(rows, axis.instance, flags, distance)
 
         times = np.array([float(value) for value in axis.values])
@@ -216,8 +220,8 @@ class Drives:
         self.times = times[order]
         self.seconds = float(self.times[-1] - self.times[0])
         steps = np.arange(flags.size).reshape(shape)
-        # The frames become the last axis, in the order of their times. The arrays begin
-        # with the axis of the scenes, and those of the grid follow.
+        # The time becomes the last axis, in ascending order. In `shape`, the axis of
+        # the scenes comes before those of the grid.
         time_axis = axis_index + 1
         self._flags = np.moveaxis(flags, time_axis, -1)[..., order]
         self._steps = np.moveaxis(steps, time_axis, -1)[..., order]
@@ -230,7 +234,7 @@ class Drives:
         flags: Flags,
         distance: npt.NDArray[np.float64],
     ) -> None:
-        """Fill the arrays of right predictions and of distances from rows.
+        """Fill arrays with the flags and the distances of rows.
 
         Detected boxes, the names of paths and the unit of distances are stored in
         attributes.
@@ -238,10 +242,10 @@ class Drives:
         Args:
             rows: rows of the sweep.
             instance: name of the control that travels.
-            flags: (scenes, ..., models), which is filled; a row's number is its index
+            flags: (scenes, ..., models) array to fill. A row's number is its index in
+                the flat array.
+            distance: (scenes, ...) array to fill. The number of an image is its index
                 in the flat array.
-            distance: (scenes, ...), which is filled; the number of an image, which is
-                that of its rows divided by the models, is its index in the flat array.
         """
         job = self._job
         right_names = self._find_right_names()
@@ -256,7 +260,7 @@ class Drives:
                 self._distance_unit = row.values[distance_name]["unit"]
             scene = image // job.images_per_scene
             names = right_names.get((scene, model))
-            # only models that detect have names, and a row may have lost its boxes
+            # Only detectors have names, and an old row may lack its boxes.
             if names is not None and isinstance(row.payload, dict):
                 self._frame_of_step[row.step] = read_frame(row.payload, names)
             if path_name in row.values:
@@ -274,17 +278,19 @@ class Drives:
         return right_names
 
     def _select_complete(self, scenes: list[int], model: int) -> _CompleteDrives:
-        """Select the drives in some scenes that have all their frames.
+        """Select the drives of some scenes that have all their frames.
 
-        Drives without the object in any frame are left out.
+        Drives in which the object is hidden in every frame are left out.
 
         Args:
             scenes: indices of the scenes.
             model: index of the model whose predictions are selected.
         """
         n_frames = len(self.times)
+        # Axes of the scenes' arrays: (scenes, grid ..., samples, models, frames).
         flags = self._flags[scenes][..., model, :].reshape(-1, n_frames)
         steps = self._steps[scenes][..., model, :].reshape(-1, n_frames)
+        # Without the axis of models, it has the shape of one model's flags.
         distance = self._distance[scenes].reshape(flags.shape)
         is_known = (flags != UNKNOWN).all(axis=1)
         is_visible = (flags != HIDDEN).any(axis=1)
@@ -300,8 +306,8 @@ class Drives:
         """
         rates = list[DriveRates]()
         named_scenes = self._job.scenes
-        # the arms of a comparison, without and with the adversarial configuration; a
-        # single one without a name if nothing is compared
+        # The arms of a comparison are the clean scenes and the adversarial ones. If
+        # nothing is compared, there is one arm, whose name is empty.
         for arm in dict.fromkeys(named_scene.arm for named_scene in named_scenes):
             scenes = [
                 scene
@@ -328,13 +334,13 @@ class Drives:
         n_frames = len(self.times)
         first_distance = _first_right_distance(drives)
         drive_records = self._describe_drives(drives, first_distance)
-        # drives with any right frame: only these have a distance of first detection
+        # Only drives with a right frame have a distance of first detection.
         has_right = np.asarray((drives.flags == RIGHT).any(axis=1))
 
-        # Rows of one draw differ in noise alone: they are repeats of one drive. All
-        # frames of a drive have the same draw, so that of the first one is looked up.
+        # Drives of one draw differ only in noise and count as one. All frames of a
+        # drive have the same draw, so that of the first frame is looked up.
         first_images = drives.steps[:, 0] // len(self._job.models)
-        drive = np.asarray(self._units.find_draw(first_images))  # (n,) its draw
+        drive = np.asarray(self._units.find_draw(first_images))  # (n,) draw of each
         n_drives = len(np.unique(drive))
         n_right_drives = len(np.unique(drive[has_right]))
         # The largest values that are possible: every frame is wrong, and the prediction
@@ -343,7 +349,7 @@ class Drives:
         max_flicker = (n_frames - 1) / self.seconds
         return DriveRates(
             model=self._job.models[model].name,
-            adversarial_run=arm or None,
+            adversarial_run=arm or None,  # the name is empty without a comparison
             drives=n_drives,
             repeats=math.ceil(len(drives.flags) / n_drives),
             frames=n_frames,
@@ -354,7 +360,10 @@ class Drives:
                 _right_fraction(drives.flags), min, drive_of_value=drive
             ),
             longest_gap=summarize_drives(
-                self._longest_gaps(drives.flags), max, (0.0, max_gap), drive
+                self._longest_gaps(drives.flags),
+                max,
+                bounds=(0.0, max_gap),
+                drive_of_value=drive,
             ),
             first_right=self._first_detection(
                 first_distance[has_right], drive[has_right]
@@ -362,7 +371,10 @@ class Drives:
             unit=self._distance_unit,
             never_right=n_drives - n_right_drives,
             flicker=summarize_drives(
-                self._changes_per_second(drives.flags), max, (0.0, max_flicker), drive
+                self._changes_per_second(drives.flags),
+                max,
+                bounds=(0.0, max_flicker),
+                drive_of_value=drive,
             ),
             tracks=self._compute_track_rates(model, drives.steps, drive),
             per_drive=drive_records,
@@ -371,15 +383,17 @@ class Drives:
     def _describe_drives(
         self, drives: _CompleteDrives, first_distance: npt.NDArray[np.float64]
     ) -> list[DriveRecord]:
-        """Return the values of the first `MAX_LISTED_DRIVES` drives, each by itself.
+        """Return the values of each of the first `MAX_LISTED_DRIVES` drives.
 
         Args:
             drives: n drives.
-            first_distance: (n,) at the first right frame; NaN if there is none.
+            first_distance: (n,) distance at the first right frame; NaN if there is
+                none.
         """
         right_fraction = _right_fraction(drives.flags)
         longest_gap = self._longest_gaps(drives.flags)
         flicker = self._changes_per_second(drives.flags)
+        # A drive is identified by the row of its first frame.
         first_steps = drives.steps[:MAX_LISTED_DRIVES, 0].tolist()
         return [
             DriveRecord(
@@ -404,10 +418,10 @@ class Drives:
         return runs * self._frame_interval
 
     def _changes_per_second(self, flags: Flags) -> npt.NDArray[np.float64]:
-        """Return how often each drive (n,) changes between right and wrong a second."""
+        """Return how often a second each drive (n,) changes between right and wrong."""
         is_right = flags == RIGHT
         is_visible = flags != HIDDEN
-        # A frame without the object is no change: neither into it nor out of it.
+        # A change to or from a frame without the object does not count.
         both_visible = is_visible[:, 1:] & is_visible[:, :-1]
         is_change = (is_right[:, 1:] != is_right[:, :-1]) & both_visible
         return np.asarray(is_change.sum(axis=1) / self.seconds)
@@ -417,15 +431,17 @@ class Drives:
     ) -> OverDrives | None:
         """Return the mean distance at the first right frame.
 
-        None if there is no such frame, or a distance is not known.
+        None if there is no such frame, or a distance is unknown.
 
         Args:
-            distance: (n,) of drives that have a right frame.
-            drive: (n,) their draws.
+            distance: (n,) distance of each drive with a right frame.
+            drive: (n,) draw of each of these drives.
         """
         if not len(distance) or not np.isfinite(distance).all():
             return None
-        return summarize_drives(distance, min, self._distance_bounds, drive)
+        return summarize_drives(
+            distance, min, bounds=self._distance_bounds, drive_of_value=drive
+        )
 
     def _compute_track_rates(
         self, model: int, steps: npt.NDArray[np.int64], drive: npt.NDArray[np.int64]
@@ -438,8 +454,7 @@ class Drives:
         Args:
             model: index of the model.
             steps: (n, frames) numbers of the rows.
-            drive: (n,) the draw of each drive; drives of one draw differ in noise
-                alone.
+            drive: (n,) the draw of each drive; drives of one draw differ only in noise.
 
         Returns:
             The rates; None unless the model detects and every frame has its boxes.
@@ -462,22 +477,29 @@ class Drives:
         longest_gap = np.array([tracked.gap for tracked in tracked_drives], dtype=float)
         n_frames = len(self.times)
         seconds_bounds = (0.0, n_frames * self._frame_interval)
+
         return TrackRates(
             tracker=str(getattr(tracker, "__name__", type(tracker).__name__)),
             lost=summarize_drives(lost, max, drive_of_value=drive),
-            # lost, but not if less overlap is enough
+            # frames that are lost, but would not be if less overlap were enough
             loose=summarize_drives(lost - lost_loosely, max, drive_of_value=drive),
-            switches=summarize_drives(switches, max, (0.0, n_frames - 1.0), drive),
+            # at most one switch between two frames
+            switches=summarize_drives(
+                switches, max, bounds=(0.0, n_frames - 1.0), drive_of_value=drive
+            ),
             longest_gap=summarize_drives(
-                longest_gap * self._frame_interval, max, seconds_bounds, drive
+                longest_gap * self._frame_interval,
+                max,
+                bounds=seconds_bounds,
+                drive_of_value=drive,
             ),
         )
 
     def save_worst(self, scenes: SceneLoader, run: RunDirectory) -> None:
         """Save a strip and an animation of the first model's worst drive.
 
-        That is the drive with the fewest right frames; its images have the marks of the
-        task.
+        The worst drive has the smallest fraction of right frames. Its images have the
+        marks of the task, such as boxes.
 
         Args:
             scenes: scenes of the sweep.
@@ -490,17 +512,17 @@ class Drives:
         worst = _right_fraction(drives.flags).argmin()
         # rows are numbered by image, then model
         image_numbers = drives.steps[worst] // len(self._job.models)
-        frames = []
+        animated_frames = []
         selected = select_evenly(len(image_numbers), MAX_ANIMATED_FRAMES)
         for number in image_numbers[selected].tolist():
             scene, queries = scenes.make_queries(number)
             query = queries[0]  # of the first model
             image = scene.render_image(query)
             marks = scene.problems[0].find_marks(image, query.u)
-            frames.append(
+            animated_frames.append(
                 np.asarray(draw_marks(image.numpy(), marks), dtype=np.float32)
             )
-        save_drive(run, "drive", frames, self.seconds)
+        save_drive(run, "drive", animated_frames, self.seconds)
 
 
 def _compute_lost_loosely(
@@ -512,7 +534,7 @@ def _compute_lost_loosely(
     enough: `MIN_OVERLAP`, or the `iou` of the task if that is less.
 
     Args:
-        task: task of the model; a track is on the object from its `iou` on.
+        task: task of the model; a track is on the object if they overlap by its `iou`.
         tracker: makes the tracker.
         frames: frames of each of n drives.
     """
@@ -559,15 +581,15 @@ def summarize_drives(
 ) -> OverDrives:
     """Compute the mean of a value over drives, its 95 % interval, and the worst value.
 
-    There is no interval if the bounds are not known, or for a single drive.
+    There is no interval if the bounds are unknown, or for a single drive.
 
     Args:
-        values: (n,) one for each time that a drive was evaluated.
-        worst: selects the worst of them: `min` or `max`.
+        values: (n,) a value for each evaluation of a drive.
+        worst: selects the worst of the values: `min` or `max`.
         bounds: smallest and largest value that a drive of the sweep can have, whatever
-            a model predicts; None if they are not known.
-        drive_of_value: (n,) the drive of each value. Values of one drive differ in
-            noise alone, and are averaged first. None: each has a drive of its own.
+            a model predicts; None if they are unknown.
+        drive_of_value: (n,) the drive of each value. Values of one drive differ only
+            in noise, and are averaged first. None: each value has its own drive.
     """
     means = values
     if drive_of_value is not None:
@@ -576,5 +598,6 @@ def summarize_drives(
     interval = None
     if bounds is not None and len(means) > 1:
         interval = mean_interval(means, *bounds)
+    # The worst value is that of a single evaluation, with the noise that it had.
     worst_value = worst(values.tolist())
     return OverDrives(mean=float(means.mean()), interval=interval, worst=worst_value)

@@ -42,7 +42,7 @@ from advsearch.tasks import Facts, Judgement, Task
 from advsearch.viewer import thumbnails
 
 KIND = "sweep"  # rows of the sweep, and the stream of their seeds
-DEFAULT_SAMPLES = 100  # of a sweep without a grid
+DEFAULT_SAMPLES = 100  # number of samples of a sweep without a grid
 ImageSize: TypeAlias = tuple[int, int]  # (height, width)
 
 
@@ -54,12 +54,13 @@ class NamedScene:
         object: name of the object.
         environment: name of the environment.
         scene: the loaded scene.
-        fixed_controls: controls that do not vary.
-        u: (d,) the configuration of these; None leaves the scene as it is.
-        arm: name of the arm of a comparison without and with the adversarial
-            configuration of a run; empty if nothing is compared.
-        photograph: name of the photograph of a folder that it is in; empty if it is in
-            none of a folder.
+        fixed_controls: controls of an attack, which are fixed in the sweep.
+        u: (d,) the adversarial configuration of these; None leaves them at their values
+            in the clean scene.
+        arm: name of the arm if clean and adversarial scenes are compared: "clean", or
+            the name of the attack's run; empty if nothing is compared.
+        photograph: name of the scene's photograph in a folder of photographs; empty
+            without a folder.
     """
 
     object: str
@@ -72,7 +73,7 @@ class NamedScene:
 
     @property
     def names(self) -> dict[str, str]:
-        """The values of the axes outside the scene, by their names."""
+        """The scene's values of the axes that are not controls, as a new dict."""
         names = {"object": self.object, "environment": self.environment}
         if self.photograph:
             names["backdrop"] = self.photograph
@@ -92,10 +93,10 @@ class Job:
         config: the settings.
         scenes: the scenes.
         models: the models, all of which get the same images.
-        tasks: one for each model.
-        controls: the sampled ones.
+        tasks: a task for each model.
+        controls: controls that are sampled.
         axes: axes of the grid.
-        aovs: layers of ground truth that are stored of every image of the first model
+        aovs: layers of ground truth to store with every image of the first model
             (`scene.formation.AOVS`).
         warnings: warnings of loading.
         metrics: columns of the rows, by name.
@@ -118,14 +119,16 @@ class Job:
 
     @property
     def samples(self) -> int:
-        """Samples at each point of the grid: by default 1, without a grid more."""
+        """Number of samples at each point of the grid: by default 1, or more without a
+        grid.
+        """
         is_sampled_only = bool(self.controls) and not self.axes
         default = DEFAULT_SAMPLES if is_sampled_only else 1
         return self.config.samples or default
 
     @cached_property
     def spp(self) -> int:
-        """Samples per pixel, as the sampler has them."""
+        """Samples per pixel, rounded as the sampler of pixels needs it."""
         return round_sample_count(self.config.pixel_sampler, self.config.search_spp)
 
     @cached_property
@@ -145,7 +148,7 @@ class Job:
 
     @cached_property
     def images_per_scene(self) -> int:
-        """Images of a scene."""
+        """Number of images of a scene, which is the same for all scenes and sizes."""
         return next(iter(self.load_points(0).values())).count
 
     @cached_property
@@ -174,16 +177,18 @@ class Job:
         A query is numbered as the row that stores its result: by image, then by model.
 
         Args:
-            numbers: numbers of the images in the sweep.
+            numbers: numbers of the images in the sweep, all of one scene.
 
         Returns:
             The queries by ascending number, each as (name of the problem, None, query).
-            The problem's name is the scene's number.
+            The problem's name is the scene's number. None is in place of the
+            configuration, which the query has.
         """
         scene = numbers.start // self.images_per_scene
         images_before = scene * self.images_per_scene  # those of the scenes before
         first_in_scene = numbers.start - images_before
         queries = list[Query]()
+        # The configurations may differ between sizes, since framing depends on them.
         for size, points in self.load_points(scene).items():
             configurations = points.make_configurations(
                 first_in_scene, len(numbers), images_before
@@ -219,6 +224,7 @@ class Job:
             values: values of the controls.
         """
         scene = number // self.images_per_scene
+        # an environment that a control or an axis chooses instead of the scene's
         environment = points.space.find_environment(values)
         return Query(
             u.clone(),
@@ -226,13 +232,13 @@ class Job:
             kind=KIND,
             index=number * len(self.models) + model,
             spp=self.spp,
-            draws_conditions=False,
-            values=self._row_values(scene, model, environment, values),
-            has_success=False,
+            draws_conditions=False,  # what is sampled is in `u` already
+            values=self._make_row_values(scene, model, environment, values),
+            has_success=False,  # a sweep counts right predictions, not successes
             with_image=self.config.keep_pictures != "none",
         )
 
-    def _row_values(
+    def _make_row_values(
         self,
         scene: int,
         model: int,
@@ -246,12 +252,13 @@ class Job:
         Args:
             scene: index of the scene.
             model: index of the model.
-            environment: name of the environment that replaces that of the scene.
+            environment: name of the environment that replaces that of the scene; None
+                if the scene keeps its own.
             values: values of the controls.
         """
         named_scene = self.scenes[scene]
         fixed_names = {control.name for control in named_scene.fixed_controls}
-        names = named_scene.names
+        names = named_scene.names  # a new dict, which may be changed
         if environment is not None:
             names["environment"] = environment
         names["model"] = self.models[model].name
@@ -285,12 +292,12 @@ class Job:
             *add_grid_axes(self.controls, self.axes, description),
         )
         if not controls:
-            return Space((), None)
+            return Space((), None)  # a space without any coordinate
         space = make_space(controls, description)
         if named_scene.fixed_controls:
             space = _fix_controls(named_scene, space)
-        # What the user fixed with `set` must not be sampled. The environment is left
-        # out here: `check_scenes` has checked it.
+        # What the user fixed with `set` must not be sampled. The environment is
+        # excepted, as `check_scenes` has checked it.
         set_by_user = named_scene.scene.description.requested - {ENVIRONMENT}
         for group in space.groups:
             if group.setting in set_by_user:
@@ -308,6 +315,7 @@ class Job:
         of the scenes are those with it. They repeat the draws of the first half.
         """
         repeat_after_scenes = 0  # never
+        # With an attack, every scene has an arm; the clean one is named, too.
         is_comparison = bool(self.scenes[0].arm)
         if is_comparison:
             repeat_after_scenes = len(self.scenes) // 2
@@ -324,12 +332,18 @@ class Job:
         )
 
     def make_facts(self, named_scene: NamedScene, values: Mapping[str, Value]) -> Facts:
-        """Return what a task needs to know of a scene whose controls have `values`."""
+        """Return what a task needs to know about a scene.
+
+        Args:
+            named_scene: the scene.
+            values: values of its controls by name; empty if the task does not need
+                them.
+        """
         return make_facts(
             named_scene.scene.description,
             named_scene.object,
             label=self.config.label,
-            describe=lambda: values,
+            describe=lambda: values,  # called only by tasks that need the values
             judge=self.config.judge,
         )
 
@@ -337,15 +351,14 @@ class Job:
 def _fix_controls(named_scene: NamedScene, space: Space) -> Space:
     """Fix the first controls of a space to the configuration of a scene.
 
-    Args:
-        named_scene: scene with fixed controls; without a configuration `u`, these are
+        named_scene: scene with fixed controls. Without a configuration `u`, these are
             fixed to their start, as in the clean arm.
         space: space of all controls, with the fixed ones first.
 
     Raises:
         InputError: the adversarial configuration does not fit the scene.
     """
-    # bound to the scene, unlike `named_scene.fixed_controls`
+    # These are bound to the scene; those of `named_scene` are not.
     fixed_controls = space.controls[: len(named_scene.fixed_controls)]
     start = torch.cat([control.start for control in fixed_controls])
     if named_scene.u is None:
@@ -355,9 +368,7 @@ def _fix_controls(named_scene: NamedScene, space: Space) -> Space:
             "adversarial_of: the adversarial configuration of "
             f"{named_scene.arm} has {len(named_scene.u)} "
             f"numbers, and {named_scene.object} takes {len(start)}: it is "
-            "another "
-            "object, or it has changed since; "
-            "do the run again"
+            "another object, or it has changed since; do the run again"
         )
     return space.fix_first_controls(named_scene.u)
 
@@ -378,7 +389,7 @@ def check_scenes(
         InputError: an axis varies what `set` fixes, or an axis or a control chooses the
             environment although several environments are named.
     """
-    # what the user has set in the scenes with `set`
+    # settings that the user has fixed in any scene with `set`
     fixed_settings = {
         name
         for named_scene in named_scenes
@@ -388,6 +399,7 @@ def check_scenes(
     environment_choices = list[str]()
     for axis in axes:
         setting = _find_setting(axis, controls)
+        # If `set` fixes the environment, an axis may still choose it.
         if setting == ENVIRONMENT:
             environment_choices.append(f"`grid` {axis.name}")
         elif setting in fixed_settings:
@@ -397,6 +409,7 @@ def check_scenes(
             )
     for control in controls:
         for parameter in control.parameters:
+            # A control's settings contain the parameters that it varies.
             is_varied = parameter.name in control.to_settings()
             if control.setting_name(parameter) == ENVIRONMENT and is_varied:
                 environment_choices.append(f"`controls` {control.name}")
@@ -412,31 +425,34 @@ def check_scenes(
 
 
 def _find_setting(axis: Axis, controls: Sequence[Control]) -> str:
-    """Return the name of the scene's setting that an axis varies."""
+    """Return the name of the scene's setting that an axis varies.
+
+    For example, an axis over "environment.which" varies "environment".
+    """
     control = next(
         (control for control in controls if control.name == axis.instance), None
     )
     if control is None:
-        # any value will do, since the name of the setting does not depend on it
+        # Any value of the axis is used, since the setting does not depend on it.
         settings = {"kind": axis.control, axis.parameter.name: axis.values[0]}
         control = make_control(axis.instance, settings)
     return control.setting_name(axis.parameter)
 
 
 def check_job(job: Job) -> tuple[Points, tuple[SampledNumber, ...]]:
-    """Bind every scene once, so that errors come before anything is rendered.
+    """Check a job by binding every scene, so that errors come before any rendering.
 
     Returns:
-        The points of the first scene, and the sampled numbers that tables show. If the
-        range of a number differs between scenes or image sizes, its parts are fractions
-        of the range instead of values.
+        The points of the first scene, and the sampled numbers that tables count by. If
+        the range of a number differs between scenes or image sizes, its parts are
+        fractions of the range instead of values.
 
     Raises:
         InputError: controls sample other numbers in one scene than in another.
     """
-    points_of_scene = list[tuple[NamedScene, Points]]()
+    scenes_and_points = list[tuple[NamedScene, Points]]()
     for scene, named_scene in enumerate(job.scenes):
-        points_of_scene += [
+        scenes_and_points += [
             (named_scene, points) for points in job.load_points(scene).values()
         ]
         facts = job.make_facts(named_scene, {})
@@ -444,32 +460,32 @@ def check_job(job: Job) -> tuple[Points, tuple[SampledNumber, ...]]:
             check_truth(
                 task, model, named_scene.scene, facts, job.config.image_settings
             )
-    first_points = points_of_scene[0][1]
-    for named_scene, points in points_of_scene:
+    first_points = scenes_and_points[0][1]
+    for named_scene, points in scenes_and_points:
         if points.sampled_layout != first_points.sampled_layout:
             raise InputError(
                 f"`object` {named_scene.object}: its controls draw other numbers than "
                 f"those of {job.scenes[0].object}; sweep "
                 "the two by themselves"
             )
+    # Each number has a version in each scene, whose range may be another.
+    numbers_of_scene = [points.sampled_numbers for _, points in scenes_and_points]
     sampled = [
         _merge_versions(versions, first_points.n_parts)
-        for versions in zip(
-            *(points.sampled_numbers for _, points in points_of_scene), strict=True
-        )
+        for versions in zip(*numbers_of_scene, strict=True)
     ]
     return first_points, tuple(sampled)
 
 
 def _merge_versions(versions: Sequence[SampledNumber], n_parts: int) -> SampledNumber:
-    """Return a sampled number with parts that are the same in all scenes.
+    """Return a sampled number whose parts are the same in all scenes.
 
-    A table counts predictions by the parts of its range. If the range differs between
-    scenes, the parts are fractions of the range instead of values.
+    A table counts predictions by the parts of a number's range. If the range differs
+    between scenes, the parts become fractions of the range instead of values.
 
     Args:
         versions: the number in each scene.
-        n_parts: number of equal parts of its range.
+        n_parts: number of parts of its range.
     """
     number = versions[0]
     if all(version.parts == number.parts for version in versions):
@@ -483,15 +499,17 @@ def _merge_versions(versions: Sequence[SampledNumber], n_parts: int) -> SampledN
 class SweptScene:
     """One scene, ready to be rendered and evaluated.
 
-    Models may get images of different sizes, and what a control frames may depend on
-    the size. So there are configurations, a renderer and a predictor for each size.
+    Models may get images of different sizes, and where a control places the camera may
+    depend on the size. So there are configurations, a renderer and a predictor for each
+    size.
 
     Attributes:
-        number: its index in the sweep.
-        points_of_size: its configurations, by image size.
-        renderer_of_size: its renderer, by image size.
-        problems: one for each model.
-        predictor_of_size: what predicts its images, by image size.
+        number: index of the scene in the sweep.
+        job: the job of the sweep.
+        points_of_size: configurations of the scene, by image size.
+        renderer_of_size: renderer of the scene, by image size.
+        problems: a problem for each model.
+        predictor_of_size: predictor of the scene's images, by image size.
     """
 
     def __init__(self, job: Job, number: int) -> None:
@@ -534,7 +552,7 @@ class SweptScene:
         )
 
     def _make_predictor(self, size: ImageSize) -> SweepPredictor:
-        """Return what predicts the images of a size, which models of that size share."""
+        """Return the predictor of the images of a size; all its models share it."""
         config = self.job.config
         points = self.points_of_size[size]
         first_model_of_size = self.job.image_sizes.index(size)
@@ -544,12 +562,13 @@ class SweptScene:
             axes=self.job.axes,
             seed=seeds.stream(config.seed, "sweep light", self.number),
             specialise=config.specialise,
+            # the number of images in the scenes before this one
             images_before=self.number * points.count,
         )
 
     @property
     def n_non_finite(self) -> int:
-        """Values of images that were not finite, and were set to 0."""
+        """Number of values of images that were not finite and were set to 0."""
         rendered = sum(
             renderer.non_finite for renderer in self.renderer_of_size.values()
         )
@@ -561,11 +580,11 @@ class SweptScene:
     def evaluate_all(
         self, queries: Sequence[Query], prepared: Preparation | None = None
     ) -> list[Evaluation]:
-        """Evaluate queries of neighbouring rows.
+        """Evaluate queries of consecutive rows.
 
         An image is made once for each size, and a model gets all images of the batch
-        together. The last evaluation also has the facts about the full batch: what
-        predicted its images, and how many values were not finite.
+        together. The last evaluation also has what concerns the full batch: a summary
+        of the predictors, and the number of values that were not finite.
 
         Args:
             queries: queries of this scene.
@@ -577,25 +596,28 @@ class SweptScene:
         images = {
             size: self._make_images(size, queries) for size in self.points_of_size
         }
-        judgements = self._judge(queries, images)
+        judgements = self._make_judgements(queries, images)
         # queries are numbered by image, then by model
         wrong_images = {
             row_number // n_models
             for row_number, judgement in judgements.items()
             if not judgement.right
         }
-        # Queries are evaluated together: each states an equal part of the time.
+        # Queries are evaluated together, so each gets an equal part of the time.
         seconds = (time.perf_counter() - begin) / len(queries)
         evaluations = self._make_evaluations(
             queries, images, judgements, seconds, wrong_images
         )
-        # What concerns the full batch stands in its last evaluation alone.
+        # `light` are the summaries of what predicted images by stored light.
+        # A predictor may have been released with its count, so that the difference
+        # could be negative.
+        n_new_non_finite = max(0, self.n_non_finite - not_finite_before)
         evaluations[-1] = replace(
             evaluations[-1],
             light=[
                 predictor.summarize() for predictor in self.predictor_of_size.values()
             ],
-            non_finite=max(0, self.n_non_finite - not_finite_before),
+            non_finite=n_new_non_finite,
         )
         return evaluations
 
@@ -623,11 +645,12 @@ class SweptScene:
         for query in queries:
             number, model = divmod(query.index, len(self.job.models))
             image = images[self.job.image_sizes[model]][number]
+            # Models of one size share the image: its cost counts for the first.
             cost = image.n_traced if self.job.is_first_of_size[model] else 0
             evaluation = Evaluation.from_judgement(
                 judgements[query.index],
                 cost=cost,
-                predicted=image.prediction_spp,
+                predicted=image.prediction_spp,  # 0 if the image was rendered
                 seconds=seconds,
             )
             if model == 0:
@@ -636,14 +659,15 @@ class SweptScene:
             evaluations.append(evaluation)
         return evaluations
 
-    def _judge(
+    def _make_judgements(
         self,
         queries: Sequence[Query],
         images: Mapping[ImageSize, Mapping[int, SweptImage]],
     ) -> dict[int, Judgement]:
-        """Return the judgements of all queries by their numbers.
+        """Return the judgements of all queries by the queries' indices.
 
-        The number of a query is image * models + model.
+        The index of a query is image * models + model. Judgements include metrics for
+        the claims about changed images (`_add_change_metrics`).
 
         Args:
             queries: queries of all models.
@@ -667,7 +691,7 @@ class SweptScene:
                 [query.u for query in model_queries],
                 [query.values for query in model_queries],
             )
-            judgements = self._add_claims(
+            judgements = self._add_change_metrics(
                 problem, size, model_queries, batch, judgements
             )
             for query, judgement in zip(model_queries, judgements, strict=True):
@@ -677,7 +701,9 @@ class SweptScene:
     def _attach_images(
         self, evaluation: Evaluation, query: Query, image: SweptImage, is_wrong: bool
     ) -> Evaluation:
-        """Return an evaluation of the first model with the images that are stored.
+        """Return an evaluation of the first model with the images to store.
+
+        These are a thumbnail, and layers of ground truth if the job has `aovs`.
 
         Args:
             evaluation: the evaluation without images.
@@ -699,7 +725,7 @@ class SweptScene:
             evaluation = replace(evaluation, layers=(layers, notes))
         return evaluation
 
-    def _add_claims(
+    def _add_change_metrics(
         self,
         problem: Problem,
         size: ImageSize,
@@ -709,16 +735,16 @@ class SweptScene:
     ) -> list[Judgement]:
         """Return judgements with a metric for each claim about changed images.
 
-        A claim says whether the prediction must change, or must not change, if the
-        image is changed. The name of the metric is the claim and the change, as
-        "must_change black"; it is 1 where the prediction is as claimed, else 0. The
-        ground truth stays what it was before the change.
+        A claim is that the prediction must change, or must not change, if the image is
+        changed. The name of the metric is the claim and the change, for example
+        "must_change black". The metric is 1 if the prediction meets the claim, else 0.
+        The ground truth stays what it was before the change.
 
         Args:
             problem: problem of the model.
             size: (height, width) of its images.
-            queries: n of them.
-            images: (n, H, W, 3).
+            queries: n queries.
+            images: (n, H, W, 3) images of the queries.
             judgements: judgements of the unchanged images.
         """
         judgements = list(judgements)
@@ -735,10 +761,10 @@ class SweptScene:
             for index, (before, after) in enumerate(
                 zip(judgements, changed_judgements, strict=True)
             ):
-                is_claimed = meets_claim(claim, before.prediction, after.prediction)
+                is_met = meets_claim(claim, before.prediction, after.prediction)
                 metrics = {
                     **(before.metrics or {}),
-                    f"{claim} {change}": float(is_claimed),
+                    f"{claim} {change}": float(is_met),
                 }
                 judgements[index] = replace(before, metrics=metrics)
         return judgements
@@ -746,7 +772,7 @@ class SweptScene:
     def _render_empty(self, size: ImageSize, queries: Sequence[Query]) -> Tensor:
         """Render the scene without its object, with the noise of each query.
 
-        It has a renderer of its own: after an object was hidden, a renderer gives
+        This takes a renderer of its own: a renderer whose object was hidden once gives
         images that differ in their last bits from those before.
         """
         if size not in self._empty_renderers:
@@ -838,12 +864,12 @@ class SceneLoader:
         return thumbnails.make_thumbnail(self.render_image(number))
 
     def find_features(self) -> Features:
-        """Find the layer whose features the first model decides by.
+        """Find the layer of the first model whose features decide its prediction.
 
         Raises:
             InputError: the task is not classification.
         """
-        # the truth of a classifier is the same in all configurations
+        # Only a classifier's ground truth is the same in all configurations.
         is_classification = not self.job.tasks[0].varies
         if not is_classification:
             raise InputError(
@@ -873,10 +899,10 @@ def verify_worst(
     """Render the worst configuration again, and count wrong predictions.
 
     The samples per pixel are chosen first, from an ascending list of counts (the
-    ladder): the smallest count from which on more samples no longer change the sign of
-    the margin. Then the count has converged. A ladder of a single count, which the
-    settings state, always counts as converged. Renders that the run has stored are not
-    made again.
+    ladder). The chosen count is the smallest from which on more samples no longer
+    change the sign of the margin: it has converged. If the settings state the count,
+    the ladder has only this one, which always counts as converged. Renders that the run
+    has stored are not made again.
 
     Args:
         problem: problem of its scene and model.
@@ -891,6 +917,7 @@ def verify_worst(
     if config.trials == 0:
         return None
     ladder = choose_ladder(config.verify_spp, config.pixel_sampler)
+    # `has_success` concerns what is stored: rows of a sweep state no success.
     verifier = Verifier(
         Journal(run, ParallelEvaluator(problem)), ladder, stages, has_success=False
     )
@@ -903,7 +930,7 @@ def verify_worst(
     trials = run_trials(
         verifier.evaluate_all, u, spp=spp, seed=config.seed, trials=config.trials
     )
-    # a wrong prediction is a success of an attack
+    # For an attack, a wrong prediction is a success.
     wrong_trials = [trial for trial in trials if trial.success]
     counts = Trials(len(wrong_trials), len(trials), spp)
     verified_rate = make_rate(counts, trials, wrong_trials)

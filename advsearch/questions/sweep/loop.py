@@ -1,9 +1,9 @@
-"""The loop of a sweep: evaluate every row, store and count predictions, sum up.
+"""The loop of a sweep: evaluate every row, store and count predictions, summarize.
 
-Rows are numbered by scene (with an adversarial scene, first all without it), then by
-point of the grid with its last axis fastest, then by draw, then by model. A batch
-begins at a multiple of its size, so that a sweep that was stopped, or whose batches
-come in another order, ends bit for bit as any other.
+Rows are numbered by scene (all clean scenes before the adversarial ones), then by point
+of the grid with its last axis fastest, then by draw, then by model. A batch begins at a
+multiple of its size, so that the result is bit for bit the same if a sweep is stopped
+and continued, or if its batches come in another order.
 """
 
 from __future__ import annotations
@@ -90,10 +90,10 @@ from advsearch.viewer import thumbnails
 NOT_FINITE = "pictures not finite"
 # samples per pixel of the image that is saved, unless verification needed more
 SAVED_IMAGE_SPP = 64
-ENOUGH_DRIVES = 20  # of fewer, a sweep states what they can show at best
-REPORT_SECONDS = 0.1
-MAX_LISTED_GAINS = 256  # scenes whose gains a summary lists; of more it has none
-SAMPLING_BATCH = 4096  # images whose draws are computed at once for the tables
+ENOUGH_DRIVES = 20  # with fewer, a remark states what they can show at best
+REPORT_SECONDS = 0.1  # progress is reported at most once in this time
+MAX_LISTED_GAINS = 256  # a summary of more scenes lists no gains
+SAMPLING_BATCH = 4096  # number of images whose draws are computed at once for tables
 
 
 class Sweep:
@@ -103,8 +103,8 @@ class Sweep:
         job: what is swept.
         run: the run directory, with the rows that are stored already; None keeps all
             in memory.
-        progress: reports it.
-        executor: evaluates the batches; None does so in this process.
+        progress: reports the progress.
+        executor: evaluates the batches; None evaluates them in this process.
 
     Rows are numbered by image, then by model.
 
@@ -143,13 +143,14 @@ class Sweep:
             )
         else:
             self._executor = executor
+        # The evaluator has no problem of its own, as each work item names its scene.
         self.journal = Journal(run, ParallelEvaluator(None, executor))
         self._n_rendered = 0  # images made now, by this process or its workers
         # Counts of the full sweep, from its rows: also of those made before a resume.
-        self._n_traced = 0  # images that were rendered, with those of predictors
-        self._n_predicted = 0  # images that were predicted from rendered ones
-        self._n_lost = 0  # rows whose worker died
-        # what predicted images, by worker and scene
+        self._n_traced = 0  # images that were traced, also to prepare predictors
+        self._n_predicted = 0  # images that were predicted from traced ones
+        self._n_lost = 0  # rows that have no prediction, since their worker died
+        # summaries of the predictors of images, by worker and scene
         self._transport: dict[tuple[str, int], list[LinearTransport | None]] = {}
         self._has_non_finite = (
             run is not None and run.store.read_note(NOT_FINITE) is not None
@@ -161,7 +162,7 @@ class Sweep:
         self._drives: list[DriveRates] | None = None
 
     def _write_notes(self, run: RunDirectory) -> None:
-        """Store what readers of the rows need: parts of ranges, and independent units."""
+        """Store the parts of ranges and the independent units, which readers need."""
         edges = {
             number.name: number.edges
             for number in self._sampled_numbers
@@ -170,33 +171,27 @@ class Sweep:
         run.store.write_note(EDGES_NOTE, json.dumps(edges))
         run.store.write_note(UNITS_NOTE, json.dumps(asdict(self.units)))
 
-    def execute(self, first: int | None = None) -> SweepResult:
-        """Evaluate the rows that are missing, and return the result.
-
-        Args:
-            first: evaluates all rows from this number on instead.
-        """
+    def execute(self) -> SweepResult:
+        """Evaluate the rows that are not stored yet, and return the result."""
         predictions = self._read_predictions()
         ending = FINISHED
         for warning in self.job.warnings:
             self.stages.progress.message(warning)
         try:
             with interruptible():
-                if first is not None:
-                    missing = [range(first, self.n_rows)]
-                else:
-                    missing = self._find_missing()
-                # If no row is missing, the last scene is loaded: the worst row is
-                # still verified, and the formation described.
+                missing = self._find_missing()
+                # If no row is missing, the last scene is loaded: verifying the worst
+                # row and describing the image formation need a scene.
                 first_row = missing[0].start if missing else self.n_rows - 1
                 # loaded here, so that its time counts for the stage "setup"
-                self._scenes.load(self._scene_of(first_row))
+                self._scenes.load(self._find_scene(first_row))
                 self._evaluate_rows(missing, predictions)
                 worst = self._find_worst(predictions, verify=True)
                 self._map_surface()
                 self._analyze_drives()
         except KeyboardInterrupt:
             ending = INTERRUPTED
+            # A batch may have been stored but not yet counted: so all are read again.
             predictions = self._read_predictions()
             worst = self._find_worst(predictions)
         self.stages.end()
@@ -221,7 +216,7 @@ class Sweep:
             drives.save_worst(self._scenes, self.run)
         self._drives = drives.compute_rates()
 
-    def _scene_of(self, row: int) -> int:
+    def _find_scene(self, row: int) -> int:
         """Return the index of the scene of a row."""
         return row // self.n_models // self.images_per_scene
 
@@ -234,30 +229,33 @@ class Sweep:
     def _evaluate_rows(
         self, missing: Sequence[range], predictions: Predictions
     ) -> None:
-        """Evaluate rows in batches; store and count what is predicted.
+        """Evaluate rows in batches; store and count their predictions.
 
         Args:
             missing: numbers of the rows that are not stored yet.
-            predictions: predictions so far, to which the judgement of each is added.
+            predictions: predictions so far; those of the new rows are added.
         """
         title = "rendering and classifying"
-        self.stages.begin("sweep", title, self.n_rows, hint=self._sweep_hint())
+        self.stages.begin("sweep", title, self.n_rows, hint=self._make_progress_hint())
         self.stages.progress.advance(self.n_rows - sum(map(len, missing)))
         self._sweep_begin = time.monotonic()
-        for done in self._executor.compute(self._make_batches(missing)):
-            evaluated = _pair_evaluations(done)
+        for batch in self._executor.compute(self._make_batches(missing)):
+            evaluated = _pair_evaluations(batch)
             queries = [query for query, _ in evaluated]
             self._save_images(evaluated)
-            self._add_costs(self.journal.store(evaluated, id_is_number=True))
+            # The index of a query is the number of its row.
+            stored_rows = self.journal.store(evaluated, id_is_number=True)
+            self._add_costs(stored_rows)
             # Models of one size share an image, which counts for the first of them.
             self._n_rendered += sum(
                 self.job.is_first_of_size[query.index % self.n_models]
                 for query in queries
             )
-            scene = self._scene_of(queries[0].index)
-            # What concerns a batch stands in its last evaluation.
+            scene = self._find_scene(queries[0].index)
+            # Summaries of predictors are in the last evaluation of a batch. A later
+            # batch of the same worker and scene replaces them.
             _, last_evaluation = evaluated[-1]
-            self._transport[done.worker, scene] = last_evaluation.light or []
+            self._transport[batch.worker, scene] = last_evaluation.light or []
             if any(evaluation.non_finite for _, evaluation in evaluated):
                 self._note_non_finite()
             for query, evaluation in evaluated:
@@ -266,8 +264,8 @@ class Sweep:
         # Workers may finish batches in any order.
         self.journal.rows.sort(key=lambda row: row.step)
 
-    def _sweep_hint(self) -> str:
-        """Return what the progress says of the work ahead.
+    def _make_progress_hint(self) -> str:
+        """Return the hint of the progress bar about the work ahead.
 
         That is the number of predictions, and about how much disk space the stored
         thumbnails will take: the bytes of a typical one, scaled by the number of
@@ -281,10 +279,12 @@ class Sweep:
         keep = self.job.config.keep_pictures
         if self.run is None or keep == "none":
             return hint
+        # Thumbnails are of the first model's images.
         height, width = self.job.image_sizes[0]
         # A thumbnail is at most THUMBNAIL_SIZE wide and high, and never enlarged.
         scale = min(1.0, thumbnails.THUMBNAIL_SIZE / max(height, width))
-        size_fraction = scale**2 * height * width / thumbnails.THUMBNAIL_SIZE**2
+        n_pixels = scale**2 * height * width
+        size_fraction = n_pixels / thumbnails.THUMBNAIL_SIZE**2
         n_images = self.n_rows // self.n_models
         megabytes = n_images * thumbnails.TYPICAL_BYTES * size_fraction / 1e6
         if megabytes >= 1e3:
@@ -334,13 +334,13 @@ class Sweep:
                 ]
 
     def _split_images(self, rows: range) -> Iterator[range]:
-        """Yield the images that rows are about, in batches, none over two scenes."""
+        """Yield the images of a range of rows in batches, each within one scene."""
         image = rows.start // self.n_models
         images_end = -(-rows.stop // self.n_models)  # rounded up
         while image < images_end:
             scene_begin = image // self.images_per_scene * self.images_per_scene
             scene_end = scene_begin + self.images_per_scene
-            # batches are counted in the scene
+            # Batches begin at multiples of their size, counted from the scene's begin.
             batches = split_into_batches(
                 image - scene_begin,
                 min(images_end, scene_end) - scene_begin,
@@ -368,7 +368,7 @@ class Sweep:
             values["accuracy"] = n_right / n_counted
         worker_stats = self._executor.stats
         if worker_stats is not None:
-            seconds = max(1e-9, now - self._sweep_begin)  # not divided by 0
+            seconds = max(1e-9, now - self._sweep_begin)  # no division by 0
             speed = self._n_rendered / seconds
             values |= {**worker_stats.progress_counts, "a second": speed}
         self.stages.progress.advance(self._n_unreported, **values)
@@ -393,16 +393,17 @@ class Sweep:
     def _add_costs(self, rows: Sequence[Row]) -> None:
         """Count the traced and the predicted images of rows, and the lost rows.
 
-        Models of one image size get the same image, which counts for the first of them.
+        Models of one image size share an image, which counts for the first of them.
         """
         for row in rows:
             is_first_of_size = self.job.is_first_of_size[row.step % self.n_models]
             if row.renders is not None:
-                self._n_traced += row.renders
+                self._n_traced += row.renders  # 0 for models that share an image
             elif is_first_of_size:  # rows of old versions don't state their renders
                 self._n_traced += 1
-            # A predicted image has no noise of its own, and so no seed.
-            if row.seed is None and is_first_of_size:
+            # Only a rendered image has a seed, that of its noise.
+            was_predicted = row.seed is None
+            if was_predicted and is_first_of_size:
                 self._n_predicted += 1
             if row.label == LOST_LABEL:
                 self._n_lost += 1
@@ -411,8 +412,8 @@ class Sweep:
         """Return the axes by whose values tables count predictions.
 
         These are object, environment, photograph, clean or adversarial scene, model,
-        the axes of the grid, and the sampled numbers, whose ranges are cut into parts.
-        What has a single value in this sweep is left out.
+        the axes of the grid, and the sampled numbers, whose ranges are divided into
+        parts. Axes with a single value are left out.
 
         Args:
             rows: (n,) numbers of the rows, ascending, whose values are looked up.
@@ -421,9 +422,9 @@ class Sweep:
         scene, image_in_scene = np.divmod(image, self.images_per_scene)
         model_names = [network.name for network in self.job.models]
         axes = [
-            *self._scene_axes(scene),
+            *self._make_scene_axes(scene),
             TableAxis("model", "", model_names, value_index=model),
-            *self._grid_axes(image_in_scene),
+            *self._make_grid_axes(image_in_scene),
         ]
         if self._sampled_numbers and len(rows):
             parts = self._find_parts(image)  # (n, k)
@@ -441,7 +442,7 @@ class Sweep:
             ]
         return [axis for axis in axes if len(axis.values) > 1]
 
-    def _scene_axes(self, scene: npt.NDArray[np.int64]) -> Iterator[TableAxis]:
+    def _make_scene_axes(self, scene: npt.NDArray[np.int64]) -> Iterator[TableAxis]:
         """Yield the axes over scenes: object, environment, photograph, arm.
 
         Args:
@@ -455,10 +456,15 @@ class Sweep:
             index_of_scene = np.array([values.index(value) for value in scene_values])
             yield TableAxis(name, "", values, index_of_scene[scene])
 
-    def _grid_axes(self, image: npt.NDArray[np.int64]) -> list[TableAxis]:
-        """Return the axes of the grid; `image` (n,) is numbered in the scene."""
+    def _make_grid_axes(self, image: npt.NDArray[np.int64]) -> list[TableAxis]:
+        """Return the axes of the grid.
+
+        Args:
+            image: (n,) number of the image of each row, in its scene.
+        """
         if not self.job.axes:
             return []
+        # The samples of a grid point are consecutive images.
         grid_point = image // self.job.samples
         indices = np.unravel_index(grid_point, self.points.grid.sizes)
         return [
@@ -466,17 +472,17 @@ class Sweep:
                 name=axis.name,
                 unit=axis.unit,
                 values=axis.values,
-                value_index=value_of_row,
+                value_index=value_indices,
                 kind="grid",
             )
-            for axis, value_of_row in zip(self.job.axes, indices, strict=True)
+            for axis, value_indices in zip(self.job.axes, indices, strict=True)
         ]
 
     def _find_parts(self, images: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """Return the part of each of k sampled numbers that images lie in, (n, k).
+        """Return the index of the part that each of k sampled numbers is in, (n, k).
 
-        The parts of all images up to the last one are computed, in batches: a draw
-        follows from the number of its image, and neighbouring ones are drawn together.
+        They are computed for all images up to the last one, in batches, since
+        consecutive draws are computed together.
 
         Args:
             images: (n,) their numbers in the sweep, ascending, at least one.
@@ -491,16 +497,16 @@ class Sweep:
         return np.asarray(np.concatenate(parts)[images])
 
     def _find_worst(
-        self, predictions: Predictions, verify: bool = False
+        self, predictions: Predictions, *, verify: bool = False
     ) -> WorstConfiguration | None:
         """Return the configuration with the smallest margin; None if there is none.
 
-        The stored row of the configuration has the margin. Values, seed and right
-        labels come from the query, which follows from the number of the row.
+        What the sweep predicted (`claimed`) comes from the stored row. Values, seed and
+        right labels come from the query, which follows from the number of the row.
 
         Args:
             predictions: predictions of all rows.
-            verify: also renders it again, and saves its image.
+            verify: whether to render it again, and save its image.
         """
         row_number = predictions.worst_row
         if row_number is None:
@@ -508,8 +514,8 @@ class Sweep:
         row = self._read_row(row_number)
         image, model = divmod(row_number, self.n_models)
         queries_of_image = self.job.make_queries(range(image, image + 1))
-        _, _, query = queries_of_image[model]
-        scene = self._scene_of(row_number)
+        _, _, query = queries_of_image[model]  # an item ends with its query
+        scene = self._find_scene(row_number)
         worst = WorstConfiguration(
             configuration=row_number,
             values={
@@ -518,7 +524,7 @@ class Sweep:
             },
             seed=query.seed,
             label_set=self._find_right_labels(scene, model, query),
-            claimed=_to_claim(read_judgement(row)),
+            claimed=_make_claim(read_judgement(row)),
             verified=None,
         )
         if not verify:
@@ -559,10 +565,13 @@ class Sweep:
         if self.run is None:
             return worst.model_copy(update={"verified": verified})
         verified_spp = verified.spp if verified else 0
-        image = problem.picture(u, worst.seed, max(SAVED_IMAGE_SPP, verified_spp))
+        saved_spp = max(SAVED_IMAGE_SPP, verified_spp)
+        image = problem.picture(u, worst.seed, saved_spp)
         self.run.save_image("worst", image)
+        # a second file, with the marks of the task, such as boxes
         save_with_marks(self.run, "worst", image, problem.find_marks(image, u))
-        image_claim = _to_claim(problem.judge(image, u))
+        # With more samples per pixel, the prediction may be another.
+        image_claim = _make_claim(problem.judge(image, u))
         return worst.model_copy(update={"verified": verified, "pictured": image_claim})
 
     def _finish(
@@ -588,7 +597,7 @@ class Sweep:
     def _summarize(
         self, predictions: Predictions, ending: str, worst: WorstConfiguration | None
     ) -> SweepSummary:
-        """Return what `summary.json` holds.
+        """Return the summary, which is stored as `summary.json`.
 
         Args:
             predictions: predictions of all rows so far.
@@ -598,6 +607,7 @@ class Sweep:
         job = self.job
         config = job.config
         path = None if self.run is None else self.run.path
+        # the rate of wrong predictions in fresh renders
         verified = worst.verified if worst else None
         formation, gains = self._describe_formation()
         changes = self._compute_change_rates()
@@ -619,7 +629,10 @@ class Sweep:
                 self.stages.seconds.get("sweep", 0.0)
             ),
             seconds={**self.stages.seconds, "total": self.stages.total},
-            warnings=[*job.warnings, *self._remarks(predictions, verified, changes)],
+            warnings=[
+                *job.warnings,
+                *self._list_remarks(predictions, verified, changes),
+            ],
             command_line=config.command_line(path),
             python_only=config.python_only,
             twins=self._find_twins(),
@@ -648,13 +661,14 @@ class Sweep:
 
     def _summarize_predictions(self, predictions: Predictions) -> dict[str, Any]:
         """Return the fields of a summary that count the predictions of all rows so far."""
-        # Rates count these rows. Their intervals count independent units instead: the
-        # frames of a drive, say, are not independent, and belong to one unit.
+        # Accuracies count rows. Their intervals count independent units: the frames of
+        # a drive, for example, are not independent, and are one unit.
         rows = np.flatnonzero(predictions.is_counted)
         right = predictions.is_right[rows]
         units = self.units.find_unit(rows)
         outcome = predictions.outcome[rows]
         axes = self._make_axes(rows)
+        # If every row is a unit, the summary states no number of units.
         has_shared_units = self.units.size > 1 and len(units) > 0
         return {
             **vars(count_by_unit(right, units, outcome)),
@@ -670,7 +684,7 @@ class Sweep:
 
     @property
     def _environment(self) -> str:
-        """Name of the environments: those that a control chooses, or the settings'."""
+        """Names of the environments: those a control chooses, or those of settings."""
         return self.points.environment or self.job.config.environment_name
 
     def _find_twins(self) -> TwinEvidence | None:
@@ -692,13 +706,15 @@ class Sweep:
     def _describe_formation(self) -> tuple[Formation | None, dict[str, float]]:
         """Return how images are formed, and the gain of each scene by its names.
 
-        The gain is the factor of exposure on linear pixel values. The formation states
-        it if all scenes have the same. With more than `MAX_LISTED_GAINS` scenes, no
-        gains are returned. If no scene was loaded, the formation is None.
+        The gain is the factor of exposure on linear pixel values. If all scenes have
+        the same gain, the formation states it. With more than `MAX_LISTED_GAINS`
+        scenes, there are no gains, and the formation states none either. If no scene
+        was loaded, the formation is None.
         """
         gains: dict[str, float] = {}
         if self._scenes.scene is None:
             return None, gains
+        # Formations of other sizes differ only in the resolution.
         renderer = next(iter(self._scenes.scene.renderer_of_size.values()))
         formation = Formation.from_values(renderer.formation)
         if len(self.job.scenes) <= MAX_LISTED_GAINS:
@@ -708,14 +724,15 @@ class Sweep:
                 )
                 names = dict(named_scene.names)
                 # The adversarial scene has the gain of its clean scene.
-                names.pop("answer", None)
+                names.pop("answer", None)  # the name of the arm
                 gains[", ".join(names.values())] = description.gain
         if len(set(gains.values())) != 1:
             formation = formation.model_copy(update={"gain": None})
         return formation, gains
 
     def _compare_arms(self, predictions: Predictions) -> ArmComparison | None:
-        """Compare the scenes without and with an adversarial configuration."""
+        """Compare the clean scenes with the adversarial ones; None without any."""
+        # The adversarial scenes come last.
         adversarial = self.job.scenes[-1].arm
         if not adversarial:
             return None
@@ -732,12 +749,12 @@ class Sweep:
         return renders
 
     def _combine_transport(self) -> LinearTransport | None:
-        """Return what predicted the images, over all workers and scenes."""
+        """Return the summary of predicted images, over all workers and scenes."""
         transport = [
             summary for summaries in self._transport.values() for summary in summaries
         ]
-        # A continued sweep may have no batch left to evaluate: then the predictors of
-        # the loaded scene say what they would do.
+        # A continued sweep may have had no batch left to evaluate. Then the predictors
+        # of the loaded scene state what they would do.
         if not self._transport and self._scenes.scene is not None:
             predictors = self._scenes.scene.predictor_of_size.values()
             transport = [predictor.summarize() for predictor in predictors]
@@ -750,11 +767,12 @@ class Sweep:
         return self._n_rendered / sweep_seconds
 
     def _compute_change_rates(self) -> list[ChangeRates]:
-        """Return how often the predictions about changed images are as claimed.
+        """Return how often predictions about changed images meet each claim.
 
-        A claim says that the prediction must change, or must not change, if the image
-        is changed in some way. Each row has a metric for it, 1 where it holds. There is
-        a rate for each claim, change and model. Rows without the object do not count.
+        A claim is that the prediction must change, or must not change, if the image is
+        changed in some way, for example `must_change` with the object hidden. Each row
+        has a metric for it: 1 if its prediction meets the claim, else 0. There is a
+        rate for each claim, change and model. Rows without the object do not count.
         """
         rates = list[ChangeRates]()
         for claim, change in self.job.config.claims:
@@ -776,53 +794,54 @@ class Sweep:
         claim: str,
         change: str,
     ) -> ChangeRates:
-        """Return how often the predictions of a model are as claimed.
+        """Return how often the predictions of a model meet a claim.
 
-        The returned `row` is the first row in which the prediction is not as claimed.
+        The returned `row` is the first row whose prediction does not meet it.
 
         Args:
-            value_of_row: the claim's metric by the number of the row, 1 where it holds.
+            value_of_row: the claim's metric by the number of the row: 1 if the
+                prediction meets the claim, else 0.
             model: index of the model.
-            claim: name of the claim.
-            change: name of the change of the image.
+            claim: name of the claim, such as "must_change".
+            change: name of the change of the image, such as "black".
         """
         rows = np.array(
             [row for row in value_of_row if row % self.n_models == model],
             dtype=np.int64,
         )
-        is_claimed = np.array(
+        is_met = np.array(
             [value_of_row[row] == 1.0 for row in rows.tolist()], dtype=bool
         )
-        violations = rows[~is_claimed]
+        violations = rows[~is_met]
         return ChangeRates(
-            **vars(count_by_unit(is_claimed, self.units.find_unit(rows))),
+            **vars(count_by_unit(is_met, self.units.find_unit(rows))),
             model=self.job.models[model].name,
             claim=claim,
             when=change,
             row=int(violations[0]) if len(violations) else None,
         )
 
-    def _remarks(
+    def _list_remarks(
         self,
         predictions: Predictions,
         verified: WorstVerified | None,
         changes: Sequence[ChangeRates],
     ) -> Iterator[str]:
-        """Yield sentences about what limits the result, and what stands out in it.
+        """Yield remarks that limit the result, or state what is unusual in it.
 
         Args:
             predictions: predictions of all rows so far.
-            verified: trials of the worst configuration; None without them.
-            changes: how often predictions about changed images are as claimed.
+            verified: fresh renders of the worst configuration; None without them.
+            changes: how often predictions about changed images meet the claims.
         """
         yield from make_lost_remarks(self._n_lost)
         yield from self.journal.remarks
+        # `noise` is the number of images of a draw, which differ only in noise.
         if self.units.noise > 1 and self.units.photographs == 1:
-            yield explain_repeats(
-                self.units.name, self.units.noise, self.n_rows // self.units.size
-            )
-        yield from self._drive_remarks()
-        yield from self._prediction_remarks(predictions)
+            n_units = self.n_rows // self.units.size
+            yield explain_repeats(self.units.name, self.units.noise, n_units)
+        yield from self._list_drive_remarks()
+        yield from self._list_prediction_remarks(predictions)
         if self._has_non_finite:
             yield "Some values of pictures were not finite and were set to 0."
         if verified and not verified.converged:
@@ -833,10 +852,11 @@ class Sweep:
             )
         for rates in changes:
             upper_bound = rates.interval[1] if rates.interval is not None else 1.0
-            # All predictions should change when the object is hidden. If the 95 %
+            # All predictions should change if the object is hidden. If the 95 %
             # interval lies below one half, most of them do not.
             is_blind = rates.claim == "must_change" and upper_bound < 0.5
             if is_blind:
+                # `correct` counts the predictions that changed.
                 n_same = rates.configurations - rates.correct
                 yield (
                     f"{rates.model} says the same in {n_same} of "
@@ -844,17 +864,17 @@ class Sweep:
                     "not be looking at the object."
                 )
 
-    def _drive_remarks(self) -> Iterator[str]:
-        """Yield what few drives can show at best.
+    def _list_drive_remarks(self) -> Iterator[str]:
+        """Yield a remark on what few drives can show at best.
 
         The sentence states the lower bound of the accuracy that so few drives would
         have even if every frame were right.
         """
-        # drives of the model that has the fewest; without any drives nothing is yielded
+        # The model with the fewest drives counts. Without drives nothing is yielded.
         n_drives = min(
             (rates.drives for rates in self._drives or ()), default=ENOUGH_DRIVES
         )
-        # repeats of one drive have a remark of their own, from `explain_repeats`
+        # `explain_repeats` has a remark on repeats of one drive.
         is_repeated = self.units.noise > 1
         if n_drives == 1 and not is_repeated:
             yield "One drive says nothing of others: there is no interval over drives."
@@ -866,11 +886,13 @@ class Sweep:
                 f"that share would begin at {100 * lower_bound:.0f} %."
             )
 
-    def _prediction_remarks(self, predictions: Predictions) -> Iterator[str]:
-        """Yield sentences about predictions that do not count, or not as right."""
+    def _list_prediction_remarks(self, predictions: Predictions) -> Iterator[str]:
+        """Yield remarks on predictions that do not count, or do not count as right."""
         n_hidden = int(predictions.is_hidden.sum())
         if n_hidden:
+            # Each model's prediction counts as a picture here.
             images = format_count(int(predictions.is_known.sum()), "picture")
+            # predictions that find an object of which nothing is in the image
             n_phantoms = predictions.n_phantoms_out_of_view
             phantoms = ""
             if n_phantoms:
@@ -894,18 +916,18 @@ def _get_names(items: Iterable[Any]) -> list[str]:
     return [item.name for item in items]
 
 
-def _pair_evaluations(done: BatchResult) -> list[tuple[Query, Evaluation]]:
+def _pair_evaluations(batch: BatchResult) -> list[tuple[Query, Evaluation]]:
     """Return the queries of a batch with their evaluations.
 
     Evaluations state the machine that made them. If the worker of the batch died, they
     state that the evaluation is lost.
     """
-    queries = [query for *_, query in done.items]
-    evaluations = done.value
-    if done.lost:
-        evaluations = [make_lost_evaluation(query, done.lost) for query in queries]
+    queries = [query for _, _, query in batch.items]
+    evaluations = batch.value
+    if batch.lost:  # the reason, as a text
+        evaluations = [make_lost_evaluation(query, batch.lost) for query in queries]
     return [
-        (query, replace(evaluation, machine=done.machine))
+        (query, replace(evaluation, machine=batch.machine))
         for query, evaluation in zip(queries, evaluations, strict=True)
     ]
 
@@ -921,14 +943,14 @@ def _make_axis_rows(
     Args:
         axes: axes of the tables.
         right: (n,) whether each prediction is right.
-        units: (n,) the independent unit of each.
-        outcome: (n,) indices among `result.OUTCOMES`.
+        units: (n,) the independent unit of each prediction.
+        outcome: (n,) index of each outcome in `result.OUTCOMES`.
     """
     return [row for axis in axes for row in axis.make_rows(right, units, outcome)]
 
 
-def _to_claim(judgement: Judgement) -> WorstClaim:
-    """Return what a result holds of the prediction in one image."""
+def _make_claim(judgement: Judgement) -> WorstClaim:
+    """Return what a result states about the prediction in one image."""
     return WorstClaim(
         **vars(judgement.prediction),
         margin=judgement.margin,

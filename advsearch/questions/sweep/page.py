@@ -1,8 +1,8 @@
 """The page of sweeps: still images and tables that need no script, and the explorer.
 
 The same page is a file that needs no other (`write_sweep_page`), a page of `advsearch
-dashboard`, and one of a directory that any web server serves: only where its rows and
-images come from differs (`SweepSource`).
+dashboard`, and a page of a directory that any web server can serve. These differ only
+in where rows and images come from (`SweepSource`).
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MAX_EMBEDDED_BYTES = 3_000_000
-"""Bytes of thumbnails in a page that needs no other file, at most; the worst
-predictions first.
+"""Maximum number of bytes of thumbnails in a page that needs no other file. Those of
+the worst predictions come first.
 """
-# in such a page; more are for `advsearch dashboard`
+# Maximum number of rows in such a page; `advsearch dashboard` shows more.
 MAX_EMBEDDED_ROWS = 200_000
 
 
@@ -66,13 +66,13 @@ class SweepSource:
 
     Attributes:
         name: name of the run.
-        rows: as columns, for a page that needs no other file, or the address they are
-            fetched from; None if they are too many for such a page, which then has the
-            tables only.
+        rows: the rows as columns, for a page that needs no other file; or the address
+            from which they are fetched. None if they are too many for the page, which
+            then has only tables.
         is_partial: whether the rows are fetched in parts (``?after=ID``), as those of a
-            sweep that goes on.
-        thumbnails: the thumbnails.
-        thumbnail_address: address of the thumbnails; None puts them into the page.
+            sweep that has not ended.
+        thumbnails: the thumbnails of the images.
+        thumbnail_address: address of the thumbnails; None embeds them in the page.
     """
 
     name: str
@@ -83,7 +83,7 @@ class SweepSource:
 
     @property
     def is_embedded(self) -> bool:
-        """Whether the page has the rows in itself."""
+        """Whether the rows are in the page itself, and not at an address."""
         return self.rows is not None and not isinstance(self.rows, str)
 
 
@@ -115,7 +115,8 @@ def make_page(
     Args:
         run: the run directory.
         summary: summary of the sweep.
-        columns: its rows; None reads them. The page has them unless they are too many.
+        columns: its rows; None reads them. The page contains them unless they are too
+            many.
     """
     columns = read_columns(run) if columns is None else columns
     rows = columns if len(columns) <= MAX_EMBEDDED_ROWS else None
@@ -129,12 +130,14 @@ def make_sweep_page(
     """Return the page of sweeps.
 
     Args:
-        runs: directory and summary of each; None without a summary yet.
-        sources: rows and thumbnails of each, which the explorer reads.
+        runs: directory and summary of each run; the summary is None if there is none
+            yet.
+        sources: rows and thumbnails of each run, which the explorer reads.
     """
+    # The explorer leaves out runs with too many rows.
     explored = [
-        (source, *run)
-        for source, run in zip(sources, runs, strict=True)
+        (source, path, summary)
+        for source, (path, summary) in zip(sources, runs, strict=True)
         if source.rows is not None
     ]
     descriptions, embedded_rows, image_notes = _describe_runs(explored)
@@ -148,8 +151,8 @@ def make_sweep_page(
     explorer = make_element("div", id="explorer", hidden="hidden")
     if not explored:
         explorer = _too_many_rows_html(runs)
-    # An address of rows or images is fetched by the page's script, which the security
-    # policy of the page has to allow.
+    # The page's script fetches rows or images from an address. The security policy of
+    # the page has to allow that.
     needs_connection = any(
         isinstance(source.rows, str) or source.thumbnail_address for source in sources
     )
@@ -169,7 +172,8 @@ def _describe_runs(
     """Return what the explorer reads of runs: descriptions, rows, and notes on images.
 
     A description has either "embedded", the id of the element with the rows, or "rows",
-    their address. Notes say which images the page leaves out.
+    their address. Its "parts" states whether rows are fetched in parts. Notes state
+    which images the page leaves out.
     """
     descriptions = list[JsonObject]()
     embedded_rows = list[Html]()
@@ -204,7 +208,7 @@ def _describe_images(
 ) -> tuple[JsonObject, Html | None]:
     """Describe for the explorer where the thumbnails of a sweep are.
 
-    They are in a folder beside the page, or embedded in it. A page embeds only as many
+    They are in a folder next to the page, or embedded in it. A page embeds only as many
     as fit.
 
     Args:
@@ -214,14 +218,16 @@ def _describe_images(
     Returns:
         The description; and a note if some are left out, else None.
     """
+    # Several configurations share an image: one for each model.
     images: JsonObject = {"models": thumbnails.configurations_per_image}
     if source.thumbnail_address is not None:
         images["folder"] = source.thumbnail_address
         images["suffix"] = "jpg"
+        # the numbers of the stored images; None if all are stored
         images["kept"] = [*thumbnails.numbers] if thumbnails.is_subset else None
         return images, None
     if not source.is_embedded:
-        return images, None
+        return images, None  # neither an address nor rows: the images are not shown
     embedded: JsonObject = dict(
         thumbnails.list_data_urls(source.rows, MAX_EMBEDDED_BYTES)
     )
@@ -237,7 +243,7 @@ def _describe_images(
 
 
 def _page_parts_html(path: Path, summary: SweepSummary) -> list[Html | None]:
-    """Return what only a page shows of a sweep, and how its result came about."""
+    """Return the parts that only a page shows, and its end: how to repeat the run."""
     view = make_view(summary)
     page_parts = [
         part for part in view.sections if part.only == "page" and not part.is_empty
@@ -249,12 +255,12 @@ def _page_parts_html(path: Path, summary: SweepSummary) -> list[Html | None]:
 
 
 def _describe_for_explorer(run: Path, summary: SweepSummary | None) -> JsonObject:
-    """Return what the page's explorer of rows has to know of a sweep.
+    """Return what the explorer of rows needs to know about a sweep.
 
-    That is the task, the axes of the grid, and height and width of the evaluated images
-    in pixels, which are the units of boxes. With several models there is no size, since
-    they may differ in it. A sweep without a summary yet has the task only, if its
-    settings can be read.
+    That is the task, the axes of the tables, and height and width of the evaluated
+    images in pixels, which are the units of boxes. With several models there is no
+    size, since it may differ between them. If there is no summary yet, only the task
+    is returned, or nothing if the settings cannot be read.
 
     Args:
         run: the run directory.
@@ -265,7 +271,7 @@ def _describe_for_explorer(run: Path, summary: SweepSummary | None) -> JsonObjec
             task = read_yaml(run / directory.CONFIG).get("task")
             name = task.get("name") if isinstance(task, Mapping) else task
             return {"task": str(name).partition("=")[0]}
-        return {}
+        return {}  # reading the settings failed
     formation = summary.image_formation
     size = None
     has_single_model = "," not in summary.model
@@ -304,7 +310,7 @@ def _header_html(runs: Sequence[tuple[Path, SweepSummary | None]]) -> Html:
 
 
 def _too_many_rows_html(runs: Sequence[tuple[Path, SweepSummary | None]]) -> Html:
-    """Return what replaces the explorer in a file that would have too many rows."""
+    """Return a note in place of the explorer, for a page with too many rows."""
     names = [directory.format_run_name(path) for path, _ in runs]
     command = shlex.join(["advsearch", "dashboard", *names])
     counts = ", ".join(
@@ -346,7 +352,7 @@ def verdict_text(summary: SweepSummary) -> str:
 
 
 def _still_html(path: Path, summary: SweepSummary) -> Html:
-    """Return what a page without a script shows in the explorer's place.
+    """Return the images that a page shows in place of the explorer without a script.
 
     These are the figure of the accuracy and the worst image, if the run has them. If no
     cell of the map has two configurations, the figure shows the margin instead.
@@ -356,13 +362,17 @@ def _still_html(path: Path, summary: SweepSummary) -> Html:
         summary: summary of the sweep.
     """
     measure = "Accuracy"
-    if summary.cells and max(map(max, summary.cells.configurations)) <= 1:
-        measure = "Margin"
+    if summary.cells:
+        max_configurations = max(map(max, summary.cells.configurations))
+        if max_configurations <= 1:  # see `display._draw_map`
+            measure = "Margin"
+    # The figure shows the first two axes.
     axis_names = list(dict.fromkeys(row.axis for row in summary.axes))
     axes = " and ".join(axis_names[:2]) or "all configurations"
     figure = _figure_html(path / "images" / "sweep.png", f"{measure} over {axes}.")
     worst = _figure_html(path / "images" / "worst.png", _worst_caption(summary))
     return join_html(
+        # The page's script hides elements with this attribute.
         make_element("div", figure, class_="pictures", data_still="true")
         if figure
         else None,
@@ -380,7 +390,7 @@ def _worst_caption(summary: SweepSummary) -> str:
         f"{name} {wording.format_number(described.value)}"
         for name, described in worst.values.items()
     )
-    # the prediction about the saved image, or about the image of the sweep
+    # the prediction about the saved image, or else the one of the sweep
     claim = worst.pictured or worst.claimed
     text = f"{values}: the model predicts {format_prediction(summary.task, claim)}"
     rate = worst.verified
@@ -462,26 +472,29 @@ def write_bundle(runs: Sequence[Path], folder: Path) -> Path:
 def _write_part_pages(run: Path, folder: Path) -> None:
     """Write the pages of the parts of a run, which its own page links to.
 
-    Pages are made anew: what lies in the run may be anybody's.
+    Their HTML is made again from their results: a stored page could contain anything.
 
     Args:
         run: run directory, whose parts are runs with results of their own.
         folder: folder of the bundle.
     """
+    # The stored pages are used only to find the parts.
     for file in sorted((run / directory.PARTS).glob(f"*/{directory.REPORT}")):
         html = make_run_page(file.parent, read_result(file.parent))
         write_text(folder / file.relative_to(run), html)
 
 
 def _write_source(run: Path, index: int, folder: Path) -> SweepSource:
-    """Write rows and thumbnails of a sweep into the directory of a bundle.
+    """Write thumbnails of a sweep, and rows if they are many, into a bundle.
 
     Args:
         run: the run directory.
         index: index of the sweep in the bundle.
-        folder: folder of the bundle.
+        folder: directory of the bundle.
     """
-    # A page that was opened by a double click may load images from files, but no rows.
+    # A page that is opened as a file, without a server, may load images from other
+    # files, but no rows. So rows are embedded in the page, unless they are too many:
+    # then the page needs a server.
     columns = read_columns(run)
     rows: pd.DataFrame | str = columns
     if len(columns) > MAX_EMBEDDED_ROWS:

@@ -1,11 +1,11 @@
 """Predictors of the images of a sweep.
 
-A predictor serves a *group*: images of a sweep that differ in one respect only. Where
-they differ in light alone, they are combined from basis images (docs/transport.md);
-where they differ in the camera alone, they are made from light on surfaces
-(docs/surface-light.md). Some images are traced for comparison; where predicted ones
-deviate too much, the group is rendered. A predictor follows from its group alone, so
-that a sweep that was stopped continues with the same one.
+A predictor serves a *group*: images of a sweep that differ in one respect only. If they
+differ only in light, they are combined from basis images (docs/transport.md). If they
+differ only in the camera, they are made from light on surfaces (docs/surface-light.md).
+Some images are traced for comparison; if predicted ones deviate too much, the group is
+rendered. A predictor depends only on its group, so that a sweep that was stopped
+continues with the same one.
 """
 
 from __future__ import annotations
@@ -62,13 +62,13 @@ from advsearch.scene.transport.matrix import COLLECTED_SPP
 from advsearch.trust.stored_files import scale_limit
 
 MIN_SAVING_FACTOR = 2.0
-"""A group is predicted if rendering it takes this many times the samples of a
-prediction, comparisons included.
+"""A group is predicted if rendering it takes at least this many times the samples of a
+prediction, including the comparisons.
 """
 
 
 class Groups:
-    """How the images of a scene fall into groups that one predictor serves.
+    """Divides the images of a scene into groups, each of which one predictor serves.
 
     Images of a group differ along some axes, those *within* groups, and have the same
     index along the others, those *between* groups.
@@ -76,18 +76,18 @@ class Groups:
     Args:
         grid: grid of the sweep.
         samples: number of samples at each point of the grid.
-        within: whether images of a group may differ along each axis of the grid.
-        is_sampled: whether they may differ in what is sampled. If not, they differ
-            along no axis but `frames`, since other images have other draws.
+        within: for each axis of the grid, whether images of a group may differ along
+            it.
+        is_sampled: whether images of a group may differ in what is sampled. If not,
+            they differ along no axis but `frames`, since other images have other draws.
         frames: the index of the axis with the frames of a drive, which have one draw;
             None without a drive.
 
     Attributes:
         group_size: number of images of a group.
         n_groups: number of groups.
-        n_cached_groups: number of groups that have to be cached so that no predictor is
-            made twice, when images come in order: 1 if the images of a group follow
-            each other.
+        n_alternating_groups: number of groups to cache so that no predictor is made
+            twice if images come in order: 1 if the images of a group follow each other.
     """
 
     def __init__(
@@ -103,27 +103,29 @@ class Groups:
         self.samples = samples
         # Samples are like one more axis, the last and fastest.
         self._all_axes = ProductIndex((*grid.sizes, samples))
-        # Along an axis the draws change, except from one frame of a drive to the next.
+        # From one index of an axis to the next, the draws change, except between the
+        # frames of a drive. So if images of a group may not differ in the draws, they
+        # differ along no axis but that of the frames.
         axis_is_within = [
             may_differ and (is_sampled or axis == frames)
             for axis, may_differ in enumerate(within)
         ]
-        self._is_within = (*axis_is_within, is_sampled)
+        self._is_within = (*axis_is_within, is_sampled)  # the last is that of samples
         within_sizes = self._select(self._all_axes.sizes, is_within=True)
         between_sizes = self._select(self._all_axes.sizes, is_within=False)
         self._within = ProductIndex(tuple(within_sizes))
         self._between = ProductIndex(tuple(between_sizes))
         self.group_size = self._within.count
         self.n_groups = self._between.count
-        self.n_cached_groups = self._count_cached_groups()
+        self.n_alternating_groups = self._count_alternating_groups()
 
-    def _count_cached_groups(self) -> int:
+    def _count_alternating_groups(self) -> int:
         """Return how many groups alternate when images come in order.
 
         The last axis is the fastest. If an axis between groups comes after an axis
-        within groups, the sweep visits all groups along it, and then comes back to the
-        first one. Example: with axes (light 10, pose 3), where images of a group differ
-        in light, 3 groups alternate; with (pose 3, light 10) it is 1.
+        within groups, the images visit all groups along it, and then come back to the
+        first one. For example, let the images of a group differ in light. With the axes
+        (light 10, pose 3), 3 groups alternate; with (pose 3, light 10) it is 1.
         """
         n_groups = 1
         was_axis_within = False
@@ -151,16 +153,16 @@ class Groups:
         return self._between.index(self._select(digits, is_within=False))
 
     def find_member(self, number: int, index: int) -> int:
-        """Return the number of a member of the group that an image belongs to.
+        """Return the number of an image of the same group, by its index in the group.
 
-        Image and member have the same index along every axis between groups. The index
-        of the member counts the axes within the group, the last one fastest.
+        Both images have the same index along every axis between groups. The index in
+        the group counts along the axes within groups, the last one fastest.
 
         Args:
-            number: number of the image.
-            index: index of the member in the group, in [0, group_size).
+            number: number of any image of the group, in the scene.
+            index: index in the group of the image to find, in [0, group_size).
         """
-        # the digits of a number are its indices along the axes
+        # The digits of a number are the indices along the axes (mixed radix).
         member_digits = list(self._all_axes.digits(number))
         within_axes = [
             axis for axis, is_within in enumerate(self._is_within) if is_within
@@ -171,30 +173,35 @@ class Groups:
 
 
 MakeGroups = Callable[[frozenset[str]], Groups]
-"""Makes the groups whose images may differ in some groups of coordinates
-(`control.parameter`).
+"""Returns the groups whose images may differ in the named parameters, each given as
+"control.parameter", and in no others.
 """
 
 
 class BasisPictures:
-    """Predicts the images of a scene at one size by a basis image of each light.
+    """Predicts images at one size of a scene by a basis image of each light.
+
+    Images of a group differ only in the strength of lights: they are weighted sums of
+    the basis images.
 
     Attributes:
-        follows: groups of coordinates in which the images of a group may differ.
-        moves: whether one of these changes more than the finished image.
+        parameters: names (control.parameter) of the parameters in which images of a
+            group may differ.
+        changes_scene: whether a parameter among these changes more than the finished
+            image, as exposure does.
     """
 
     name = "basis pictures"
     samples = COLLECTED_SPP
-    """Samples per pixel of what predicts."""
+    """Samples per pixel of a basis image."""
     bytes = 0
-    """Memory of what groups share."""
+    """Memory that groups share."""
 
     def __init__(self, renderer: Renderer, seed: int) -> None:
         self._renderer = renderer
         self._lighting = find_lighting(renderer)
-        self.follows = frozenset(self._lighting.groups)
-        self.moves = any(self._lighting.groups.values())
+        self.parameters = frozenset(self._lighting.groups)
+        self.changes_scene = any(self._lighting.groups.values())
 
     def find_refusal(self, make_groups: MakeGroups, spp: int) -> Refusal | None:
         """Return why images are rendered; None if they are predicted.
@@ -203,20 +210,22 @@ class BasisPictures:
         samples that rendering a group takes, and if the basis images fit into memory.
 
         Args:
-            make_groups: makes the groups.
+            make_groups: returns the groups whose images differ in some parameters.
             spp: samples per pixel of the images.
         """
         renderer = self._renderer
-        groups = make_groups(self.follows)
+        groups = make_groups(self.parameters)
         if renderer.formation.denoiser != "oidn":
-            return NOISE
+            return NOISE  # an image that is not denoised has noise to be reproduced
         # The number of lights is the same in all configurations: take the first one.
         inputs = renderer.scene.assembly(renderer.space.inputs(renderer.start))
         n_lights = len(LightBasis(renderer, self._lighting, inputs).inputs_of_light)
-        # A basis image for each light, and `N_VIEWS` comparisons with traced images.
-        # For each, two halves are traced to estimate the noise, and one as images are.
+        # All numbers of samples are per pixel. There is a basis image for each light,
+        # and `N_VIEWS` images are compared with traced ones. For each of these, two
+        # halves are traced to estimate the noise, and one image with `spp`.
         basis_samples = n_lights * COLLECTED_SPP
         prediction_samples = basis_samples + N_VIEWS * (2 * CHECK_SPP + spp)
+        # Rendering a group takes `spp` for each image.
         min_images = math.ceil(MIN_SAVING_FACTOR * prediction_samples / spp)
         if groups.group_size < min_images:
             return Refusal(
@@ -225,7 +234,7 @@ class BasisPictures:
             )
         height, width = renderer.formation.resolution
         # about 8 bytes for each pixel of a basis image
-        n_bytes = groups.n_cached_groups * n_lights * 8 * height * width
+        n_bytes = groups.n_alternating_groups * n_lights * 8 * height * width
         if n_bytes > scale_limit(MAX_BYTES):
             return Refusal(
                 f"basis pictures of {groups.n_groups} groups take too much memory; "
@@ -238,8 +247,9 @@ class BasisPictures:
         """Return the predictor of the images of a group.
 
         Args:
-            u: (d,) configuration of one of them.
-            seed: seed of its light paths.
+            u: (d,) configuration of any image of the group: they differ only in light,
+                which the predictor takes from the image to predict.
+            seed: seed of the light paths of its basis images.
         """
         return BasisRenderer(self._renderer, u, seed, changing=self._lighting)
 
@@ -247,28 +257,28 @@ class BasisPictures:
 ARRANGEMENT_SAMPLES = 2_200_000
 LIGHT_SAMPLES = 80_000
 """Costs, as the number of rendered samples that take as long: of an arrangement (what
-texels of the surfaces see of each other), and of the light of an environment on them.
+texels of the surfaces see of each other), and of an environment's light on them.
 
-They take 0.8 and 0.03 s where an image of 128 x 128 pixels with 8 samples per pixel
-takes 46 ms.
+They take 0.8 s and 0.03 s; an image of 128 x 128 pixels with 8 samples per pixel takes
+46 ms.
 """
 PREDICTION_SPP = 0.8  # samples per pixel that take as long as a predicted image
-ARRANGEMENT_BYTES = 50_000_000  # memory of an arrangement, about
-LIGHT_BYTES = 4_000_000  # memory of the light of an environment besides its map, about
+ARRANGEMENT_BYTES = 50_000_000  # approximate memory of an arrangement
+LIGHT_BYTES = 4_000_000  # approximate memory of an environment's light, without its map
 
 
 def find_break_even(renderer: Renderer, spp: int, arrangements: float = 1.0) -> int:
-    """Return how many images under one light make light on surfaces pay.
+    """Return from how many images under one light on light on surfaces is used.
 
     Preparing the light and comparing it with traced images has a fixed cost; each image
-    that is predicted saves `spp - PREDICTION_SPP`. It pays if the images save
+    that is predicted saves `spp - PREDICTION_SPP`. The light is used if the images save
     `MIN_SAVING_FACTOR` times the fixed cost. All costs are in samples per pixel.
 
     Args:
         renderer: renderer of the images.
-        spp: samples per pixel of the images.
-        arrangements: arrangements that are found for each light, below 1 if several
-            lights share one. An arrangement is what surfaces see of each other.
+        spp: samples per pixel of the images, at least 1.
+        arrangements: number of arrangements that are found for each light; below 1 if
+            several lights share one. An arrangement is what surfaces see of each other.
     """
     height, width = renderer.formation.resolution
     preparation_samples = ARRANGEMENT_SAMPLES * arrangements + LIGHT_SAMPLES
@@ -279,22 +289,23 @@ def find_break_even(renderer: Renderer, spp: int, arrangements: float = 1.0) -> 
 
 
 class LightOnSurfaces:
-    """Predicts the images of a scene at one size by light that is stored on surfaces.
+    """Predicts images at one size of a scene by light that is stored on surfaces.
 
-    Groups in which object and surroundings stand the same share an *arrangement*: what
-    these see of each other. Its rays are the same wherever things stand, so that it
-    does not matter which of the groups is first.
+    Images of a group differ only in the camera. Groups in which object and surroundings
+    do not move share an *arrangement*: what their surfaces see of each other. Its rays
+    are the same for every group, so that it does not matter which group is first.
 
     Attributes:
-        follows: groups of coordinates in which the images of a group may differ.
-        moves: whether one of these moves the camera.
+        parameters: names (control.parameter) of the parameters in which images of a
+            group may differ.
+        changes_scene: whether a parameter among these moves the camera.
     """
 
     name = "surface light"
     samples = RAYS_PER_PIXEL
 
     def __init__(self, renderer: Renderer, seed: int) -> None:
-        """Find the groups of coordinates that move nothing but the camera.
+        """Find the parameters that move nothing but the camera.
 
         Args:
             renderer: renderer of the images.
@@ -304,20 +315,22 @@ class LightOnSurfaces:
         self._seed = seeds.stream(seed, "surface light")
         self._arrangements: list[SurfaceRenderer] = []
         self._max_arrangements = 0
-        # which inputs of the scene change with each group of coordinates
+        # which inputs of the scene change with each parameter
         self._changed_inputs = {
             group.name: find_changed_inputs(renderer, [group.name])
             for group in renderer.space.groups
         }
-        self.follows = self._find_groups_changing_only(CAMERA_INPUTS)
-        self.moves = any(
-            self._changed_inputs[name] & CAMERA_INPUTS for name in self.follows
+        self.parameters = self._find_parameters_changing_only(CAMERA_INPUTS)
+        # `parameters` includes those that change only the finished image.
+        self.changes_scene = any(
+            self._changed_inputs[name] & CAMERA_INPUTS for name in self.parameters
         )
 
-    def _find_groups_changing_only(self, inputs: frozenset[str]) -> frozenset[str]:
-        """Return the groups of coordinates that change nothing but these inputs.
+    def _find_parameters_changing_only(self, inputs: frozenset[str]) -> frozenset[str]:
+        """Return the names of the parameters that change nothing but these inputs.
 
-        They may change the finished image, too.
+        A change of the finished image, such as exposure, is allowed, too: it is applied
+        to predicted images as to rendered ones.
         """
         allowed = inputs | IMAGE_INPUTS
         return frozenset(
@@ -332,16 +345,18 @@ class LightOnSurfaces:
         a side effect this sets how many arrangements are cached.
 
         Args:
-            make_groups: makes the groups.
+            make_groups: returns the groups whose images differ in some parameters.
             spp: samples per pixel of the images.
         """
-        groups = make_groups(self.follows)
-        # An arrangement serves all images between which neither object nor surroundings
-        # move: those of several groups, each with light of its own.
+        groups = make_groups(self.parameters)
+        # An arrangement can serve several groups: all images between which neither
+        # object nor surroundings move. Colors are left out, since an arrangement holds
+        # for one color of the object.
         arrangement_groups = make_groups(
-            self._find_groups_changing_only(FREE_INPUTS - {COLOR_INPUT})
+            self._find_parameters_changing_only(FREE_INPUTS - {COLOR_INPUT})
         )
-        self._max_arrangements = arrangement_groups.n_cached_groups
+        self._max_arrangements = arrangement_groups.n_alternating_groups
+        # Each group has a light. This is below 1 if groups share arrangements.
         arrangements_per_light = arrangement_groups.n_groups / groups.n_groups
         min_images = find_break_even(self._renderer, spp, arrangements_per_light)
         if groups.group_size < min_images:
@@ -355,8 +370,8 @@ class LightOnSurfaces:
         environment = self._renderer.scene.get_base_value(ENVIRONMENT_INPUT)
         light_bytes = LIGHT_BYTES + 4 * environment.numel()  # 4 bytes for a float32
         n_bytes = (
-            arrangement_groups.n_cached_groups * ARRANGEMENT_BYTES
-            + groups.n_cached_groups * light_bytes
+            arrangement_groups.n_alternating_groups * ARRANGEMENT_BYTES
+            + groups.n_alternating_groups * light_bytes
         )
         if n_bytes > scale_limit(MAX_BYTES):
             return Refusal(
@@ -368,12 +383,13 @@ class LightOnSurfaces:
     def make_predictor(self, u: Tensor, seed: int) -> Predictor:
         """Return the predictor of the images of a group.
 
-        An arrangement that stores what surfaces see of each other is reused if object
-        and surroundings stand the same. Else a new one is made and cached; if there are
-        too many, the oldest is released.
+        The arrangement of another group is reused if object and surroundings have not
+        moved. Else a new one is made and cached; if too many are cached, the one that
+        was made first is released.
 
         Args:
-            u: (d,) configuration of one of them.
+            u: (d,) configuration of any image of the group: they differ only in the
+                camera, which the predictor takes from the image to predict.
             seed: not used; all arrangements have the same rays.
         """
         with torch.no_grad():
@@ -400,8 +416,8 @@ class SweptImage:
     Attributes:
         image: (H, W, 3), sRGB in [0, 1].
         prediction_spp: samples per pixel of what predicted it; 0 if it was rendered.
-        n_traced: images that were traced for it; those for a group count for the first
-            image of the group.
+        n_traced: number of images that were traced for it. Those that were traced to
+            prepare a predictor count for the first image of the group.
     """
 
     image: Tensor
@@ -411,21 +427,21 @@ class SweptImage:
 
 @dataclass
 class SweepPredictor:
-    """Makes the images of one scene at one size, by prediction where that pays.
+    """Makes the images of one scene at one size, predicted if that saves time.
 
     Attributes:
         problem: problem of a model that gets these images.
         points: the configurations of the scene.
         axes: axes of the grid.
         seed: seed of the predictors.
-        specialise: whether anything is predicted.
-        images_before: images of the scenes before this one.
-        deviations: deviations of the predictors that were compared with traced images.
-        seconds: seconds that making and comparing them took.
+        specialise: whether images may be predicted.
+        images_before: number of images of the scenes before this one.
+        deviations: deviations of the predictors from traced images.
+        seconds: seconds that making and comparing the predictors took.
         rendered_groups: indices of the groups whose images are rendered because
             predictions deviated too much.
         renderer: renderer of the problem.
-        method: how images are predicted, or would be.
+        method: method that predicts images, or would if it were not refused.
         refusal: why all images are rendered; None if they are predicted.
     """
 
@@ -438,24 +454,25 @@ class SweepPredictor:
     deviations: list[Deviation] = field(default_factory=list)
     seconds: float = 0.0
     rendered_groups: set[int] = field(default_factory=set)
-    # images that were traced for each group, by its index
-    _traced: dict[int, int] = field(default_factory=dict)
-    # Predictors of the groups that are cached, by index; None where images are
-    # rendered.
+    # number of images that were traced to prepare the predictor of each group
+    _n_traced_of_group: dict[int, int] = field(default_factory=dict)
+    # The cached predictors by the index of the group; None if its predictions deviated
+    # too much, so that its images are rendered.
     _predictors: dict[int, Predictor | None] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.renderer = self.problem.renderer
         self.method, self.refusal = self._choose_method()
-        self._groups = self._make_groups(self.method.follows)
+        self._groups = self._make_groups(self.method.parameters)
 
     def _choose_method(self) -> tuple[BasisPictures | LightOnSurfaces, Refusal | None]:
-        """Choose how images are predicted.
+        """Choose the method that predicts images.
 
         Returns:
-            The cheapest method that pays here, and None. If none pays, a method that is
-            not used, and why not: the first one that could follow something that
-            varies, since its reason tells the user what to change; else the last one.
+            The cheapest method that is not refused, and None. If all are refused, one
+            of them and why it is refused, for the user to read. That is the first one
+            which could predict something that varies, since its reason says what to
+            change; else the last one.
         """
         refused: list[tuple[BasisPictures | LightOnSurfaces, Refusal]] = []
         for method_type in (BasisPictures, LightOnSurfaces):  # cheapest first
@@ -465,31 +482,38 @@ class SweepPredictor:
                 return method, None
             refused.append((method, refusal))
         for method, refusal in refused:
-            if refusal is not NOTHING_MOVES:
+            nothing_to_predict = refusal is NOTHING_MOVES
+            if not nothing_to_predict:
                 return method, refusal
         return refused[-1]
 
     def _find_refusal(self, method: BasisPictures | LightOnSurfaces) -> Refusal | None:
         """Return why a method does not predict these images; None if it does."""
-        if not method.moves:
+        if not method.changes_scene:
             return NOTHING_MOVES
         if self.renderer.composition_reason or not self.specialise:
             return Refusal(self.renderer.composition_reason or "nothing is left out")
         return method.find_refusal(self._make_groups, self.problem.spp)
 
-    def _make_groups(self, follows: frozenset[str]) -> Groups:
-        """Return the groups whose images may differ in some groups of coordinates."""
+    def _make_groups(self, parameters: frozenset[str]) -> Groups:
+        """Divide the images into groups whose images may differ in some parameters.
+
+        Args:
+            parameters: names (control.parameter) of these parameters. What is sampled
+                may differ in a group only if all sampled parameters are among them.
+        """
         axis_names = [axis.name for axis in self.axes]
-        follows_all_sampled = all(
-            group.name in follows
+        # A parameter that is not on an axis of the grid is sampled.
+        may_draws_differ = all(
+            group.name in parameters
             for group in self.renderer.space.groups
             if group.name not in axis_names
         )
         return Groups(
             self.points.grid,
             samples=self.points.samples,
-            within=tuple(name in follows for name in axis_names),
-            is_sampled=follows_all_sampled,
+            within=tuple(name in parameters for name in axis_names),
+            is_sampled=may_draws_differ,
             frames=self.points.units.frames,
         )
 
@@ -508,12 +532,13 @@ class SweepPredictor:
         images: dict[int, SweptImage] = {}
         numbers_by_predictor: dict[Predictor, list[int]] = {}
         for number, query in query_of_image.items():
-            predictor = None  # renders the image
+            predictor = None  # the image is rendered
             if self.refusal is None:
                 group = self._groups.find_group(number)
                 predictor = self._load_predictor(group, number)
             if predictor is None:
                 image = self.renderer(query.u, seed=query.seed, spp=self.problem.spp)
+                # A predictor of its group may have been traced, and then rejected.
                 n_traced = self._count_traced(number) + 1
                 images[number] = SweptImage(image, prediction_spp=0, n_traced=n_traced)
             else:
@@ -524,7 +549,9 @@ class SweepPredictor:
             )
             for number, image in zip(numbers, predicted, strict=True):
                 n_traced = self._count_traced(number)
-                images[number] = SweptImage(image, self.method.samples, n_traced)
+                images[number] = SweptImage(
+                    image, prediction_spp=self.method.samples, n_traced=n_traced
+                )
         return images
 
     def _count_traced(self, number: int) -> int:
@@ -536,16 +563,16 @@ class SweepPredictor:
         first_of_group = self._groups.find_member(number, 0)
         if number != first_of_group:
             return 0
-        return self._traced.get(self._groups.find_group(number), 0)
+        return self._n_traced_of_group.get(self._groups.find_group(number), 0)
 
     def _load_predictor(self, group: int, number: int) -> Predictor | None:
         """Return the predictor of a group; None if its images are rendered.
 
         A new predictor is compared with traced images first. If it deviates too much,
-        the images of its group are rendered. A predictor depends on the index of its
-        group alone, not on the image that needs it first, so that a sweep that was
-        stopped continues with the same predictors. If too many are cached, the oldest
-        is released.
+        the images of its group are rendered. A predictor depends only on the index of
+        its group, not on the image that needs it first, so that a sweep that was
+        stopped continues with the same predictors. If too many are cached, the one that
+        was made first is released.
 
         Args:
             group: index of the group.
@@ -553,16 +580,21 @@ class SweepPredictor:
         """
         if group in self._predictors:
             return self._predictors[group]
-        if len(self._predictors) >= self._groups.n_cached_groups:
+        if len(self._predictors) >= self._groups.n_alternating_groups:
             oldest = next(iter(self._predictors))
             self._predictors.pop(oldest)
         begin = time.perf_counter()
+        # A scene has fewer groups than images, so that these indices differ between
+        # all groups of all scenes.
         seed = seeds.stream(self.seed, "light", self.images_before + group)
-        # Always from member 0 of the group, whichever of its images comes first.
-        predictor = self.method.make_predictor(self._configuration(number, 0), seed)
+        # The configuration is that of the first image of the group, whichever image
+        # comes first.
+        predictor = self.method.make_predictor(
+            self._make_configuration(number, 0), seed
+        )
         deviation = self._compare(predictor, number, seed)
         self.deviations.append(deviation)
-        self._traced[group] = predictor.n_traced_images + deviation.n_traced
+        self._n_traced_of_group[group] = predictor.n_traced_images + deviation.n_traced
         if not deviation.is_accepted:
             self.rendered_groups.add(group)
         self._predictors[group] = predictor if deviation.is_accepted else None
@@ -572,23 +604,27 @@ class SweepPredictor:
     def _compare(self, predictor: Predictor, number: int, seed: int) -> Deviation:
         """Compare predicted images of a group with traced ones.
 
-        The compared images are random members of the group. They and the noise of the
-        traced images follow from `seed`.
+        The compared images are random members of the group, of which one may be taken
+        more than once. They and the noise of the traced images follow from `seed`.
 
         Args:
             predictor: predictor of the group.
             number: number of an image of the group, in the scene.
-            seed: selects the images that are compared.
+            seed: seed of the comparison.
         """
 
         def compute_margin(image: Tensor, u: Tensor) -> float:
-            """Return the margin of the model's prediction about an image."""
+            """Return the margin of the model's prediction about an image.
+
+            The model gets images in 8 bits; other deviations are computed without
+            rounding.
+            """
             return self.problem.judge(round_to_8_bit(image), u).margin
 
         def compare_view(check: int) -> ComparedView:
-            """Compare the prediction of a random configuration of the group."""
+            """Compare a random image of the group with a traced one."""
             index = seeds.stream(seed, "check", check) % self._groups.group_size
-            u = self._configuration(number, index)
+            u = self._make_configuration(number, index)
             (predicted,) = predictor.predict_images([u])
             noise_seed = seeds.stream(seed, "traced", check)
             return compare_with_traced(
@@ -601,16 +637,21 @@ class SweepPredictor:
             )
 
         with torch.no_grad():
-            return compare_views(compare_view)
+            return compare_views(compare_view)  # calls it once for each view
 
-    def _configuration(self, number: int, index: int) -> Tensor:
-        """Return a configuration (d,) of the group of an image, by its index there."""
+    def _make_configuration(self, number: int, index: int) -> Tensor:
+        """Return the configuration (d,) of an image of a group.
+
+        Args:
+            number: number of any image of the group, in the scene.
+            index: index of the image in the group.
+        """
         member = self._groups.find_member(number, index)
         return self.points.make_configurations(member, 1, self.images_before)[0]
 
     @property
     def n_non_finite(self) -> int:
-        """How many values were not finite, and were set to 0."""
+        """Number of values of predicted images that were not finite and set to 0."""
         return sum(
             predictor.non_finite
             for predictor in self._predictors.values()
@@ -620,8 +661,8 @@ class SweepPredictor:
     def summarize(self) -> LinearTransport | None:
         """Return what a result states about predicted images.
 
-        It is their worst deviation, the memory and the time, or why images are
-        rendered. None if nothing varies that any method could predict.
+        That is the worst deviation, the memory and the time, or why images are
+        rendered. None if nothing varies that a method could predict.
         """
         if self.refusal is NOTHING_MOVES:
             return None
@@ -643,11 +684,12 @@ class SweepPredictor:
             for predictor in self._predictors.values()
             if predictor is not None
         )
+        # Sweeps use no matrix, so that there are no entries, and none was renewed.
         return LinearTransport(
             used=True,
             method=self.method.name,
             reason=reason,
-            entries=0,  # of a matrix, which sweeps do not use
+            entries=0,
             bytes=self.method.bytes + predictor_bytes,
             seconds=self.seconds,
             renewed=0,
@@ -661,11 +703,11 @@ def combine_transport(
     """Combine the summaries of the predicted images of several scenes.
 
     Args:
-        all_summaries: all summaries of each scene; None where nothing moves.
+        all_summaries: summaries of all scenes and image sizes; None if nothing moves.
 
     Returns:
-        The worst error, the largest memory, all seconds and the first reason, of the
-        scenes with predicted images. If none has them, the last summary; None if
+        The worst error, the largest memory, all seconds and the first reason, over the
+        summaries with predicted images. If there are none, the last summary; None if
         nothing moves in any scene.
     """
     summaries = [summary for summary in all_summaries if summary is not None]
@@ -688,10 +730,10 @@ def prepare_surface_light(
 ) -> None:
     """Prepare light on surfaces for trials, if that is cheaper than rendering them.
 
-    The trials vary some numbers around a configuration. If light on surfaces can follow
-    these numbers, accurately enough and at less cost, the verifier's state has it as
-    `predictor`. If the camera moves, but the light is not used, the state has the
-    reason as `predictor_refusal`.
+    The trials vary some coordinates of a configuration. If light on surfaces can follow
+    these, accurately enough and at less cost than rendering, the verifier's state gets
+    it as `predictor`. If the camera moves, but the light is not used, the state gets
+    the reason as `predictor_refusal`.
 
     Args:
         verifier: verifier of the trials, whose sample count is known.
@@ -701,24 +743,26 @@ def prepare_surface_light(
     """
     problem = verifier.problem
     varying = set(coordinates.tolist())
-    groups = [
+    # the parameters that have any of these coordinates
+    parameter_names = [
         group.name
         for group in problem.space.groups
         if not varying.isdisjoint(range(group.begin, group.begin + group.size))
     ]
-    changed_inputs = find_changed_inputs(problem.renderer, groups)
+    changed_inputs = find_changed_inputs(problem.renderer, parameter_names)
     moves_camera = bool(changed_inputs & CAMERA_INPUTS)
     # light on surfaces cannot follow a change of any other input
     can_follow = changed_inputs <= FREE_INPUTS
     if not moves_camera or not can_follow:
         return
-    findings = verifier.state
+    state = verifier.state
     refusal = find_scene_refusal(problem.renderer)
-    min_images = find_break_even(problem.renderer, findings.spp)
+    min_images = find_break_even(problem.renderer, state.spp)
     if refusal is None and n_images < min_images:
         reason = f"light on surfaces pays from {min_images} pictures on"
+        # Each trial counts as a step here.
         refusal = Refusal(reason, RefusalCause.TOO_FEW_STEPS)
-    findings.predictor_refusal = refusal
+    state.predictor_refusal = refusal
     if refusal is not None:
         return
     title = "finding the light on surfaces"
@@ -728,6 +772,6 @@ def prepare_surface_light(
     light = SurfaceLight(problem, 0, light_u=at, moving_coordinates=coordinates)
     # `prepare` compares predicted images with traced ones, and may refuse.
     light.prepare(verifier.stages.progress.advance)
-    findings.predictor_refusal = light.accuracy_refusal
+    state.predictor_refusal = light.accuracy_refusal
     is_accurate = light.accuracy_refusal is None
-    findings.predictor = light if is_accurate else None
+    state.predictor = light if is_accurate else None

@@ -1,7 +1,7 @@
 """Counts of a sweep, and its result as Python has it.
 
-docs/sweeps.md, "What it says". Counting takes some 15 bytes a configuration. Sweeps
-that another program made are imported here, too.
+See docs/sweeps.md, "What it says". Counting takes about 15 bytes per configuration.
+Sweeps that another program made are imported here, too.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ from advsearch.tasks import Judgement
 from advsearch.viewer import thumbnails
 
 FINISHED = "finished"
-MAX_CELLS = 4096  # of a map; with more pairs of values there is none
-# wrong predictions that the summary lists, the most frequent first
+MAX_CELLS = 4096  # maximum number of cells of a map; with more there is none
+# maximum number of wrong predictions that the summary lists, the most frequent first
 MAX_LISTED_PREDICTIONS = 20
 
 
 OUTCOMES = tuple(Outcome)
-UNKNOWN_OUTCOME = 255  # in arrays of indices among `OUTCOMES`
+UNKNOWN_OUTCOME = 255  # in arrays of indices in `OUTCOMES`
 
 
 def count_by_unit(
@@ -65,15 +65,15 @@ def count_by_unit(
 ) -> CountedPredictions:
     """Count predictions, with their accuracy and its 95 % interval.
 
-    The accuracy is the mean over units of the fraction of right predictions in each. A
-    single unit with several predictions gives no interval.
+    The accuracy is the mean over units of the fraction of right predictions in each.
+    Several predictions of a single unit have no interval.
 
     Args:
         right: (n,) whether each prediction is right.
-        units: (n,) the unit of each, such as the drive of a frame; predictions of one
-            unit are not independent.
-        outcome: (n,) kinds of outcome, such as a missed box, as indices among
-            `OUTCOMES`; those of wrong predictions are counted.
+        units: (n,) the independent unit of each prediction, such as the drive of a
+            frame; predictions of one unit are not independent.
+        outcome: (n,) kind of outcome, such as a missed box, as an index in `OUTCOMES`;
+            the outcomes of wrong predictions are counted.
     """
     right = np.asarray(right)
     if not len(right):
@@ -81,8 +81,11 @@ def count_by_unit(
     right_in_unit = sum_per_unit(right, units)
     unit_size = sum_per_unit(np.ones(len(right)), units)
     interval = None
-    # several predictions of one unit don't tell how much units differ
-    if len(unit_size) > 1 or len(right) == 1:
+    # Several predictions of one unit do not show how much units differ. A single
+    # prediction has an interval, the one of a single independent trial.
+    has_several_units = len(unit_size) > 1
+    is_single_prediction = len(right) == 1
+    if has_several_units or is_single_prediction:
         interval = rate_interval(right_in_unit, unit_size)
     outcome_counts = None
     if outcome is not None:
@@ -98,11 +101,11 @@ def count_by_unit(
 
 
 def _count_outcomes(outcome: npt.NDArray[np.uint8]) -> dict[str, int] | None:
-    """Return how often each outcome occurs, by its name; None if none is known."""
+    """Return how often each outcome occurs, by its name; None if all are unknown."""
     counts = np.bincount(outcome, minlength=len(OUTCOMES))
     count_by_name = {
         known.value: int(count)
-        # not strict: there may be a count of `UNKNOWN_OUTCOME`
+        # not strict: `counts` may go on to the count of `UNKNOWN_OUTCOME`
         for known, count in zip(OUTCOMES, counts, strict=False)
         if count
     }
@@ -112,14 +115,14 @@ def _count_outcomes(outcome: npt.NDArray[np.uint8]) -> dict[str, int] | None:
 def count_independent(
     correct: int, n_predictions: int, interval: tuple[float, float] | None = None
 ) -> CountedPredictions:
-    """Return the accuracy of independent predictions with its 95 % interval.
+    """Return counts and accuracy of independent predictions, with a 95 % interval.
 
-    Both are None without predictions.
+    Accuracy and interval are None without predictions.
 
     Args:
-        correct: right predictions.
-        n_predictions: predictions.
-        interval: interval of the accuracy; by default that of Clopper and Pearson.
+        correct: number of right predictions.
+        n_predictions: number of predictions.
+        interval: interval of the accuracy; None computes that of Clopper and Pearson.
     """
     if not n_predictions:
         return CountedPredictions(
@@ -139,10 +142,10 @@ class Predictions:
     Attributes:
         is_known: (n,) whether there is a prediction.
         is_right: (n,) whether it is right.
-        is_hidden: (n,) whether nothing of what is judged is in the image.
-        margin: (n,) NaN where it is not a number; then a prediction is neither right
-            nor, in `_wrong`, wrong.
-        outcome: (n,) of a detector, indices among `OUTCOMES`.
+        is_hidden: (n,) whether nothing of the object is in the image.
+        margin: (n,) margin of the prediction; NaN if it is not a number. Then the
+            prediction counts neither as right nor as a wrong label.
+        outcome: (n,) outcome of a detection, as an index in `OUTCOMES`.
     """
 
     def __init__(self, n_rows: int) -> None:
@@ -160,20 +163,21 @@ class Predictions:
         self._index_by_label = dict[str, int]()
 
     def add(self, row: int, judgement: Judgement) -> None:
-        """Add the judgement of a row; one that was there before is replaced.
+        """Add the judgement of a row, or replace the one that was there before.
 
         Args:
             row: number of the row.
-            judgement: what the task says of the prediction.
+            judgement: what the task states about the prediction.
         """
         label = judgement.prediction.label
         self.is_known[row] = True
         self.is_right[row] = judgement.right
+        # A judgement's `success` is that of an attack: the prediction is wrong.
         self._wrong[row] = judgement.success
         self.margin[row] = judgement.margin
         self.is_hidden[row] = label == OUT_OF_VIEW
         outcome = get_outcome(judgement.payload)
-        if outcome is not None:
+        if outcome is not None:  # only a detection has an outcome
             self.outcome[row] = OUTCOMES.index(outcome)
         n_labels = len(self._index_by_label)
         self._label_index[row] = self._index_by_label.setdefault(label, n_labels)
@@ -185,13 +189,13 @@ class Predictions:
 
     @property
     def n_phantoms_out_of_view(self) -> int:
-        """Images without the object in which a detector finds it all the same."""
+        """Number of images without the object in which a detector still finds it."""
         is_phantom = self.outcome == OUTCOMES.index(Outcome.PHANTOM)
         return int((self.is_hidden & is_phantom).sum())
 
     @property
     def worst_row(self) -> int | None:
-        """The first row of the smallest margin; None if none is a number.
+        """The first row with the smallest margin; None if no margin is a number.
 
         Rows without the object count only if there are no others.
         """
@@ -202,29 +206,33 @@ class Predictions:
 
     @property
     def n_non_finite(self) -> int:
-        """How many margins are not numbers; these predictions count as not right."""
+        """Number of margins that are not numbers; these predictions are not right."""
         return int((self.is_known & np.isnan(self.margin)).sum())
 
     @property
     def frequent_wrong_labels(self) -> dict[str, int]:
-        """How often each of the most frequent wrong predictions occurs, in order."""
+        """How often each of the most frequent wrong labels occurs, most frequent first.
+
+        Labels of the same count are in alphabetical order.
+        """
         labels = list(self._index_by_label)
         wrong_labels = Counter(
             labels[index] for index in self._label_index[self._wrong]
         )
         most_frequent = wrong_labels.most_common(MAX_LISTED_PREDICTIONS)
+        # Items are (label, count): by descending count, then by label.
         return dict(sorted(most_frequent, key=lambda item: (-item[1], item[0])))
 
     def compare_arms(self, models: Sequence[str], units: Units) -> list[PairedRates]:
-        """Compare the predictions without and with an adversarial configuration.
+        """Compare the predictions about clean scenes and adversarial ones.
 
-        The rows are two arms: the second half repeats the first with the adversarial
-        configuration. A pair is the same image in both arms. It is counted only if both
-        predictions are, that is if the object is visible in both.
+        The first half of the rows are those of the clean scenes; the second half
+        repeats them with the adversarial ones. A pair is the same image in both arms. A
+        pair counts only if the object is visible in both.
 
         Args:
             models: names of the models.
-            units: how rows follow from draws.
+            units: maps images to draws.
 
         Returns:
             The comparison for each model that has pairs.
@@ -255,17 +263,17 @@ def _compare_pairs(
     outcome: npt.NDArray[np.uint8],
     draws: npt.NDArray[np.int64],
 ) -> PairedRates:
-    """Compare the predictions of a model without and with an adversarial scene.
+    """Compare the predictions of a model about clean and adversarial scenes.
 
     Args:
         model: name of the model.
-        right: (2, n) whether each is right, first without.
-        outcome: (2, n) indices among `OUTCOMES`.
-        draws: (n,) the draw of each pair.
+        right: (2, n) whether each prediction is right, those about clean scenes first.
+        outcome: (2, n) outcomes as indices in `OUTCOMES`.
+        draws: (n,) the draw of each pair; draws are the independent units.
     """
     clean, adversarial = right
     clean_outcome, adversarial_outcome = outcome
-    # the p-value is not shown
+    # The p-value, the third, is not part of the result.
     difference, interval, _ = compare_paired(clean, adversarial, draws)
     return PairedRates(
         model=model,
@@ -282,15 +290,15 @@ def _compare_pairs(
 
 @dataclass(frozen=True, eq=False)
 class TableAxis:
-    """Something that a table is by.
+    """An axis by whose values tables count predictions.
 
     Attributes:
         name: name of the axis.
-        unit: unit of its values.
-        values: or the bounds of parts of a range.
-        value_index: (n,) the index of each row among these.
-        kind: outside of the scene (object, environment, model), of the grid, or a
-            sampled number.
+        unit: unit of measure of its values.
+        values: the values, or the bounds of parts of a range.
+        value_index: (n,) the index in `values` of the value of each row.
+        kind: "outside" for an axis that is not in the scene (object, environment,
+            model), "grid" for one of the grid, "drawn" for a sampled number.
     """
 
     name: str
@@ -305,12 +313,12 @@ class TableAxis:
         units: npt.NDArray[np.int64],
         outcome: npt.NDArray[np.uint8] | None = None,
     ) -> list[AxisRow]:
-        """Return the table: counts by value, without values that have none.
+        """Return a row of counts for each value that has predictions.
 
         Args:
             right: (n,) whether each prediction is right.
-            units: (n,) the unit of each.
-            outcome: (n,) indices among `OUTCOMES`.
+            units: (n,) the independent unit of each prediction.
+            outcome: (n,) outcomes as indices in `OUTCOMES`; None if unknown.
         """
         if outcome is None:
             outcome = np.full(len(right), UNKNOWN_OUTCOME, np.uint8)
@@ -318,9 +326,13 @@ class TableAxis:
         axis_rows = list[AxisRow]()
         for index, group in predictions.groupby(self.value_index):
             counts = count_by_unit(group.right, group.unit, group.outcome.to_numpy())
-            value = self.values[index]
             axis_rows.append(
-                AxisRow(axis=self.name, unit=self.unit, value=value, **vars(counts))
+                AxisRow(
+                    axis=self.name,
+                    unit=self.unit,
+                    value=self.values[index],
+                    **vars(counts),
+                )
             )
         return axis_rows
 
@@ -332,17 +344,15 @@ def make_map(
 ) -> SweepMap | None:
     """Count predictions, and average margins, for every pair of values of two axes.
 
-    The two axes are the first ones of the grid. If the grid has fewer than two, axes
-    outside of the scene, such as the model, take their place, the last one first. If
-    there are neither, they are the first two sampled numbers.
+    The two axes are the first two in the order of `_order_for_map`.
 
     Args:
-        axes: all of the tables.
+        axes: all axes of the tables.
         right: (n,) whether each prediction is right.
-        margin: (n,) NaN where it is not a number.
+        margin: (n,) margin of each prediction; NaN if it is not a number.
 
     Returns:
-        The map; None of fewer than two axes, or of more than `MAX_CELLS` pairs.
+        The map; None if there are fewer than two axes, or more than `MAX_CELLS` pairs.
     """
     axes = _order_for_map(axes)
     if len(axes) < 2:
@@ -352,7 +362,7 @@ def make_map(
     height = len(y_axis.values)
     if width * height > MAX_CELLS:
         return None
-    cell = y_axis.value_index * width + x_axis.value_index  # (n,) row by row
+    cell = y_axis.value_index * width + x_axis.value_index  # (n,) counted row by row
 
     def sum_over_cells(
         cells: npt.NDArray[np.integer[Any]],
@@ -380,10 +390,11 @@ def make_map(
 
 
 def _order_for_map(axes: Sequence[TableAxis]) -> list[TableAxis]:
-    """Return the axes in the order in which a map takes them.
+    """Return the axes in the order of preference for a map.
 
-    Axes of the grid come first, then those outside of the scene, the last one first.
-    Sampled ones are taken only if there are none of these.
+    Axes of the grid come first. Then come those outside of the scene in reverse order,
+    so that the model is preferred to the object. Sampled numbers are returned only if
+    there are none of these.
     """
     grid = [axis for axis in axes if axis.kind == "grid"]
     outside = [axis for axis in axes if axis.kind == "outside"]
@@ -400,9 +411,9 @@ class SweepResult:
     """The result of a sweep.
 
     Attributes:
-        summary: what `summary.json` holds.
-        run: the run directory, or None if it was not kept.
-        in_memory: the rows, where there is no run directory.
+        summary: what `summary.json` contains.
+        run: the run directory; None if the run was not stored.
+        in_memory: the rows, if there is no run directory.
     """
 
     summary: SweepSummary
@@ -460,20 +471,20 @@ class SweepResult:
         return draw_sweep(self.summary).get("png")
 
 
-MAX_PIXELS = 1 << 22  # of an image that is imported
-MAX_LISTED_VALUES = 96  # different values of a parameter that the result lists
-STORED_BATCH = 1000  # rows that are stored together
+MAX_PIXELS = 1 << 22  # maximum size of an imported image
+MAX_LISTED_VALUES = 96  # maximum number of values of a parameter with a table
+STORED_BATCH = 1000  # number of rows that are stored together
 
 
 def import_threedb(
     folder: Path, run: str | Path | None = None, *, overwrite: bool = False
 ) -> Path:
-    """Import a folder that 3DB wrote into a run directory, and return that.
+    """Import a folder that 3DB wrote into a run directory, and return its path.
 
     Args:
         folder: folder of 3DB.
         run: run directory; by default ``runs/NAME-3db-NNN``.
-        overwrite: whether another run may be there.
+        overwrite: whether an existing run is replaced.
 
     Raises:
         FileFormatError: the log of 3DB is empty or corrupt.
@@ -502,7 +513,7 @@ def import_threedb(
 def _summarize_threedb(rows: pd.DataFrame, run: Path, folder: Path) -> SweepSummary:
     """Return the summary of a sweep that 3DB made.
 
-    Fields that the log of 3DB says nothing about are None, 0 or empty.
+    Fields that the log of 3DB does not contain are None, 0 or empty.
 
     Args:
         rows: rows of the sweep.
@@ -511,10 +522,10 @@ def _summarize_threedb(rows: pd.DataFrame, run: Path, folder: Path) -> SweepSumm
     """
     right = np.asarray(rows["correct"] == 1)
     tables = list[AxisRow]()
-    for name in rows.attrs["units"]:
+    for name in rows.attrs["units"]:  # the keys are the parameters
         values, indices = np.unique(rows[name].astype(object), return_inverse=True)
-        # A parameter with a single value did not vary; one with very many would make
-        # an unreadable table.
+        # A parameter with one value did not vary. A table of very many values would be
+        # unreadable.
         if 1 < len(values) <= MAX_LISTED_VALUES:
             axis = TableAxis(name, "", values.tolist(), indices)
             tables += axis.make_rows(right, rows["unit"])
@@ -522,17 +533,18 @@ def _summarize_threedb(rows: pd.DataFrame, run: Path, folder: Path) -> SweepSumm
         column: _join_names(rows, column)
         for column in ("object", "environment", "model")
     }
-    # fields that the log of 3DB says nothing about: None
+    # fields that the log of 3DB does not contain: None, or 0 if they must be numbers
     unknown = dict.fromkeys(
         ("image_formation", "cells", "worst", "sampler", "renders_per_second")
     )
+    unknown_numbers = dict.fromkeys(("not_finite", "spp", "seed"), 0)
     wrong_labels = Counter(rows["label"][~right])
     return SweepSummary(
         run=str(run),
         **names,
         **vars(count_independent(int(right.sum()), len(rows))),
         **unknown,
-        **dict.fromkeys(("not_finite", "spp", "seed"), 0),
+        **unknown_numbers,
         task="classification",
         controls=[],
         ending=FINISHED,

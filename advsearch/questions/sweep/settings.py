@@ -29,8 +29,8 @@ BLIND = {
     "covered": "the camera is covered (one even colour, the picture's mean)",
     "away": "the object is taken away",
 }
-"""Changes after which nothing of the object is visible: a model that looks at it
-predicts something else.
+"""Changes after which nothing of the object is visible. A model that looks at the
+object predicts something else then.
 """
 
 HARMLESS = {
@@ -38,8 +38,8 @@ HARMLESS = {
     "shift": "the picture moves by one pixel to the right",
     "jpeg": "the picture is a JPEG file of quality 95",
 }
-"""Changes that mean nothing: it predicts the same."""
-Grid = dict[str, object]  # values, or ranges of them, by the parameters of the grid
+"""Changes that have no meaning, after which the prediction should be the same."""
+Grid = dict[str, object]  # values of each parameter of the grid, or a range of them
 
 
 class SweepConfig(SceneConfig):
@@ -94,7 +94,7 @@ class SweepConfig(SceneConfig):
     model: str = setting_as_in(
         SceneConfig,
         "model",
-        description="the network under test; several, separated by commas, are shown "
+        description="the network under test; several, separated by commas, are run on "
         "the same pictures",
     )
     grid: Grid = setting(
@@ -117,9 +117,9 @@ class SweepConfig(SceneConfig):
     adversarial_of: str | None = setting(
         None,
         "sweep",
-        "sweep the adversarial scene of this attack beside the clean scene, under the "
-        "same draws; scene and model "
-        "come from that run, and so does what its --over drew if nothing else varies",
+        "sweep the adversarial scene of this attack as well as the clean scene, with "
+        "the same draws; scene and model are those of that run, and if nothing else "
+        "varies, so is what its --over varied",
         "the name or the folder of a run",
         metavar="RUN",
         otherwise="none",
@@ -134,12 +134,14 @@ class SweepConfig(SceneConfig):
         le=1_000_000_000,
     )
     sampler: Literal["sobol", "random"] = setting(
-        "sobol", "sweep", "how the draws are made, evenly spread or independent"
+        "sobol",
+        "sweep",
+        "how values are sampled: evenly spread, or independently",
     )
     batch: int = setting(
         16,
         "sweep",
-        "pictures that are classified and stored together",
+        "number of pictures that are classified and stored together",
         unit="pictures",
         ge=1,
         le=1024,
@@ -157,13 +159,13 @@ class SweepConfig(SceneConfig):
     fps: float = setting(
         2.0,
         "sweep",
-        "frames of the drive that are looked at",
+        "number of frames per second of the drive",
         unit="frames a second",
         gt=0.0,
         le=1000.0,
     )
     keep_pictures: Literal["all", "wrong", "none"] = setting(
-        "none", "sweep", "keep small pictures of these predictions"
+        "none", "sweep", "store small pictures of these predictions"
     )
     specialise: bool = setting_as_in(
         DerivativeConfig,
@@ -183,18 +185,16 @@ class SweepConfig(SceneConfig):
     must_change: str | None = setting(
         None,
         "sweep",
-        "show each picture also black, covered (one even colour) or "
-        "with the object taken away, and "
-        "count how often the model says something else, as it must",
+        "repeat each prediction with the picture black, covered (one even color) or "
+        "without the object, and count how often it changes, as it must",
         f"names among {', '.join(BLIND)}, separated by commas",
         otherwise="none",
     )
     must_not_change: str | None = setting(
         None,
         "sweep",
-        "show each picture also with a third of a stop more exposure, a "
-        "shift by one pixel or as a JPEG "
-        "file, and count how often the model says the same, as it must",
+        "repeat each prediction with a third of a stop more exposure, a shift by one "
+        "pixel or as a JPEG file, and count how often it stays the same, as it must",
         f"names among {', '.join(HARMLESS)}, separated by commas",
         otherwise="none",
     )
@@ -216,7 +216,7 @@ class SweepConfig(SceneConfig):
     trials: int = setting(
         20,
         "verification",
-        "fresh renders that verify the worst configuration; 0 for none",
+        "number of fresh renders that verify the worst configuration; 0 for none",
         f"0, or a whole number from {MIN_TRIALS} to 100000",
         unit="renders",
         ge=0,
@@ -245,7 +245,7 @@ class SweepConfig(SceneConfig):
 
     @property
     def claims(self) -> tuple[tuple[str, str], ...]:
-        """What is claimed of changed images: ``("must_change", "black")`` and so on."""
+        """The claims about changed images, such as ``("must_change", "black")``."""
         changes_by_claim = {
             "must_change": self.must_change,
             "must_not_change": self.must_not_change,
@@ -275,8 +275,8 @@ class SweepConfig(SceneConfig):
     def find_control_type(self, instance: str) -> type[Control] | None:
         """Return the class of a control by its name; None if there is none.
 
-        The settings of the control may state its kind. Else the name is the kind, or
-        ``KIND:INSTANCE``.
+        The kind is stated in the settings of the control, or else is its name. A name
+        may be ``KIND:INSTANCE``.
 
         Args:
             instance: name of the control.
@@ -285,7 +285,7 @@ class SweepConfig(SceneConfig):
 
         control_settings = self.controls.get(instance, {})
         kind = str(control_settings.get("kind", instance))
-        if kind not in CONTROLS:
+        if kind not in CONTROLS:  # such as "light:key"
             kind = kind.partition(":")[0]
         return CONTROLS.get(kind)
 
@@ -302,16 +302,16 @@ class SweepConfig(SceneConfig):
 
     @classmethod
     def load_attack_defaults(
-        cls, file: Path, typed: Mapping[str, Any]
+        cls, file: Path, stated_settings: Mapping[str, Any]
     ) -> dict[str, Any]:
-        """Return the settings that a sweep takes from the attack it is about.
+        """Return the settings that a sweep takes from the attack of `adversarial_of`.
 
-        Unless the sweep states what varies, that is what varied by chance in the
-        attack (its setting `over`).
+        If the sweep does not state what varies, the controls are those that varied at
+        random in the attack (its setting `over`).
 
         Args:
             file: `run.yaml` of the attack.
-            typed: settings that the sweep states, by name.
+            stated_settings: settings that the sweep itself states, by name.
         """
         attack_config = AttackConfig.from_yaml(file)
         # Both commands have these settings, but a sweep has its own values of them.
@@ -328,8 +328,10 @@ class SweepConfig(SceneConfig):
             for name, value in cls.get_shared_settings(attack_config).items()
             if name not in excluded
         }
-        states_what_varies = typed.get("grid") or typed.get("controls")
-        if not states_what_varies:
+        has_grid = bool(stated_settings.get("grid"))
+        has_controls = bool(stated_settings.get("controls"))
+        if not has_grid and not has_controls:
+            # The attack's own controls are fixed; the sweep varies its conditions.
             settings["controls"] = attack_config.over
         return settings
 

@@ -38,7 +38,7 @@ class StoredSweep:
         """Read settings and result of a sweep.
 
         Raises:
-            FileFormatError: the run is one of another experiment.
+            FileFormatError: the run is one of another command.
         """
         summary = read_result(folder)
         if not isinstance(summary, SweepSummary):
@@ -49,12 +49,12 @@ class StoredSweep:
         return cls(folder, SweepConfig.from_yaml(folder / CONFIG), summary)
 
     def read_rows(self) -> pd.DataFrame:
-        """Read the rows, by ascending `step`.
+        """Read the rows in ascending order of `step`.
 
         `runs.tables.read_sweep` describes the columns and the attributes of the frame.
 
         Raises:
-            FileFormatError: they cannot be read.
+            FileFormatError: the rows cannot be read.
         """
         rows = read_sweep(self.folder, is_sampled=self.summary.sampler is not None)
         return rows.sort_values("step", ignore_index=True)

@@ -1,4 +1,4 @@
-"""The result of `sweep`: what `summary.json` holds of it."""
+"""The result of `sweep`, as `summary.json` stores it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from advsearch.runs.results import (
 
 
 class AxisRow(CountedPredictions):
-    """Every configuration with one value of an axis."""
+    """Counts of the predictions with one value of an axis."""
 
     axis: str
     unit: str
@@ -42,22 +42,22 @@ class SweepMap(Fields):
     """Counts and margins over two axes, in rows of the second one."""
 
     axes: tuple[MapAxis, MapAxis]
-    over: list[str] = Field(description="the axes beyond")
+    over: list[str] = Field(description="the other axes, over which the counts sum")
     configurations: list[list[int]]
     correct: list[list[int]]
     margin: list[list[JsonFloat | None]] = Field(
-        description="the mean, in logits; null where there is none"
+        description="mean margin in logits; null where no margin is known"
     )
 
 
 class WorstClaim(Fields):
-    """What the model says of one picture of the worst configuration."""
+    """The prediction of the model in one picture of the worst configuration."""
 
     label: str
     index: int | None
     probability: JsonFloat | None
     margin: JsonFloat
-    payload: Payload = optional_field("what else the task keeps of it; absent without")
+    payload: Payload = optional_field("further output of the task; absent without any")
 
 
 class WorstVerified(VerifiedRate):
@@ -67,7 +67,7 @@ class WorstVerified(VerifiedRate):
     """
 
     converged: bool = Field(
-        description="whether the margin stood still with the samples"
+        description="whether more samples no longer changed the sign of the margin"
     )
     renders: int
 
@@ -75,78 +75,86 @@ class WorstVerified(VerifiedRate):
 class WorstConfiguration(Fields):
     """The configuration with the smallest margin."""
 
-    configuration: int = Field(description="its number")
+    configuration: int = Field(description="number of the configuration")
     values: Annotated[
         dict[str, results.DescribedValue], key_validator("object", "model")
     ]
     seed: int
-    label_set: list[str] = Field(description="the names that count as right there")
-    claimed: WorstClaim = Field(description="of the sweep's own picture")
+    label_set: list[str] = Field(description="the names that count as right")
+    claimed: WorstClaim = Field(description="prediction in the picture of the sweep")
     verified: WorstVerified | None = Field(
-        description="null where it was not rendered again"
+        description="rate of wrong predictions in fresh renders; null if there are none"
     )
     pictured: WorstClaim | None = optional_field(
-        "of the picture that is kept; absent without"
+        "prediction in the picture that is stored; absent if none is stored"
     )
 
 
 class SurfacePart(Fields):
-    """A part of an object's surface, and the predictions by whether it was seen."""
+    """A part of an object's surface, and predictions by whether it was visible."""
 
-    face: int = Field(description="number of the triangle in its middle")
-    u: float = Field(description="its middle, across the map")
-    v: float = Field(description="its middle, up the map, whose bottom row is 0")
+    face: int = Field(description="number of the triangle at the center of the part")
+    u: float = Field(description="u of the center, across the map")
+    v: float = Field(description="v of the center, up the map; 0 at the bottom")
     center: tuple[float, float, float] = Field(
-        description="its middle, in the mesh's coordinates, z up"
+        description="center in the coordinates of the mesh, z up"
     )
-    visible: CountedPredictions = Field(description="pictures that see it")
-    hidden: CountedPredictions = Field(description="the other ones")
+    visible: CountedPredictions = Field(description="pictures that show the part")
+    hidden: CountedPredictions = Field(description="pictures that do not show it")
     difference: float = Field(
-        description="share of wrong predictions where it is "
-        "seen, less that where it is not"
+        description="fraction of wrong predictions where the part is visible, minus "
+        "that where it is not"
     )
     interval: Interval = Field(
-        description="of that difference, 95 %, for the part by itself; null where "
-        "pictures share a draw, as frames of "
-        "a drive do"
+        description="95 % interval of the difference, for this part alone; null if "
+        "pictures share a draw, such as frames of a drive"
     )
     p: float = Field(
-        description="how likely it is that by chance any part stands out as far"
+        description="probability that by chance any part would differ at least as "
+        "clearly"
     )
 
 
 class SurfaceTable(Fields):
-    """What goes with wrong predictions on the surface of one object, for one model."""
+    """How predictions of one model depend on the visible surface of one object."""
 
     object: str
     model: str
-    part: str = Field(description="what is counted: a `cell` of the map, or a `face`")
+    part: str = Field(description="kind of part: a `cell` of the map, or a `face`")
     unwrapped: bool = Field(
-        description="whether the map is a new one, and not that of the object's texture"
+        description="whether the map was made for the sweep, and is not that of the "
+        "object's texture"
     )
-    visible: int = Field(description="how many were seen at all")
+    visible: int = Field(description="number of parts that were visible in any picture")
     compared: int = Field(
-        description="how many were seen often enough, and hidden often enough"
+        description="number of parts that were visible often enough and hidden often "
+        "enough to be compared"
     )
     worse: int = Field(
-        description="how many of these go with wrong predictions, told from chance"
+        description="number of compared parts that go significantly with wrong "
+        "predictions"
     )
-    better: int = Field(description="likewise, with right predictions")
+    better: int = Field(
+        description="number of compared parts that go significantly with right "
+        "predictions"
+    )
     strongest: list[SurfacePart] = Field(
-        description="those told most clearly, none close to another; `worse` ones first"
+        description="the parts with the clearest difference, none close to another; "
+        "`worse` ones first"
     )
 
 
 class SurfaceMap(Fields):
-    """Which parts of the surface, when seen, go with wrong predictions."""
+    """Which parts of the surface, when visible, go with wrong predictions."""
 
-    file: str = Field(description="the counts, in the folder")
-    cells: int = Field(description="along each side of the map")
+    file: str = Field(description="file with the counts, in the run directory")
+    cells: int = Field(description="number of cells along each side of the map")
     min_pictures: int = Field(
-        description="pictures with and without a part that a comparison takes"
+        description="number of pictures with a part, and of pictures without it, that "
+        "a comparison needs"
     )
     tables: list[SurfaceTable] = Field(
-        description="for every object, model and kind of part"
+        description="a table for every object, model and kind of part"
     )
 
 
@@ -157,71 +165,79 @@ class PairedRates(Fields):
     """
 
     model: str
-    clean: CountedPredictions = Field(description="without the adversarial scene")
-    adversarial: CountedPredictions = Field(description="with it")
-    both: int = Field(description="pairs that are right in both")
-    clean_only: int = Field(description="pairs that are right without it alone")
-    adversarial_only: int = Field(description="pairs that are right with it alone")
-    neither: int = Field(description="pairs that are right in none")
+    clean: CountedPredictions = Field(
+        description="predictions without the adversarial scene"
+    )
+    adversarial: CountedPredictions = Field(
+        description="predictions with the adversarial scene"
+    )
+    both: int = Field(description="pairs that are right in both scenes")
+    clean_only: int = Field(description="pairs that are right only in the clean scene")
+    adversarial_only: int = Field(
+        description="pairs that are right only in the adversarial scene"
+    )
+    neither: int = Field(description="pairs that are right in neither scene")
     difference: float = Field(
-        description="accuracy with the adversarial scene less that without"
+        description="accuracy with the adversarial scene minus that without"
     )
     interval: Interval = Field(
-        description="of that difference, 95 %, of pairs, over "
-        "draws where some share one"
+        description="95 % interval of the difference, of pairs; over draws if some "
+        "pairs share one"
     )
 
 
 class ArmComparison(Fields):
-    """The clean scene and the adversarial one of a run under the same draws."""
+    """The clean scene and the adversarial scene of a run, with the same draws."""
 
-    adversarial_run: str = Field(description="the run")
-    pairs: list[PairedRates] = Field(description="for each model")
+    adversarial_run: str = Field(description="the run of the adversarial scene")
+    pairs: list[PairedRates] = Field(description="the comparison for each model")
 
 
 class OverDrives(Fields):
-    """A value of each drive, over all drives."""
+    """Statistics of a value over all drives."""
 
-    mean: float = Field(description="over drives")
+    mean: float = Field(description="mean over drives")
     interval: Interval | None = Field(
-        description="of the mean, 95 %, over drives; null of one, or where the range "
-        "is not known beforehand"
+        description="95 % interval of the mean over drives; null for a single drive, "
+        "or if the range of the value is unknown"
     )
-    worst: float = Field(description="of the worst drive")
+    worst: float = Field(description="value of the worst drive")
 
 
 class DriveRecord(Fields):
-    """What a model says along one drive."""
+    """The predictions of a model along one drive."""
 
-    row: int = Field(description="number of its first frame among the rows")
+    row: int = Field(description="number of the row of the first frame")
     path: str | None = Field(
-        description="its path; null where all drives have the same"
+        description="name of the path; null if all drives have the same"
     )
-    right: float = Field(description="share of frames in which the model is right")
+    right: float = Field(description="fraction of frames in which the model is right")
     first_right: float | None = Field(
-        description="distance at the first of these; null without one"
+        description="distance at the first right frame; null without one"
     )
     longest_gap: float = Field(
-        description="seconds of the longest run of frames in which it is not"
+        description="seconds of the longest run of frames in which the model is wrong"
     )
-    flicker: float = Field(description="changes between right and wrong a second")
+    flicker: float = Field(description="changes between right and wrong per second")
 
 
 class TrackRates(Fields):
-    """What a tracker makes of a detector's boxes along whole drives."""
+    """How a tracker follows the object by a detector's boxes along full drives."""
 
-    tracker: str = Field(description="its name")
+    tracker: str = Field(description="name of the tracker")
     lost: OverDrives = Field(
-        description="share of the frames that see the object in which no track is on it"
+        description="fraction of the frames with the object in which no track is on it"
     )
     loose: OverDrives = Field(
-        description="likewise, in which none fits it, but a loose one is on it"
+        description="fraction of the frames with the object in which no track is on "
+        "it, but one overlaps it loosely"
     )
     switches: OverDrives = Field(
-        description="how often the track on it has another number than before"
+        description="number of frames in which the track on the object has another "
+        "number than before"
     )
     longest_gap: OverDrives = Field(
-        description="seconds of the longest run of frames without its track"
+        description="seconds of the longest run of frames without a track on the object"
     )
 
 
@@ -233,51 +249,54 @@ class DriveRates(Fields):
 
     model: str
     adversarial_run: str | None = Field(
-        description="the adversarial scene of a run; null without"
+        description="the run whose adversarial scene is used; null for the clean scene"
     )
-    drives: int = Field(description="how many there are with all their frames")
+    drives: int = Field(description="number of drives with all their frames")
     repeats: int = Field(
         default=1,
-        description="how often each was looked at, with other noise; its "
-        "numbers are the mean of these",
+        description="how often each drive was evaluated, with different noise; its "
+        "values are means over the repeats",
     )
-    frames: int = Field(description="of each drive")
-    seconds: float = Field(description="from the first frame to the last")
-    right: OverDrives = Field(description="share of frames in which the model is right")
+    frames: int = Field(description="number of frames of each drive")
+    seconds: float = Field(description="seconds from the first frame to the last")
+    right: OverDrives = Field(
+        description="fraction of frames in which the model is right"
+    )
     longest_gap: OverDrives = Field(
-        description="seconds of the longest run of frames in which it is not"
+        description="seconds of the longest run of frames in which the model is wrong"
     )
     first_right: OverDrives | None = Field(
-        description="distance at the first frame in which it is right, of drives that "
-        "have one; `interval` is null "
-        "where the plan does not say between which distances drives are"
+        description="distance at the first right frame, of drives that have one; "
+        "`interval` is null if the range of distances does not follow from the settings"
     )
-    unit: str = Field(default="object sizes", description="of that distance")
-    never_right: int = Field(description="drives without a frame in which it is right")
-    flicker: OverDrives = Field(description="changes between right and wrong a second")
+    unit: str = Field(default="object sizes", description="unit of that distance")
+    never_right: int = Field(description="number of drives without a right frame")
+    flicker: OverDrives = Field(
+        description="changes between right and wrong per second"
+    )
     tracks: TrackRates | None = optional_field(
-        "what a [tracker](drives.md#tracks) makes of the boxes; absent without a "
+        "results of a [tracker](drives.md#tracks) on the boxes; absent without a "
         "detector"
     )
     per_drive: list[DriveRecord] = Field(
-        default=[], description="the numbers of each drive, the first 1,000"
+        default=[], description="values of each of the first 1,000 drives"
     )
 
 
 class ChangeRates(CountedPredictions):
     """The predictions of a model on changed images.
 
-    `correct` are those that are as claimed.
+    `correct` counts the predictions that meet the claim.
     """
 
     model: str
     claim: str = Field(
-        description="`must_change`, or `must_not_change`: what the model says"
+        description="what the prediction has to do: `must_change` or `must_not_change`"
     )
-    when: str = Field(description="what was changed")
+    when: str = Field(description="how the picture was changed")
     row: int | None = Field(
-        description="number of the first picture in which it is "
-        "not as claimed; null without one"
+        description="number of the first picture whose prediction does not meet the "
+        "claim; null if all do"
     )
 
 
@@ -288,85 +307,89 @@ class SweepSummary(CountedPredictions, RunResult):
 
     object: str
     model: str
-    task: str = Field(description="what judges the predictions")
+    task: str = Field(description="the task that evaluates the predictions")
     image_formation: results.Formation | None
-    planned: int = Field(description="how many configurations there are")
+    planned: int = Field(description="number of configurations in the full sweep")
     out_of_view: int = Field(
         default=0,
-        description="configurations with nothing of the object in the picture; "
-        "`configurations` is without them",
+        description="number of configurations with nothing of the object in the "
+        "picture; `configurations` does not count them",
     )
     phantoms_out_of_view: int = Field(
         default=0,
-        description="of these, in how many a detector finds the object all "
-        "the same; absent without",
+        description="number of these in which a detector still finds the object; "
+        "absent if there are none",
     )
     not_finite: int = Field(
-        description="outputs that were not numbers; they count as not right"
+        description="number of outputs that were not numbers; they do not count as "
+        "right"
     )
     answers: dict[str, int] = Field(
-        description="how often each wrong prediction was given, the 20 most frequent"
+        description="counts of the 20 most frequent wrong predictions"
     )
     axes: list[AxisRow] = Field(description="a row for every value of every axis")
     cells: SweepMap | None = Field(
-        description="over the first two axes with several values; null where there are "
-        "fewer, or more than 4096 pairs"
+        description="map over the first two axes with several values; null if there "
+        "are fewer axes, or more than 4096 pairs of values"
     )
     arms: ArmComparison | None = optional_field(
-        "the clean scene beside [an adversarial "
-        "one](sweeps.md#an-adversarial-scene-beside-the-clean-one); absent without"
+        "the clean scene compared with [an adversarial "
+        "one](sweeps.md#an-adversarial-scene-beside-the-clean-one); absent without one"
     )
     worst: WorstConfiguration | None
     drives: list[DriveRates] | None = optional_field(
-        "of [whole drives](drives.md); absent where no frames of a path are swept"
+        "rates over [full drives](drives.md); absent if no frames of a path are swept"
     )
     changes: list[ChangeRates] | None = optional_field(
-        "of [pictures that are also shown changed](sweeps.md#is-it-looking); absent "
-        "unless asked"
+        "predictions on [changed pictures](sweeps.md#is-it-looking); absent if not "
+        "requested"
     )
     units: int | None = optional_field(
-        "draws that the configurations are of, such as [drives](drives.md), and "
-        "intervals over; absent "
-        "where none share one"
+        "number of independent draws of the configurations, such as "
+        "[drives](drives.md), over which the intervals are; absent if no "
+        "configurations share a draw"
     )
     grid: dict[str, int] = Field(
-        description="how many values each axis of the grid has"
+        description="number of values of each axis of the grid"
     )
     gains: dict[str, float] | None = optional_field(
-        "the gain of each scene, by object and environment; absent of one scene"
+        "the gain of each scene, by object and environment; absent for a single scene"
     )
     drawn: dict[str, results.VariedValue] = Field(
         default={},
-        description="what each value was drawn from, of parameters of few numbers",
+        description="what each value was sampled from, for parameters of few numbers",
     )
-    samples: int = Field(description="draws at each point of the grid")
-    sampler: str | None = Field(description="of the draws; null without any")
-    spp: int = Field(description="samples a pixel")
+    samples: int = Field(description="number of draws at each point of the grid")
+    sampler: str | None = Field(
+        description="sampler of the draws; null if nothing is sampled"
+    )
+    spp: int = Field(description="samples per pixel")
     renders: Annotated[dict[str, int], key_validator("sweep")] = Field(
-        description="of the sweep and of the verification; `products`: predicted "
-        "instead"
+        description="number of pictures that were rendered for the sweep and for its "
+        "verification; `products` are pictures that were predicted instead"
     )
     transport: results.LinearTransport | None = optional_field(
         "whether [basis pictures](transport.md#light) or [light on "
-        "surfaces](surface-light.md#sweeps) "
-        "predicted pictures; absent where neither light nor camera moves"
+        "surfaces](surface-light.md#sweeps) predicted pictures; absent if neither "
+        "light nor camera moves"
     )
     surface: SurfaceMap | None = optional_field(
-        "which parts of the [surface](sweeps.md#the-surface), when seen, go with wrong "
-        "predictions; absent unless asked"
+        "which parts of the [surface](sweeps.md#the-surface), when visible, go with "
+        "wrong predictions; absent if not requested"
     )
     shared: results.SharedWork | None = optional_field(
-        "how [workers](cluster.md) did that shared the work; absent without"
+        "the [workers](cluster.md) that shared the work; absent without workers"
     )
     renders_per_second: float | None = Field(
-        description="pictures of the sweep; null where nothing was rendered now",
+        description="rendered pictures of the sweep per second; null if nothing was "
+        "rendered now",
         json_schema_extra=as_fact("{:.3g}"),
     )
-    warnings: list[str] = Field(description="sentences that a reader has to know")
+    warnings: list[str] = Field(description="remarks that limit what the result shows")
 
     @property
     def looked_at(self) -> int:
-        """Configurations with a prediction, also those out of view."""
+        """Number of configurations with a prediction, also those out of view."""
         return self.configurations + self.out_of_view
 
     @property

@@ -1,10 +1,11 @@
 """Find which parts of an object's surface, when visible, go with wrong predictions.
 
-docs/sweeps.md, "The surface". The interval of a difference is Newcombe's (1998,
-Statistics in Medicine 17, method 10) from Wilson's (1927). What may be chance is found
-by permuting the wrong predictions, each time with the part that stands out most
-(Westfall and Young 1993, the single-step maximum) by the likelihood ratio. Where images
-share a draw (frames of a drive), full draws are permuted, and there is no interval.
+See docs/sweeps.md, "The surface". The interval of a difference is that of Newcombe
+(1998, Statistics in Medicine 17, method 10), from Wilson's (1927). Whether a difference
+may be chance is tested by permuting the wrong predictions: the likelihood ratio of a
+part is compared with the largest one of all parts in each permutation (Westfall and
+Young 1993, single-step maximum). If images share a draw (frames of a drive), the
+predictions of a draw are permuted together, and there is no interval.
 """
 
 from __future__ import annotations
@@ -45,9 +46,9 @@ from advsearch.trust.writing import write_bytes
 
 Int64Array = npt.NDArray[np.int64]
 Float64Array = npt.NDArray[np.float64]
-# permutations of the wrong predictions, so that no p-value is under 0.005
+# number of permutations of the wrong predictions; no p-value is below 1 / 200
 N_PERMUTATIONS = 199
-# the chance that any part is significant if none has to do with the predictions
+# probability that any part is significant if no part affects the predictions
 SIGNIFICANCE_LEVEL = 0.05
 
 
@@ -55,15 +56,15 @@ class PartCounts:
     """Counts of images and of wrong predictions for n parts of a surface.
 
     Attributes:
-        n_images: images in all.
-        n_failures: images whose prediction is wrong.
-        visible_counts: (n,) images that show each part.
-        wrong_counts: (n,) failures among these.
-        permuted_counts: (N_PERMUTATIONS, n) the same after each permutation of the
-            failures.
-        permuted_failures: bits of (N_PERMUTATIONS, images), packed along the first
-            axis: the permuted failures, from `permute_draws`; None permutes single
-            images.
+        n_images: number of images.
+        n_failures: number of images whose prediction is wrong.
+        visible_counts: (n,) number of images that show each part.
+        wrong_counts: (n,) number of failures among these.
+        permuted_counts: (N_PERMUTATIONS, n) what `wrong_counts` is after each
+            permutation of the failures.
+        permuted_failures: (bytes of N_PERMUTATIONS bits, n_images) whether each image
+            is a failure in each permutation, from `permute_draws`; None permutes single
+            images while they are added.
     """
 
     def __init__(
@@ -77,12 +78,12 @@ class PartCounts:
         """Begin with counts of 0.
 
         Args:
-            n_parts: parts of the surface.
-            n_images: images that will be added.
-            n_failures: those of them whose prediction is wrong.
+            n_parts: number of parts of the surface.
+            n_images: number of images that will be added.
+            n_failures: number of these whose prediction is wrong.
             seed: seed of the permutations.
-            permuted_failures: permutations from `permute_draws`, packed as bits; None
-                permutes single images while they are added.
+            permuted_failures: permutations from `permute_draws`; None permutes single
+                images while they are added.
         """
         self.permuted_failures = permuted_failures
         self.n_images = n_images
@@ -90,7 +91,7 @@ class PartCounts:
         self.visible_counts = np.zeros(n_parts, np.int64)
         self.wrong_counts = np.zeros(n_parts, np.int64)
         self.permuted_counts = np.zeros((N_PERMUTATIONS, n_parts), np.uint32)
-        # for the sequential sampling in `add`
+        # for the sequential sampling in `add`; failures left in each permutation
         self._images_left = n_images
         self._failures_left = np.full(N_PERMUTATIONS, n_failures)
         self._random = np.random.default_rng(seed)
@@ -98,101 +99,107 @@ class PartCounts:
     def add(self, parts: Int64Array, failed: bool) -> None:
         """Count an image, and decide in which permutations it is a failure.
 
-        A permutation deals the failures out to the images anew, at random: its counts
-        are what chance alone could give if predictions had nothing to do with the
+        A permutation assigns the failures to the images anew, at random. Its counts
+        show what chance alone would give if the predictions did not depend on the
         parts. Images are added in the order of `permuted_failures`, `n_images` in all.
 
         Args:
-            parts: indices of the parts that it shows, each once.
+            parts: indices of the parts that the image shows, each once.
             failed: whether its prediction is wrong.
         """
         self.visible_counts[parts] += 1
         self.wrong_counts[parts] += failed
         if self.permuted_failures is not None:
-            # one bit for each permutation, in the column of this image
+            # The column of this image has one bit for each permutation.
             image = self.n_images - self._images_left
-            bits = np.unpackbits(self.permuted_failures[:, image], count=N_PERMUTATIONS)
-            permuted_failure = bits.astype(bool)
+            packed_bits = self.permuted_failures[:, image]
+            is_failure = np.unpackbits(packed_bits, count=N_PERMUTATIONS).astype(bool)
         else:
             # Sequential sampling (Knuth's algorithm S): an image is a failure with the
             # probability failures left / images left, so that each choice of
             # `n_failures` images is equally likely.
             uniform = self._random.random(N_PERMUTATIONS)
-            permuted_failure = uniform * self._images_left < self._failures_left
+            is_failure = uniform * self._images_left < self._failures_left
         self._images_left -= 1
-        self._failures_left = self._failures_left - permuted_failure
-        self.permuted_counts[np.ix_(np.flatnonzero(permuted_failure), parts)] += 1
+        # In each permutation in which the image is a failure (True is 1), one failure
+        # fewer is left, and each of its parts has one failure more.
+        self._failures_left = self._failures_left - is_failure
+        failing_permutations = np.flatnonzero(is_failure)
+        self.permuted_counts[np.ix_(failing_permutations, parts)] += 1
 
 
 def compare_parts(
     counts: PartCounts, part_slice: slice, min_images: int
 ) -> pd.DataFrame:
-    """Compare the predictions where a part is visible with those where it is not.
+    """Compare predictions about images that show a part with those that do not.
 
     Intervals: Newcombe (1998), method 10. P-values: single-step maximum of the
     likelihood ratio over permutations (Westfall and Young 1993).
 
     Args:
         counts: counts of all parts.
-        part_slice: the parts that are compared.
-        min_images: images of either kind that a comparison takes.
+        part_slice: the parts to compare.
+        min_images: number of images that have to show a part, and number that have to
+            hide it, for a comparison.
 
     Returns:
-        A row per part, by its index; NaN where it was not `compared`. `difference`:
-        fraction of wrong predictions where the part is visible, less that where it is
-        not; `low` and `high`: bounds of its 95 % interval, for the part by itself, NaN
-        where images share a draw; `p`: probability that any part stands out as far by
-        chance; `significant`: whether `p` is at most `SIGNIFICANCE_LEVEL`; `strength`:
-        the bound that is nearer to 0, without its sign, 0 if the interval contains 0.
-        Without an interval `strength` is the absolute difference.
+        A row for each part, by its index; NaN if it was not `compared`. `difference`:
+        fraction of wrong predictions where the part is visible, minus that where it is
+        hidden; `low` and `high`: bounds of its 95 % interval for this part alone, NaN
+        if images share a draw; `p`: probability that any part would differ at least as
+        clearly by chance; `significant`: whether `p` is at most `SIGNIFICANCE_LEVEL`;
+        `strength`: distance of the interval from 0, which is 0 if the interval contains
+        0. Without an interval `strength` is the absolute difference.
     """
     n_visible = counts.visible_counts[part_slice]
     n_hidden = counts.n_images - n_visible
     is_compared = (n_visible >= min_images) & (n_hidden >= min_images)
+    # the columns that `_compute_comparison` returns, in its order
     nan_columns = dict.fromkeys(("difference", "low", "high", "p"), np.nan)
     part_indices = np.arange(len(counts.visible_counts))[part_slice]
     parts = pd.DataFrame(nan_columns, index=part_indices).assign(compared=is_compared)
     if is_compared.any():
         columns = _compute_comparison(counts, part_indices[is_compared])
         parts.loc[is_compared, list(nan_columns)] = columns
-    # Positive if both bounds are on the same side of 0: then either `low` or `-high` is
-    # positive, and it is the distance from 0.
-    nearer_bound = np.where(
-        parts.low.isna(), parts.difference.abs(), np.maximum(parts.low, -parts.high)
-    )
+    has_no_interval = parts.low.isna()
+    # If the interval lies above 0, its distance from 0 is `low`; if it lies below,
+    # `-high`. The other one is negative then. If it contains 0, both are.
+    distance_from_0 = np.maximum(parts.low, -parts.high)
+    strength = np.where(has_no_interval, parts.difference.abs(), distance_from_0)
     return parts.assign(
         significant=parts.p <= SIGNIFICANCE_LEVEL,
-        strength=np.nan_to_num(np.maximum(nearer_bound, 0.0)),
+        strength=np.nan_to_num(np.maximum(strength, 0.0)),
     )
 
 
 def _compute_comparison(counts: PartCounts, parts: Int64Array) -> Float64Array:
-    """Compute difference, lower and upper bound and p-value of parts, (m, 4).
+    """Compute difference, lower bound, upper bound and p-value of parts, (m, 4).
 
-    The difference is the rate of wrong predictions where the part is visible, less that
-    elsewhere. Where images share a draw, they are not independent, and the bounds are
-    NaN.
+    The difference is the rate of wrong predictions where the part is visible, minus
+    that where it is hidden. If images share a draw, they are not independent, and the
+    bounds are NaN.
 
     Args:
         counts: counts of all parts.
-        parts: (m,) indices of those that are compared.
+        parts: (m,) indices of the parts to compare.
     """
     n = counts.visible_counts[parts]
     k = counts.wrong_counts[parts]
-    difference, low, high = _newcombe(
+    difference, low, high = _compare_rates(
         k, n, other_k=counts.n_failures - k, other_n=counts.n_images - n
     )
-    if counts.permuted_failures is not None:  # images share draws
+    share_draws = counts.permuted_failures is not None
+    if share_draws:
         low = np.full(len(n), np.nan)
-        high = low
-    p_value = _permutation_p_value(counts, k, n, parts)
+        high = np.full(len(n), np.nan)
+    p_value = _compute_permutation_p_value(counts, k, n, parts)
     return np.stack([difference, low, high, p_value], axis=1)
 
 
-def _permutation_p_value(
+def _compute_permutation_p_value(
     counts: PartCounts, k: Int64Array, n: Int64Array, parts: Int64Array
 ) -> Float64Array:
-    """Compute how likely it is that any part stands out as far as each by chance.
+    """Compute for each part the probability that any part differs as clearly by chance.
 
     The p-value of a part is the fraction of permutations in which the largest statistic
     of all parts is at least the statistic of this part. The data themselves count as
@@ -200,31 +207,32 @@ def _permutation_p_value(
 
     Args:
         counts: counts with the permuted failures of all parts.
-        k: (m,) failures among the images that show each compared part.
-        n: (m,) these images.
+        k: (m,) number of failures among the images that show each compared part.
+        n: (m,) number of these images.
         parts: (m,) indices of the compared parts.
     """
     images = counts.n_images
     failures = counts.n_failures
-    # the largest statistic of any part in each permutation, ascending
+    # The number of images that show a part is the same in all permutations. Only the
+    # number of failures among them changes.
     max_statistics = np.sort(
         [
-            _likelihood_ratio(
-                permuted[parts].astype(np.int64), n, failures, images
+            _compute_likelihood_ratio(
+                failure_counts[parts].astype(np.int64), n, failures, images
             ).max()
-            for permuted in counts.permuted_counts
+            for failure_counts in counts.permuted_counts
         ]
     )
-    statistic = _likelihood_ratio(k, n, failures, images)
+    statistic = _compute_likelihood_ratio(k, n, failures, images)
     n_permutations = len(max_statistics)
-    # permutations whose largest statistic is at least that of the part, except for
-    # rounding
+    # number of permutations whose largest statistic is at least that of the part; the
+    # tolerance is for rounding
     tolerance = 1e-9
     n_above = n_permutations - np.searchsorted(max_statistics, statistic - tolerance)
     return np.asarray((1 + n_above) / (1 + n_permutations))
 
 
-def _likelihood_ratio(
+def _compute_likelihood_ratio(
     k: Int64Array, n: Int64Array, n_failures: int, n_images: int
 ) -> Float64Array:
     """Compute the likelihood ratio statistic of two failure rates against one (G-test).
@@ -256,7 +264,7 @@ def _likelihood_ratio(
     return np.asarray(2.0 * log_ratio)
 
 
-def _newcombe(
+def _compare_rates(
     k: Int64Array, n: Int64Array, other_k: Int64Array, other_n: Int64Array
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Compute the difference k/n - other_k/other_n with its 95 % interval.
@@ -277,16 +285,15 @@ def _newcombe(
     return difference, low, high
 
 
-# images that have to show a part, and as many that do not, before its predictions are
-# compared
+# A part is compared if at least this many images show it, and as many do not.
 MIN_IMAGES = 5
 MIN_RAYS = 4 * MAP_SIZE
-"""Rays along each side of an image, at least: in smaller images, many cells would lie
-between two pixels.
+"""Minimum number of rays along each side of an image. With fewer, many cells of the map
+would lie between two pixels.
 """
 MAX_LISTED_PARTS = 5
-"""Parts of each kind that the summary lists, at most, that go with wrong predictions,
-and as many with right ones.
+"""Maximum number of parts of each kind that the summary lists: so many that go with
+wrong predictions, and as many that go with right ones.
 """
 # distance between two listed parts, in units of the object's largest extent, so that
 # a spot is listed once
@@ -300,11 +307,11 @@ VIEW_ANGLES = (
     (0.0, 80.0),
     (0.0, -60.0),
 )
-"""Azimuth and elevation of the cameras that show the object in colours, degrees."""
+"""Azimuth and elevation in degrees of the cameras of the figure's views."""
 VIEW_SIZE = 240
 # the prediction of an image without a row, or without the object
 UNKNOWN = -1
-BATCH_SIZE = 16  # images whose configurations are computed at once
+BATCH_SIZE = 16  # number of images whose configurations are computed at once
 
 
 class SurfaceCounts:
@@ -312,7 +319,7 @@ class SurfaceCounts:
 
     Attributes:
         parts: the parts of the surface.
-        part_counts: their counts for each model.
+        part_counts: counts of the parts for each model.
     """
 
     def __init__(self, parts: SurfaceParts, part_counts: Sequence[PartCounts]) -> None:
@@ -322,8 +329,8 @@ class SurfaceCounts:
     def add(self, surfaces: Surfaces, wrong_by_model: Mapping[int, bool]) -> None:
         """Count an image for each model.
 
-        Parts are the cells of the map; on a mesh of few faces also the faces, whose
-        indices follow those of the cells.
+        Parts are the cells of the map. On a mesh of few faces, the faces are parts,
+        too; their indices follow those of the cells.
 
         Args:
             surfaces: the surface that each pixel of the image shows.
@@ -347,10 +354,11 @@ class SurfaceCounts:
         kind: str,
         compared: pd.DataFrame,
     ) -> SurfaceTable:
-        """Return how a model's predictions go with the parts of one kind.
+        """Return how a model's predictions depend on the parts of one kind.
 
-        `strongest` of the table lists the most significant parts, no two close to each
-        other: first those that go with wrong predictions, then with right ones.
+        `strongest` of the table lists the strongest significant parts, no two of them
+        close to each other: first those that go with wrong predictions, then those that
+        go with right ones.
 
         Args:
             object_name: name of the object.
@@ -367,24 +375,23 @@ class SurfaceCounts:
                 self._describe_part(part, counts, compared)
                 for part in self._select_spread(compared[is_candidate])
             ]
+        visible_counts = counts.visible_counts[self.parts.part_slices[kind]]
         return SurfaceTable(
             object=object_name,
             model=model,
             part=kind,
             unwrapped=self.parts.is_unwrapped,
-            visible=int(
-                (counts.visible_counts[self.parts.part_slices[kind]] > 0).sum()
-            ),
-            compared=int(compared.compared.sum()),
+            visible=int((visible_counts > 0).sum()),
+            compared=int(compared["compared"].sum()),
             worse=int(is_worse.sum()),
             better=int(is_better.sum()),
             strongest=strongest,
         )
 
     def _select_spread(self, candidates: pd.DataFrame) -> list[int]:
-        """Select the strongest parts of which none is close to another.
+        """Select the strongest parts such that no two are close to each other.
 
-        Of two parts within `MIN_PART_DISTANCE` the weaker one is left out; at most
+        Of two parts within `MIN_PART_DISTANCE` the weaker one is left out. At most
         `MAX_LISTED_PARTS` are selected.
         """
         extent = float(np.ptp(self.parts.mesh.vertices, axis=0).max())
@@ -402,7 +409,7 @@ class SurfaceCounts:
     def _describe_part(
         self, part: int, counts: PartCounts, compared: pd.DataFrame
     ) -> SurfacePart:
-        """Return the counts and the comparison of one part, as the summary has them.
+        """Return the counts and the comparison of one part for the summary.
 
         Args:
             part: index of the part.
@@ -413,17 +420,22 @@ class SurfaceCounts:
         n_visible_wrong = int(counts.wrong_counts[part])
         n_hidden = counts.n_images - n_visible
         n_hidden_wrong = counts.n_failures - n_visible_wrong
+        n_visible_right = n_visible - n_visible_wrong
+        n_hidden_right = n_hidden - n_hidden_wrong
         u, v = self.parts.center_uvs[part].tolist()
         return SurfacePart(
             face=int(self.parts.face[part]),
             u=u,
             v=v,
             center=self.parts.centers[part].tolist(),
-            visible=count_independent(n_visible - n_visible_wrong, n_visible),
-            hidden=count_independent(n_hidden - n_hidden_wrong, n_hidden),
-            difference=float(compared.difference[part]),
-            interval=(float(compared.low[part]), float(compared.high[part])),
-            p=float(compared.p[part]),
+            visible=count_independent(n_visible_right, n_visible),
+            hidden=count_independent(n_hidden_right, n_hidden),
+            difference=float(compared.loc[part, "difference"]),
+            interval=(
+                float(compared.loc[part, "low"]),
+                float(compared.loc[part, "high"]),
+            ),
+            p=float(compared.loc[part, "p"]),
         )
 
 
@@ -436,12 +448,12 @@ def map_surface(
 
     Args:
         scenes: scenes of the sweep.
-        rows: all of its rows.
+        rows: all rows of the sweep.
         run: run directory into which the files are written.
         progress: advances by the number of predictions.
 
     Returns:
-        What the summary says.
+        The tables for the summary.
     """
     job = scenes.job
     wrong = _read_wrong(scenes, rows)  # (scenes, images, models)
@@ -462,9 +474,11 @@ def _read_wrong(scenes: SceneLoader, rows: Iterable[Row]) -> npt.NDArray[np.int8
     shape = (len(job.scenes), job.images_per_scene, len(job.models))
     wrong: npt.NDArray[np.int8] = np.full(shape, UNKNOWN, np.int8)
     for row in rows:
-        # An image without the object doesn't count as one that hides a part either.
+        # If nothing of the object is in an image, the image counts neither as one that
+        # shows a part nor as one that hides it.
         if row.label != OUT_OF_VIEW:
-            wrong.flat[row.step] = not read_judgement(row).right
+            row_number = row.step
+            wrong.flat[row_number] = not read_judgement(row).right
     return wrong
 
 
@@ -481,13 +495,16 @@ def _make_counts(
         wrong: (scenes, images, models) 1, 0 or UNKNOWN, from `_read_wrong`.
     """
     job = scenes.job
-    draws = _draw_of_images(scenes, wrong, job)
+    draws = _find_draws(scenes, wrong, job)
     n_models = len(job.models)
     counts = dict[str, SurfaceCounts]()
     for object_index, (name, asset) in enumerate(assets.items()):
         parts = SurfaceParts(asset.mesh)
-        has_object = [named_scene.object == name for named_scene in job.scenes]
-        # Each pair of an object and a model has a seed, so permutations, of its own.
+        has_object = np.array(
+            [named_scene.object == name for named_scene in job.scenes]
+        )
+        # Each pair of an object and a model has a seed of its own, and so permutations
+        # of its own.
         model_seeds = [
             seeds.stream(job.config.seed, "surface", object_index * n_models + model)
             for model in range(n_models)
@@ -502,7 +519,7 @@ def _make_counts(
     return counts
 
 
-def _draw_of_images(
+def _find_draws(
     scenes: SceneLoader, wrong: npt.NDArray[np.int8], job: Job
 ) -> npt.NDArray[Any]:
     """Return the draw of each image, (scenes, images of a scene)."""
@@ -523,8 +540,8 @@ def _make_part_counts(
         seed: seed of the permutations.
     """
     permuted = permute_draws(wrong.ravel(), draws.ravel(), seed)
-    n_known = int((wrong >= 0).sum())  # UNKNOWN is below 0
-    n_failures = int((wrong >= 1).sum())
+    n_known = int((wrong != UNKNOWN).sum())
+    n_failures = int((wrong == 1).sum())
     return PartCounts(parts.count, n_known, n_failures, seed, permuted)
 
 
@@ -535,7 +552,7 @@ def _count_scene(
     counts: SurfaceCounts,
     progress: Progress,
 ) -> None:
-    """Trace the surface in every image of a scene and count it.
+    """Find the visible surface in every image of a scene and count its parts.
 
     Small images are traced with several rays per pixel; see `MIN_RAYS`. Models of one
     image size share the traced image.
@@ -543,7 +560,7 @@ def _count_scene(
     Args:
         scenes: scenes of the sweep.
         scene: the index of the scene.
-        wrong: (images, models) of the scene, from `_read_wrong`.
+        wrong: (images, models) 1, 0 or UNKNOWN, from `_read_wrong`.
         counts: counts of the scene's object.
         progress: advances by the number of predictions.
     """
@@ -555,25 +572,23 @@ def _count_scene(
             models = [
                 model for model in range(n_models) if job.image_sizes[model] == size
             ]
+            # The scenes before this one have the same number of images each.
             configurations = swept_scene.points_of_size[size].make_configurations(
-                # every scene before this one has as many images
-                batch.start,
-                len(batch),
-                before=scene * n_images,
+                batch.start, len(batch), before=scene * n_images
             )
             # at least `MIN_RAYS` rays along the shorter side of the image
             rays_per_pixel = ceil(MIN_RAYS / min(size))
             renderer = swept_scene.renderer_of_size[size]
-            for number, u in zip(batch, configurations, strict=True):
+            for number_in_scene, u in zip(batch, configurations, strict=True):
                 surfaces = renderer.surfaces(u, rays_per_pixel)
-                counts.add(surfaces, _select_known(wrong[number], models))
+                counts.add(surfaces, _select_known(wrong[number_in_scene], models))
         progress.advance(len(batch) * n_models)
 
 
 def _select_known(
     wrong: npt.NDArray[np.int8], models: Sequence[int]
 ) -> dict[int, bool]:
-    """Return whether each model is wrong, by its index, where that is known.
+    """Return whether each model is wrong, by its index, without unknown predictions.
 
     Args:
         wrong: (all models,) 1, 0 or UNKNOWN.
@@ -591,14 +606,15 @@ def permute_draws(
     together to another draw.
 
     Args:
-        wrong: (n,) whether each prediction is wrong, or UNKNOWN; every draw has as many
-            images.
+        wrong: (n,) whether each prediction is wrong, or UNKNOWN. Every draw has the
+            same number of images.
         draws: (n,) the draw of each image.
         seed: seed of the permutations.
 
     Returns:
-        Whether the permuted predictions are wrong, without unknown ones, packed as
-        `PartCounts` takes them; None if each image has a draw of its own.
+        (bytes of N_PERMUTATIONS bits, known images) whether the predictions are wrong
+        in each permutation; None if each image has a draw of its own. A known image may
+        get an unknown prediction, which counts as not wrong.
     """
     is_known = wrong != UNKNOWN
     draw_sizes = np.unique(draws, return_counts=True)[1]  # images of each draw
@@ -610,10 +626,10 @@ def permute_draws(
     images_of_draw = np.argsort(draws, kind="stable").reshape(n_draws, -1)
     generator = np.random.default_rng(seed)
     permuted = np.zeros((N_PERMUTATIONS, len(wrong)), bool)
-    for permutation in permuted:
-        # `permutation` is a row of `permuted`, which this fills.
+    for permutation_index in range(N_PERMUTATIONS):
         order = generator.permutation(n_draws)
-        permutation[images_of_draw] = is_wrong[images_of_draw[order]]
+        source_images = images_of_draw[order]
+        permuted[permutation_index, images_of_draw] = is_wrong[source_images]
     return np.packbits(permuted[:, is_known], axis=0)
 
 
@@ -642,12 +658,12 @@ def _write_map(
             _compare_kinds(model_counts, object_counts.parts)
             for model_counts in object_counts.part_counts
         ]
-        for array_name, array in _stored_arrays(object_counts, comparisons).items():
+        for array_name, array in _list_arrays(object_counts, comparisons).items():
             arrays[f"{array_name}_{number}"] = array
         panels += _make_panels(assets[name], object_counts, comparisons, name, models)
         tables += _make_tables(models, object_counts, comparisons, name)
     _write_arrays(run, arrays)
-    _save_figure(panels[:MAX_PANELS], run)
+    _save_figure(panels[:MAX_PANELS], run)  # the file above has all counts
     return SurfaceMap(
         file=COUNTS_FILE, cells=MAP_SIZE, min_pictures=MIN_IMAGES, tables=tables
     )
@@ -688,7 +704,7 @@ def _write_arrays(run: RunDirectory, arrays: dict[str, Any]) -> None:
 
 
 def _compare_kinds(counts: PartCounts, parts: SurfaceParts) -> dict[str, pd.DataFrame]:
-    """Compare the predictions of a model by the parts of each kind."""
+    """Compare the parts of each kind (cells, faces) for a model, by the kind's name."""
     return {
         kind: compare_parts(counts, part_slice, MIN_IMAGES)
         for kind, part_slice in parts.part_slices.items()
@@ -715,35 +731,36 @@ def _make_panels(
     for model, model_counts, compared_by_kind in zip(
         models, counts.part_counts, comparisons, strict=True
     ):
-        cells = compared_by_kind["cell"]
+        cells = compared_by_kind["cell"]  # the figure shows no faces
+        significant_difference = cells.difference.where(cells.significant)  # else NaN
         yield Panel(
             title=f"{shorten_name(object_name)}, {shorten_name(model)}",
-            grey_colors=_grey_colors(counts.parts, model_counts, cells),
-            difference=cells.difference.where(cells.significant).to_numpy(),
+            grey_colors=_compute_grey_colors(counts.parts, model_counts, cells),
+            difference=significant_difference.to_numpy(),
             views=views,
         )
 
 
 def _save_figure(panels: Sequence[Panel], run: RunDirectory) -> None:
     size = (10.0, 0.5 + 3.6 * len(panels))
-    figures = render_figure(partial(_draw, panels), size, kinds=("png",))
+    figures = render_figure(partial(_draw_panels, panels), size, kinds=("png",))
     for suffix, data in figures.items():
         write_bytes(run.path / "images" / f"surface.{suffix}", data)
 
 
-def _stored_arrays(
+def _list_arrays(
     counts: SurfaceCounts, comparisons: Sequence[Mapping[str, pd.DataFrame]]
 ) -> dict[str, npt.NDArray[Any]]:
-    """Return the arrays that the file holds of an object, by their names.
+    """Return the arrays that the file stores for an object, by their names.
 
     Args:
         counts: counts of the object.
-        comparisons: comparisons from `compare_parts`, by the kind of part, for each
-            model.
+        comparisons: for each model, the comparison of its parts by kind, from
+            `compare_parts`.
 
     Returns:
-        Arrays whose first axis is the models, (models,) or (models, parts); "map" has
-        the corners of the parts.
+        Arrays (models,) or (models, parts), and "map", which has the corners of the
+        parts.
     """
     model_counts = counts.part_counts
     arrays: dict[str, npt.NDArray[Any]] = {
@@ -753,6 +770,7 @@ def _stored_arrays(
         "wrong": np.stack([part_counts.wrong_counts for part_counts in model_counts]),
     }
     for column in ("difference", "low", "high", "p"):
+        # Parts are numbered by kind, in the order of the kinds.
         column_of_model = [
             np.concatenate([compared[column] for compared in compared_by_kind.values()])
             for compared_by_kind in comparisons
@@ -762,7 +780,7 @@ def _stored_arrays(
     return arrays
 
 
-def _grey_colors(
+def _compute_grey_colors(
     parts: SurfaceParts, counts: PartCounts, cells: pd.DataFrame
 ) -> Float64Array:
     """Return the colors (cells, 3) of cells without a significant difference.
@@ -776,14 +794,16 @@ def _grey_colors(
         cells: comparison of the cells, from `compare_parts`.
     """
     was_visible = counts.visible_counts[parts.part_slices["cell"]] > 0
+    # A cell may be visible though its center, which `is_covered` tests, is not covered.
     has_surface = parts.is_covered.ravel() | was_visible
     is_compared = cells.compared.to_numpy()
     colors = np.where(is_compared[:, None], NOT_SIGNIFICANT_GREY, NOT_COMPARED_GREY)
     return np.where(has_surface[:, None], colors, WHITE)
 
 
-MAX_PANELS = 12  # pairs of object and model in the figure; the file has all counts
-# the direction to the light that shades the object, world space; of length 1
+# maximum number of panels, pairs of object and model, in the figure
+MAX_PANELS = 12
+# unit vector to the light that shades the object, in world space
 LIGHT_DIRECTION = (0.36, 0.48, 0.80)
 COLORMAP = "PuOr_r"
 """ColorBrewer's purple to orange, which color-blind people can tell apart: orange is
@@ -799,16 +819,19 @@ GREY_LABELS = {
     NOT_SIGNIFICANT_GREY: "not told from chance",
     NOT_COMPARED_GREY: "too few pictures with or without it",
 }
-N_VIEW_ROWS = 2  # of the views of an object
+N_VIEW_ROWS = 2  # rows of the views of an object
+VIEWS_WIDTH = 1.55  # width of the views, in widths of the map
+MIN_SHADE = 0.7  # brightness of a surface that faces away from the light
+LIT_SHADE = 0.3  # what is added where the surface faces the light
 
 
 class MapView(NamedTuple):
-    """What a camera sees of an object.
+    """An image of an object that shows the cells of its map.
 
     Attributes:
         title: position of the camera, as text.
-        cells: (H, W) index of the cell in each pixel, row by row of the map; -1 where
-            the object is not.
+        cells: (H, W) index of the cell in each pixel, row by row of the map; -1 without
+            the object.
         shade: (H, W) brightness in [0, 1].
     """
 
@@ -821,10 +844,10 @@ class Panel(NamedTuple):
     """What the figure shows of one object and one model.
 
     Attributes:
-        title: names of both.
-        grey_colors: (cells, 3) of cells without a significant difference.
-        difference: (cells,) by how much predictions are wrong more often where the
-            cell is visible; NaN where that is not significant.
+        title: names of the object and the model.
+        grey_colors: (cells, 3) colors of the cells without a significant difference.
+        difference: (cells,) fraction of wrong predictions where the cell is visible,
+            minus that where it is hidden; NaN if not significant.
         views: views of the object.
     """
 
@@ -835,11 +858,11 @@ class Panel(NamedTuple):
 
 
 def _render_views(asset: ObjectAsset, parts: SurfaceParts) -> Iterator[MapView]:
-    """Yield the views of the object by itself from the cameras in `VIEW_ANGLES`.
+    """Yield the views of the object alone from the cameras in `VIEW_ANGLES`.
 
     Args:
         asset: the object.
-        parts: parts of its surface, whose cells the pixels of a view are looked up in.
+        parts: parts of its surface; their cells are found for each pixel.
     """
     # without a ground, which would hide the object from below
     scene_of_object = load_scene(asset, settings={"ground.size": 0.0})
@@ -849,7 +872,7 @@ def _render_views(asset: ObjectAsset, parts: SurfaceParts) -> Iterator[MapView]:
         viewed = description.with_values(
             camera__azimuth=azimuth, camera__elevation=elevation
         )
-        to_world = camera_to_world(viewed, 1.0).astype(np.float32)
+        to_world = camera_to_world(viewed, aspect=1.0).astype(np.float32)
         surfaces = scene.find_surfaces({"camera.to_world": torch.from_numpy(to_world)})
         is_object = surfaces.visible_mask(OBJECT).numpy()
         face = surfaces.face.numpy()[is_object]
@@ -857,11 +880,12 @@ def _render_views(asset: ObjectAsset, parts: SurfaceParts) -> Iterator[MapView]:
         cells = np.full(is_object.shape, -1, np.int64)
         cells[is_object] = parts.find_cells(face, uv)
         cosine = np.clip(surfaces.normal.numpy() @ np.array(LIGHT_DIRECTION), 0.0, 1.0)
-        shade = 0.7 + 0.3 * cosine  # never so dark that colors are hard to tell apart
+        # never so dark that colors are hard to distinguish
+        shade = MIN_SHADE + LIT_SHADE * cosine
         yield MapView(f"{azimuth:g}°, {elevation:g}° up", cells, shade)
 
 
-def _draw(panels: Sequence[Panel], figure: Any) -> None:
+def _draw_panels(panels: Sequence[Panel], figure: Any) -> None:
     """Draw a row for each panel: the map of the surface, and the object from six sides.
 
     All panels have the same scale of colors, which is symmetric around 0.
@@ -876,12 +900,13 @@ def _draw(panels: Sequence[Panel], figure: Any) -> None:
     scale = mpl.cm.ScalarMappable(
         mpl.colors.Normalize(-limit, limit), mpl.colormaps[COLORMAP]
     )
-    axes = figure.subplots(len(panels), 2, squeeze=False, width_ratios=(1.0, 1.55))
+    axes = figure.subplots(
+        len(panels), 2, squeeze=False, width_ratios=(1.0, VIEWS_WIDTH)
+    )
     for (map_axes, view_axes), panel in zip(axes, panels, strict=True):
-        is_grey = np.isnan(panel.difference)[:, None]
-        scale_colors = scale.to_rgba(panel.difference)[:, :3]
-        cell_colors = np.where(is_grey, panel.grey_colors, scale_colors)
+        cell_colors = _color_cells(panel, scale)
         map_axes.imshow(
+            # Row 0 of the cells is at v = 1, the top of the image.
             cell_colors.reshape(MAP_SIZE, MAP_SIZE, 3),
             extent=(0, 1, 0, 1),
             interpolation="nearest",
@@ -890,7 +915,7 @@ def _draw(panels: Sequence[Panel], figure: Any) -> None:
         map_axes.set_title(panel.title)
         _draw_views(view_axes, panel.views, cell_colors)
 
-    # the color bar stands beside all rows, and need not be as high
+    # One color bar for all rows stands at their right; it need not be as high.
     shrink = 0.8 if len(panels) == 1 else 0.4
     bar = figure.colorbar(scale, ax=axes, shrink=shrink, format=_format_percent)
     bar.set_label(
@@ -901,6 +926,18 @@ def _draw(panels: Sequence[Panel], figure: Any) -> None:
         for color, label in GREY_LABELS.items()
     ]
     figure.legend(handles=patches, loc="outside lower center", ncols=2)
+
+
+def _color_cells(panel: Panel, scale: Any) -> Float64Array:
+    """Return the color (cells, 3) of each cell of a map.
+
+    Args:
+        panel: panel of the figure; cells without a significant difference are gray.
+        scale: matplotlib's map from differences to colors.
+    """
+    is_grey = np.isnan(panel.difference)[:, None]
+    scale_colors = scale.to_rgba(panel.difference)[:, :3]
+    return np.where(is_grey, panel.grey_colors, scale_colors)
 
 
 def _find_scale_limit(panels: Sequence[Panel]) -> float:
@@ -919,7 +956,7 @@ def _draw_views(axes: Any, views: Sequence[MapView], cell_colors: Float64Array) 
 
     Args:
         axes: axes of matplotlib.
-        views: each with the cell of the map, or -1, and the shade of every pixel.
+        views: views with the cell, or -1, and the shade of every pixel.
         cell_colors: (cells, 3) color of each cell.
     """
     axes.axis("off")

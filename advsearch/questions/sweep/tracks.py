@@ -1,8 +1,8 @@
 """Track the boxes of a detector along a drive, and compare with the true boxes.
 
-A frame is lost where the object is seen and no track of that frame overlaps its true
-box; an identity switch is a frame whose track has another number than the one before
-that had the object (as in MOTA, Bernardin and Stiefelhagen 2008).
+A frame is lost if the object is visible and no track of that frame overlaps its true
+box. An identity switch is a frame whose track has another number than the last one that
+was on the object (as in MOTA, Bernardin and Stiefelhagen 2008).
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from advsearch.tasks.boxes import compute_iou
 
 Float64Array = NDArray[np.float64]
 Step = Callable[[Float64Array, Float64Array], Sequence[tuple[int, Any]]]
-"""From the boxes (n, 4) of a frame, x0, y0, x1, y1 in pixels, and their scores (n,) to
-the tracks that are in it: a number that stays the same, and a box.
+"""Takes the boxes (n, 4) of a frame, x0, y0, x1, y1 in pixels, and their scores (n,).
+Returns the tracks in the frame: for each its number, which stays the same, and its box.
 """
-# makes a new one for each drive; frames come in their order
+# Makes a step function for each drive, which is called with the frames in order.
 Tracker = Callable[[], Step]
 
 
 class DetectedFrame(NamedTuple):
-    """The boxes of an image of a drive, x0, y0, x1, y1 in pixels.
+    """The boxes in an image of a drive, x0, y0, x1, y1 in pixels.
 
     Attributes:
-        true: (4,) of the object; None if it is not visible.
-        boxes: (n, 4) that a detector predicts.
-        scores: (n,) theirs.
+        true: (4,) box of the object; None if it is not visible.
+        boxes: (n, 4) boxes that a detector predicts.
+        scores: (n,) scores of these boxes.
     """
 
     true: Float64Array | None
@@ -43,12 +43,12 @@ class DetectedFrame(NamedTuple):
 
 
 class DriveTracking(NamedTuple):
-    """What a tracker makes of one drive.
+    """How well a tracker follows the object along one drive.
 
     Attributes:
-        lost: fraction of the frames that are lost.
-        switches: identity switches.
-        gap: lost frames in a row, at most.
+        lost: fraction of the visible frames that are lost.
+        switches: number of identity switches.
+        gap: largest number of consecutive lost frames.
     """
 
     lost: float
@@ -58,14 +58,15 @@ class DriveTracking(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Track:
-    """A track.
+    """A track of `ConstantVelocity`.
 
     Attributes:
         number: number of the track, which stays the same.
-        box: (4,) in the last frame: a detected one, or, where the track was missed, the
-            last detected one moved by `missed` times its speed.
+        box: (4,) box in the last frame: a detected one, or, if the track was missed,
+            the last detected one moved by `missed` times its speed.
         speed: (4,) change of the box per frame.
-        missed: frames since it had a detected box.
+        missed: number of frames since the last detected box; 0 if the last frame had
+            one.
     """
 
     number: int
@@ -85,7 +86,7 @@ class ConstantVelocity:
     Args:
         sure: score of a box that begins a track.
         overlap: minimum intersection over union of a box with the predicted one.
-        patience: frames in which a track may be missed; after more it has ended.
+        patience: number of frames in which a track may be missed before it ends.
     """
 
     def __init__(
@@ -95,9 +96,10 @@ class ConstantVelocity:
 
         Args:
             sure: score in [0, 1] from which on a box may begin a track.
-            overlap: intersection over union with the predicted box, at least, for a box
+            overlap: minimum intersection over union with the predicted box for a box
                 to continue a track.
-            patience: frames in a row that a track may be without a box before it ends.
+            patience: number of consecutive frames without a box after which a track
+                still continues.
         """
         self.sure = sure
         self.overlap = overlap
@@ -111,8 +113,8 @@ class ConstantVelocity:
         """Move all tracks on by one frame, and return those that have a box in it.
 
         Args:
-            boxes: (n, 4) that were detected in the frame.
-            scores: (n,) of the boxes.
+            boxes: (n, 4) detected boxes of the frame.
+            scores: (n,) scores of the boxes.
 
         Returns:
             Number and box of each track that was assigned a box, or began.
@@ -138,7 +140,7 @@ class ConstantVelocity:
     def _assign(
         self, tracks: Sequence[_Track], boxes: Float64Array
     ) -> tuple[list[_Track], list[_Track], list[Float64Array]]:
-        """Assign boxes (n, 4) to tracks, which have moved on to the frame of the boxes.
+        """Assign boxes (n, 4) to tracks that have moved on to the frame of the boxes.
 
         Returns:
             The tracks with a box, those without, and the boxes without a track.
@@ -148,11 +150,11 @@ class ConstantVelocity:
         for track_index, box_index in box_of_track.items():
             track = tracks[track_index]
             box = boxes[box_index]
-            # The last detected box, `missed` frames ago. `missed` is at least 1, since
-            # `__call__` counts every track as missed before boxes are assigned.
-            last_box = track.box - track.speed * track.missed
-            speed = (box - last_box) / track.missed
-            assigned.append(_Track(track.number, box, speed))
+            # `__call__` has moved the track's box on, by its speed in each missed
+            # frame. `missed` is at least 1, since this frame counts as missed, too.
+            last_detected_box = track.box - track.speed * track.missed
+            speed = (box - last_detected_box) / track.missed
+            assigned.append(_Track(track.number, box, speed, missed=0))
         used_boxes = set(box_of_track.values())
         free_tracks = [
             track for index, track in enumerate(tracks) if index not in box_of_track
@@ -168,7 +170,7 @@ class ConstantVelocity:
         """
         overlap_rows = [compute_overlaps(boxes, track.box) for track in tracks]
         overlap_table = np.array(overlap_rows).reshape(len(tracks), len(boxes))
-        # negated, since the function minimizes the sum
+        # The function minimizes the sum, so the overlaps are negated.
         pairs = zip(*linear_sum_assignment(-overlap_table), strict=True)
         return {
             track: box
@@ -231,15 +233,15 @@ def track_drive(
             continue
         if any(number == last_number for _, number in on_object):
             continue
-        _, number = max(on_object)  # the largest overlap
+        _, number = max(on_object)  # pairs of overlap and number: the largest overlap
         if last_number is not None:
             n_switches += 1
         last_number = number
-    # lengths of the runs of lost frames
+    # Lengths of the runs of lost frames. A frame without the object ends a run.
     gaps = [sum(run) for lost, run in itertools.groupby(is_lost) if lost]
     n_visible = sum(frame.true is not None for frame in frames)
     return DriveTracking(
-        lost=sum(is_lost) / max(1, n_visible),
+        lost=sum(is_lost) / max(1, n_visible),  # no division by 0
         switches=n_switches,
         gap=max(gaps, default=0),
     )
@@ -251,9 +253,10 @@ def _find_tracks_on(
     """Return overlap and number of the tracks that are on the true box.
 
     Args:
-        tracks: number and box (4,) of each.
-        true_box: (4,); None if the object is not visible, then no track is on it.
-        iou: overlap from which on a track is on it.
+        tracks: number and box (4,) of each track.
+        true_box: (4,) box of the object; None if it is not visible. Then no track is on
+            it.
+        iou: minimum overlap of a track that is on the object.
     """
     if true_box is None:
         return []

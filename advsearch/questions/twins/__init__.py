@@ -1,4 +1,4 @@
-"""Compare what a model says of photographs with what it says of their renders."""
+"""Compare a model's predictions about photographs with those about their renders."""
 
 from __future__ import annotations
 

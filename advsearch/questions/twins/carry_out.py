@@ -1,6 +1,6 @@
-"""Render the twins of photographs, show all to a model, and count.
+"""Render the twins of photographs, run models on all of them, and count.
 
-The rows are stored one by one, so that a run that was stopped goes on.
+Rows are stored one by one, so that a stopped run can continue.
 """
 
 from __future__ import annotations
@@ -43,9 +43,10 @@ from advsearch.questions.twins.result import (
     TwinsResult,
 )
 
-LOW_OVERLAP = 0.8  # of silhouettes: below it a pose is doubted
-IMAGE_SIZE = 160  # longer side, pixels, of images on the page
-# the photograph, the twin in it, and that in the environment; not the hole
+LOW_OVERLAP = 0.8  # of silhouettes; with less, the pose may be wrong
+IMAGE_SIZE = 160  # longer side in pixels of images on the page
+# The photograph, the twin in it, and the twin in the environment are stored; the hole
+# is not.
 N_STORED_IMAGES = 3
 
 
@@ -54,8 +55,8 @@ class Selection:
     """The objects in photographs that a run compares.
 
     Attributes:
-        objects: objects of all rows; the place of one is the number of its row.
-        windows: windows of the rows that are used, by their number.
+        objects: objects of all rows; the index of an object is the number of its row.
+        windows: windows of the selected rows, by their numbers.
         warnings: warnings about what was left out.
     """
 
@@ -91,25 +92,27 @@ def run_twins(context: RunContext[TwinsConfig], *, network: Any = None) -> Twins
     measurements = context.open_measurements()
 
     def make_result(rows: list[TwinRow]) -> TwinsResult:
+        # Tasks may have new remarks after they were calibrated in the comparison.
         remarks = [remark for judge in judges for remark in judge.task.remarks]
         return comparison.make_result(rows, [*warnings, *remarks])
 
-    return measurements.collect(
-        comparison.compare(selection, measurements), make_result
-    )
+    # `compare` looks up stored rows, and `collect` gathers stored and new ones.
+    rows = comparison.compare(selection, measurements)
+    return measurements.collect(rows, make_result)
 
 
 class ModelJudge:
-    """Judges what one model predicts of photographs and twins.
+    """Evaluates the predictions of a model about photographs and twins.
 
     Args:
-        task: judges the predictions.
-        model: predicts.
-        model_of_frame: models that predict some frames instead.
+        task: task that evaluates the predictions.
+        model: model that predicts.
+        model_of_frame: for some frames, another model that predicts instead.
 
     Attributes:
-        task: task for this model, and calibrated if it needs that.
-        model: as above.
+        task: the task for this model; calibrated after the first prediction if the task
+            needs that.
+        model: the model.
     """
 
     def __init__(
@@ -149,10 +152,13 @@ class ModelJudge:
             )
 
     def _calibrate_once(self, twin: rendering.Twin, truth: Any) -> None:
-        """Let a task that needs it look at the first photograph.
+        """Calibrate a task that needs it, with the first photograph.
+
+        A task is calibrated if its model's outputs can be read in several ways, such as
+        two formats of boxes: the known truth shows which one is right.
 
         Raises:
-            InputError: the user has to state how the outputs are read.
+            InputError: several ways remain; the user has to state one.
         """
         if self._is_calibrated:
             return
@@ -161,6 +167,7 @@ class ModelJudge:
             photograph = twin.images[PHOTOGRAPH].clamp(0.0, 1.0)
             output = self.model(color.round_to_8_bit(photograph))
             self.task = self.task.after_calibration(output, truth)
+        # A task without calibration may be ambiguous, too.
         if self.task.ambiguities:
             raise InputError(f"task {self.task.name}: {self.task.ambiguities}")
 
@@ -170,8 +177,8 @@ def load_judges(
 ) -> tuple[list[ModelJudge], list[str]]:
     """Load the models, and return a judge for each model, and warnings.
 
-    A judge predicts and evaluates images. If each frame has its own model, all these
-    models have one judge together.
+    A judge predicts and evaluates images. If each frame has its own model, there is a
+    single judge, which selects the model by the frame.
 
     Args:
         config: settings of the run.
@@ -187,8 +194,9 @@ def load_judges(
     if network is None:
         networks = list(settings.split_names(config.model))
     elif network_of_frame:
-        # Each model once, though it is used for many frames.
+        # Each model is loaded once, though it predicts many frames.
         networks = list(dict.fromkeys(network_of_frame.values()))
+    # The function's type is for `SceneConfig`, which has the same settings of models.
     scene_config: Any = config
     models, warnings = workbench.load_models(networks, task, scene_config)
     if len({model.input_size for model in models}) > 1:
@@ -202,10 +210,12 @@ def load_judges(
         )
     if not network_of_frame:
         return [ModelJudge(task, model, {}) for model in models], warnings
+    # `models` are in the order of `networks`.
     model_of_frame = {
         frame: models[networks.index(frame_network)]
         for frame, frame_network in network_of_frame.items()
     }
+    # The first model predicts frames that the mapping does not have.
     return [ModelJudge(task, models[0], model_of_frame)], warnings
 
 
@@ -236,12 +246,14 @@ class Comparison:
 
     @property
     def surroundings(self) -> tuple[str, ...]:
-        """What surrounds the object in the twins."""
+        """Names of the surroundings of the object in the twins."""
         return COMPOSED, self._config.environment_name, HOLE
 
     @property
     def margin(self) -> float:
-        """How far a window reaches beyond the object's box, in its longer sides."""
+        """How far a window reaches beyond the object's box, as a fraction of the box's
+        longer side.
+        """
         if self._config.margin is not None:
             return self._config.margin
         is_detector = self._judges[0].task.varies
@@ -294,9 +306,9 @@ class Comparison:
         return Selection(objects, windows, warnings)
 
     def _is_hidden(self, item: PhotographedObject) -> bool:
-        """Return whether less of an object is visible than `visible` asks for.
+        """Return whether less of an object is visible than `visible` requires.
 
-        False where the data does not state how much is.
+        False if the data does not state the visible fraction.
         """
         return item.visible is not None and item.visible < self._config.visible
 
@@ -331,17 +343,18 @@ class Comparison:
             try:
                 judge.task.check(self._make_facts(item))
             except InputError as error:
+                # The message names a setting `label`, which `twins` does not have.
                 reason = str(error).removeprefix("label: ")
                 if item.object in self._config.names:
                     raise InputError(f"names: {item.object}: {reason}") from None
-                end = "" if reason.endswith(("?", ".")) else "."
+                end_of_sentence = "" if reason.endswith(("?", ".")) else "."
                 raise InputError(
-                    f"{item.where}: {reason}{end} Or name its class with `names`, "
-                    f"{item.object}=CLASS"
+                    f"{item.where}: {reason}{end_of_sentence} Or name its class with "
+                    f"`names`, {item.object}=CLASS"
                 ) from None
 
     def _load_asset(self, item: PhotographedObject) -> Any:
-        """Return the object that a photograph shows; one that was read is cached."""
+        """Return the object in a photograph; `load_object` caches it."""
         return rendering.load_object(item.mesh, item.unit)
 
     def compare(self, selection: Selection, measurements: Any) -> Iterator[TwinRow]:
@@ -352,7 +365,7 @@ class Comparison:
             measurements: stored rows of the run, by name; finished rows are added.
         """
         self._context.progress.stage("twins", len(selection.windows))
-        # Objects of one mesh and one camera's pixels share a renderer.
+        # Objects with the same mesh and the same shape of pixels share a renderer.
         groups: dict[tuple[Path, float], list[int]] = {}
         for number in selection.windows:
             item = selection.objects[number]
@@ -377,10 +390,12 @@ class Comparison:
         missing = [
             number for number in numbers if not self._is_stored(number, measurements)
         ]
+        # Mitsuba cannot record renders of one scene while another one exists. So all
+        # layers are rendered first, their renderer is freed, and then the renderer of
+        # the environment is made.
         layers = self._render_layers(selection, missing)
-        # Mitsuba can't record renders of one scene while another one lives.
         gc.collect()
-        renderer = None
+        renderer = None  # not used if all rows are stored
         if missing:
             renderer = self._make_renderer(
                 rendering.SurroundedRenderer,
@@ -389,8 +404,9 @@ class Comparison:
                 missing,
             )
         for number in numbers:
-            layer = layers.pop(number, None)
-            # rendered once for all models, and not at all where all rows are stored
+            layer = layers.pop(number, None)  # None if the rows are stored
+            # The twin is rendered once for all models, and not at all if all rows are
+            # stored.
             make_twin = cache(
                 partial(self._make_twin, number, selection, layer, renderer)
             )
@@ -412,7 +428,7 @@ class Comparison:
     def _render_layers(
         self, selection: Selection, numbers: Sequence[int]
     ) -> dict[int, rendering.Layer]:
-        """Render objects that have the same mesh, to be put into their photographs.
+        """Render objects that have the same mesh into their photographs.
 
         Args:
             selection: all selected objects and their windows.
@@ -448,10 +464,10 @@ class Comparison:
 
         Args:
             renderer_type: class `SurroundedRenderer` or `LayerRenderer`, or a function
-                that makes one.
-            environment: environment that lights them.
+                that makes an instance.
+            environment: environment that lights the objects.
             selection: all selected objects.
-            numbers: numbers of the rows that it renders.
+            numbers: numbers of the objects to render.
         """
         item = selection.objects[numbers[0]]
         film = rendering.choose_film(
@@ -479,19 +495,20 @@ class Comparison:
             number: number of the object.
             selection: all selected objects and their windows.
             layer: the object rendered into the photograph.
-            renderer: renders it in the environment.
+            renderer: renderer of the object in the environment.
         """
         item = selection.objects[number]
         window = selection.windows[number]
         environment = self._config.environment_name
-        surrounded = {environment: renderer.render(item, window, number)}
+        render = renderer.render(item, window, number)
+        render_of_environment = {environment: render}
         self.n_renders += 1
         twin = rendering.make_twin(
             item,
             self._load_photograph(item.photograph),
             window,
             layer,
-            surrounded,
+            render_of_environment,
             self._size,
         )
         self._save_images(number, twin)
@@ -504,14 +521,14 @@ class Comparison:
         make_twin: Callable[[], rendering.Twin],
         judge: ModelJudge,
     ) -> TwinRow:
-        """Return a model's predictions on an object's photograph and on its twins.
+        """Return a model's predictions about an object's photograph and its twins.
 
         Args:
-            number: number of the row, which is that of the object.
+            number: number of the object, which is that of the row.
             selection: all selected objects.
-            make_twin: function that renders the twins; it is cached, as all models
+            make_twin: function that renders the twins; it is cached, since all models
                 share them.
-            judge: the model's judge.
+            judge: judge of the model.
         """
         item = selection.objects[number]
         window = selection.windows[number]
@@ -538,9 +555,10 @@ class Comparison:
     def _make_facts(
         self, item: PhotographedObject, twin: rendering.Twin | None = None
     ) -> Any:
-        """Return what a task takes the truth from.
+        """Return the facts from which a task finds the ground truth.
 
-        Before the object is rendered, there is no twin and so nothing about its sight.
+        Without a twin, before the object is rendered, they do not include what is
+        visible of the object.
         """
         return tasks.Facts(
             item.object,
@@ -549,7 +567,7 @@ class Comparison:
         )
 
     def _find_label(self, item: PhotographedObject) -> str:
-        """Return the right label: by `names`, by the list, or the object's name."""
+        """Return the right label: from `names`, from the list, or the object's name."""
         return self._config.names.get(item.object) or item.label or item.object
 
     def _save_images(self, number: int, twin: rendering.Twin) -> None:
@@ -593,9 +611,10 @@ class Comparison:
 
 
 def rank_disagreement(row: TwinRow) -> tuple[bool, float]:
-    """Return a key that sorts rows: those who disagree first, by difference of margins.
+    """Return a key that sorts the rows with the largest disagreements first.
 
-    Disagreement is about which is right: the photograph or its composed twin.
+    Rows in which only one of the photograph and its composed twin is right come first.
+    Within these and the others, a larger difference of the margins comes first.
     """
     twin = row.twin(COMPOSED)
     difference = abs(row.photo.margin - twin.margin)
@@ -606,7 +625,7 @@ def rank_disagreement(row: TwinRow) -> tuple[bool, float]:
 
 
 def parse_frames(text: str | None) -> Callable[[str], bool]:
-    """Return a function that tells, by its name, whether a frame is used.
+    """Return a function that returns whether a frame is selected, by its name.
 
     Args:
         text: names and ranges FIRST:LAST of the numbers that names end in, both
@@ -631,8 +650,8 @@ def parse_frames(text: str | None) -> Callable[[str], bool]:
             )
 
     def is_used(frame: str) -> bool:
-        # "scene/000012" and "000012.png" both have the number "000012".
         """Return whether the frame is selected by its name or its number."""
+        # "scene/000012" and "000012.png" both have the number "000012".
         number = frame.rpartition("/")[2].partition(".")[0]
         if frame in names or number in names:
             return True
@@ -644,17 +663,17 @@ def parse_frames(text: str | None) -> Callable[[str], bool]:
 
 
 def make_row_name(number: int, model_index: int) -> str:
-    """Return the key of a stored row: that of an object, for one of the models."""
+    """Return the key of a stored row, which is about one object and one model."""
     return f"twin {number} {model_index}"
 
 
 def make_image_name(number: int, index: int) -> str:
-    """Return the file of an image of a row in the run's folder."""
+    """Return the file name of an image of a row, relative to the run directory."""
     return f"images/twin-{number:06d}-{index}.jpg"
 
 
 def list_images(number: int) -> list[str]:
-    """Return the files of all stored images of a row, the photograph's first."""
+    """Return the file names of all stored images of a row, the photograph first."""
     return [make_image_name(number, index) for index in range(N_STORED_IMAGES)]
 
 

@@ -1,4 +1,4 @@
-"""Count how far the predictions of twins hold for photographs."""
+"""Count how far predictions about twins hold for photographs."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from advsearch.questions.twins.result import FactorPart, TwinPrediction, TwinRow
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
 
-N_PARTS = 3  # parts of equal size that a factor is cut into
+N_PARTS = 3  # number of parts of equal size into which a factor is divided
 MIN_ROWS_PER_PART = 10
-MIN_BOX_OVERLAP = 0.5  # of boxes of a detector that agree, over their union
+MIN_BOX_OVERLAP = 0.5  # minimum intersection over union of boxes that agree
 Box = tuple[float, float, float, float]  # x, y, width and height
 
 
 def make_table(
     rows: Sequence[TwinRow], surroundings: Sequence[str], task: str
 ) -> list[results.TwinAgreement]:
-    """Return the agreement by model and surroundings: of all, by object, by condition."""
+    """Return the agreement by model and surroundings: total, by object, by condition."""
     table = []
     for model in dict.fromkeys(row.model for row in rows):
         of_model = [row for row in rows if row.model == model]
@@ -83,12 +83,12 @@ def count_agreement(
     the result is Cohen's kappa: agreement beyond chance.
 
     Args:
-        rows: at least one, of one model.
+        rows: rows of one model, at least one.
         surroundings: name of the twins' surroundings, such as an environment.
         model: name of the model, for the result.
         task: title of the task, for the result.
-        object_name: name that all rows share; empty where they have several.
-        condition: condition that all rows share; empty where they have several.
+        object_name: object of all rows; empty if they have several.
+        condition: condition of all rows; empty if they have several.
     """
     units = number_units(rows)
     photos = [row.photo for row in rows]
@@ -136,7 +136,7 @@ def estimate_rate(happens: BoolArray, units: IntArray) -> results.Estimate:
 def estimate_conditional(
     event: BoolArray, condition: BoolArray, units: IntArray
 ) -> results.Estimate | None:
-    """Return the rate of an event where another happens; None in too few units."""
+    """Return the rate of an event where another happens; None if in too few units."""
     n_units = statistics.agreement.count_units(condition, units)
     if n_units < statistics.agreement.MIN_UNITS:
         return None
@@ -146,10 +146,15 @@ def estimate_conditional(
 def estimate_kappa(
     photo_wrong: BoolArray, twin_wrong: BoolArray, units: IntArray
 ) -> results.Estimate | None:
-    """Return Cohen's kappa; None where either is wrong in too few units."""
+    """Return Cohen's kappa, the agreement of right and wrong beyond chance.
+
+    None if the photograph or the twin is wrong in too few units: then the interval
+    would say nothing. It may well be right in few.
+    """
     agreement = statistics.agreement
     for wrong in (photo_wrong, twin_wrong):
-        if agreement.count_units(wrong, units) < agreement.MIN_UNITS:
+        n_units_with_wrong = agreement.count_units(wrong, units)
+        if n_units_with_wrong < agreement.MIN_UNITS:
             return None
     return _estimate_coefficient(
         agreement.compute_kappa, photo_wrong, twin_wrong, units
@@ -183,7 +188,7 @@ def estimate_box_agreement(
 ) -> results.Estimate | None:
     """Return how often a detector's boxes agree in photograph and twin.
 
-    The best box of the right class is used in each. Rows in which one of both has no
+    In each, the best box of the right class is used. Rows in which one of them has no
     such box are left out. Boxes agree if their intersection over union is at least
     `MIN_BOX_OVERLAP`. The result is None without rows.
 
@@ -211,7 +216,7 @@ def find_box(payload: Any, label: str) -> Box | None:
     """
     if not isinstance(payload, dict):
         return None
-    # A detector stores what it found, the best first.
+    # A detector stores its detections under "found", the best first.
     for detection in payload.get("found") or []:
         if detection["label"] == label:
             left, top, right, bottom = detection["box"]
@@ -220,12 +225,12 @@ def find_box(payload: Any, label: str) -> Box | None:
 
 
 def compute_box_iou(first: Box, second: Box) -> float:
-    """Return the overlap of two boxes (x, y, width, height) over their union."""
+    """Return the intersection over union of two boxes (x, y, width, height)."""
     first_x, first_y, first_width, first_height = first
     second_x, second_y, second_width, second_height = second
     right = min(first_x + first_width, second_x + second_width)
     bottom = min(first_y + first_height, second_y + second_height)
-    # under 0 where the boxes lie side by side
+    # below 0 if the boxes do not overlap
     width = right - max(first_x, second_x)
     height = bottom - max(first_y, second_y)
     overlap = max(width, 0.0) * max(height, 0.0)
@@ -241,7 +246,7 @@ def _estimate_coefficient(
 ) -> results.Estimate | None:
     """Return a statistic of two arrays (n,), with its interval over units (n,).
 
-    None where it has no interval.
+    None if it has no interval.
     """
     interval = statistics.agreement.correlation_interval(
         statistic, first, second, units
@@ -259,7 +264,7 @@ FACTORS: dict[str, tuple[str, Callable[[TwinRow], float | None]]] = {
     "visible fraction": ("", lambda row: row.visible),
     "overlap of the silhouettes": ("", lambda row: row.overlap),
 }
-"""What may explain disagreement: unit, and how a row has it."""
+"""What may explain disagreement: the unit, and a function that reads it from a row."""
 
 
 def explain_disagreement(
@@ -299,8 +304,8 @@ def _cut_factor(
     """Yield the parts of a factor with values (n,) of its rows.
 
     A factor is a property of the photographs, such as the object's size. A part has the
-    rows between two quantiles of its values. There are no parts if quantiles coincide,
-    as those of a constant do.
+    rows between two quantiles of its values. If quantiles coincide, as those of a
+    constant do, nothing is yielded.
 
     Args:
         name, unit: name and unit of the factor.

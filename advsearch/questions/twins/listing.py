@@ -1,10 +1,10 @@
-"""Read which objects photographs show, and where: folders in BOP's form, and lists.
+"""Read which objects photographs show, and where: directories in BOP's form, and lists.
 
 BOP's form (Hodan et al. 2018, "BOP: Benchmark for 6D object pose estimation") has
-`scene_gt.json`, `scene_camera.json`, `rgb/`, and meshes in millimetres in `models/`. A
-list (CSV, JSON or YAML) has a row for each object in a photograph; docs/twins.md says
-what is in it. Poses lead from the coordinates of the mesh's file to the camera's, which
-are x to the right, y down and z forwards, as OpenCV has them.
+`scene_gt.json`, `scene_camera.json`, `rgb/`, and meshes in millimeters in `models/`. A
+list (CSV, JSON or YAML) has a row for each object in a photograph (docs/twins.md).
+Poses lead from the coordinates of the mesh's file to those of the camera, which are x
+to the right, y down and z forwards, as in OpenCV.
 """
 
 from __future__ import annotations
@@ -24,16 +24,18 @@ from advsearch.extend import InputError, errors, reading, stored_files
 
 Float64Array = npt.NDArray[np.float64]
 
-MAX_JSON_BYTES = 1 << 26  # of a file with all poses of a scene
-MAX_YAML_BYTES = 1 << 17  # of a list in YAML, which is slow to read
-MAX_VIEWS = 100_000  # objects in photographs of one run
-MAX_IMAGE_DIGITS = 12  # of an image's number in BOP's form
+MAX_JSON_BYTES = 1 << 26  # size of a file with all poses of a scene
+MAX_YAML_BYTES = 1 << 17  # size of a list in YAML, which is slow to read
+MAX_VIEWS = 100_000  # number of objects in photographs of one run
+MAX_IMAGE_DIGITS = 12  # digits of an image's number in BOP's form
 MAX_OBJECT_NUMBER = 999_999  # in BOP's form: file names have six digits
-MAX_TEXT = 200  # letters of a frame, label or condition; the rest is cut
-MAX_NUMBER = 1e9  # of a pose or a camera, in any unit
-MAX_ROTATION_ERROR = 0.02  # of an entry of R R^T against the identity
-PINHOLE_KIND = "brown-conrady"  # of camera models, with distortion 0
-MAX_SKEW = 1e-6  # of a camera's focal length; a larger one is refused
+MAX_TEXT = 200  # characters of a frame, label or condition; the rest is cut
+MAX_NUMBER = 1e9  # numbers of a pose or a camera, in any unit
+MAX_ROTATION_ERROR = 0.02  # of an entry of R R^T, compared with the identity
+PINHOLE_KIND = (
+    "brown-conrady"  # kind of a camera model; it is a pinhole at distortion 0
+)
+MAX_SKEW = 1e-6  # as a fraction of the focal length; a larger one is rejected
 GROUND_TRUTH = "scene_gt.json"
 PHOTO_FOLDERS = ("rgb", "gray")
 PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".webp")
@@ -49,12 +51,15 @@ LIST_KEYS = (
     "frame",
     "mask",
 )
-"""What a row of a list must have, and all that it may have."""
+"""The keys that a row of a list must have, and all keys that it may have."""
 
 
 @dataclass(frozen=True)
 class Pinhole:
-    """A camera without distortion, in pixels from the corner of the photograph."""
+    """A camera without distortion; all numbers are in pixels.
+
+    The principal point is measured from the corner of the photograph.
+    """
 
     fx: float
     fy: float
@@ -72,21 +77,21 @@ class PhotographedObject:
     """An object as a photograph shows it.
 
     Attributes:
-        photograph: the file.
-        frame: name of the independent unit that it is of: a photograph, or a scene.
-        object: its name.
-        mesh: its file.
+        photograph: file of the photograph.
+        frame: name of the independent unit that it belongs to: a photograph, or a
+            scene.
+        object: name of the object.
+        mesh: file of the mesh.
         unit: unit of the coordinates of the mesh and of the pose.
-        pose: (4, 4) from the coordinates of the mesh's file to the camera's.
+        pose: (4, 4) map from the coordinates of the mesh's file to the camera's.
         camera: camera that took the photograph.
-        label: the right label; empty: the object's name.
-        condition: condition of the photograph, such as "dim"; empty where there is
-            none.
-        mask: file of the full silhouette; None without.
-        visible_mask: file of what is visible of it; None without.
-        visible: fraction of the silhouette that is visible; None if it is not known.
-        box: x, y, width and height of the silhouette in pixels, by the data set.
-        where: file and entry that name it, for messages.
+        label: the right label; empty takes the object's name.
+        condition: condition of the photograph, such as "dim"; empty if there is none.
+        mask: file with the mask of the full silhouette; None without one.
+        visible_mask: file with the mask of what is visible of it; None without one.
+        visible: fraction of the silhouette that is visible; None if unknown.
+        box: x, y, width and height of the silhouette in pixels, from the data set.
+        where: file and entry that state it, for messages.
     """
 
     photograph: Path
@@ -107,11 +112,11 @@ class PhotographedObject:
 
 @dataclass(frozen=True)
 class Listing:
-    """What was read of a folder or a list.
+    """The objects in photographs that a directory or a list states.
 
     Attributes:
         objects: objects in photographs, in the order of the files.
-        n_missing: entries whose photograph is not there.
+        n_missing: number of objects whose photograph is missing.
     """
 
     objects: list[PhotographedObject]
@@ -119,7 +124,7 @@ class Listing:
 
 
 def read_photographs(path: Path) -> Listing:
-    """Read a BOP folder or a list.
+    """Read a directory in BOP's form or a list.
 
     Raises:
         InputError: there is neither, or something in it cannot be used; the message
@@ -129,11 +134,13 @@ def read_photographs(path: Path) -> Listing:
         listing = Listing(list(_read_list(path)))
     else:
         listing = _read_bop(path)
+    # A missing photograph of a list is an error, so `n_missing` is that of a directory.
     if not listing.objects:
         raise InputError(
-            f"photographs: {path} names {listing.n_missing} photographs, and none of "
-            "them is in it; copy them, or name another folder"
+            f"photographs: {path} names {listing.n_missing} objects in photographs, "
+            "and none of these photographs is in it; copy them, or name another folder"
         )
+    # The function puts the limit into the text.
     stored_files.check_most(
         path, len(listing.objects), MAX_VIEWS, "at most {} objects in photographs"
     )
@@ -176,7 +183,6 @@ def _find_models(folder: Path) -> Path:
     resolved = folder.resolve()
     for parent in (resolved, *resolved.parents[:2]):
         if (parent / "models").is_dir():
-            # Data sets are often downloaded without all photographs.
             return parent / "models"
     raise InputError(
         f"photographs: expected the meshes of {folder} in a folder models in it or "
@@ -208,6 +214,7 @@ def _read_scene(scene: Path, models: Path, condition: str) -> Listing:
         if not is_number or not _is_rows(entries):
             raise errors.FileFormatError(f"{where}: expected a list of objects")
         photograph = _find_photograph(scene, int(image))
+        # Data sets are often downloaded without all photographs.
         if photograph is None:
             n_missing += len(entries)
             continue
@@ -234,12 +241,12 @@ def _read_scene(scene: Path, models: Path, condition: str) -> Listing:
 def _read_bop_silhouette(
     scene: Path, image: str, index: int, infos: Any
 ) -> dict[str, Any]:
-    """Return the masks, the visible fraction and the box of an object, where stated.
+    """Return the masks, the visible fraction and the box of an object; None if unknown.
 
     Args:
-        scene: folder of the scene.
-        image: number of the image, as a text.
-        index: place of the object among those of the image.
+        scene: directory of the scene.
+        image: number of the image, as text.
+        index: index of the object among those of the image.
         infos: what `scene_gt_info.json` has about the image's objects, unchecked.
     """
     info: Mapping[str, Any] = {}
@@ -259,7 +266,7 @@ def _read_bop_object(
     """Return object, mesh and pose of an entry of the ground truth.
 
     Args:
-        where: place in the file, for messages.
+        where: location in the file, for messages.
         entry: entry of the object.
         models: directory of the meshes.
     """
@@ -288,7 +295,7 @@ def _read_bop_camera(scene: Path, cameras: Mapping[str, Any], image: str) -> Pin
 
 
 def _find_photograph(scene: Path, image: int) -> Path | None:
-    """Return the photograph with a number in a BOP scene; None if it is not there."""
+    """Return the photograph with a number in a BOP scene; None if it is missing."""
     for folder in PHOTO_FOLDERS:
         for suffix in PHOTO_SUFFIXES:
             file = scene / folder / f"{image:06d}{suffix}"
@@ -298,13 +305,13 @@ def _find_photograph(scene: Path, image: int) -> Path | None:
 
 
 def _find_mask(scene: Path, folder: str, image: str, index: int) -> Path | None:
-    """Return the mask of an image's object by its place; None if it is not there."""
+    """Return the mask of an image's object by its index; None if it is missing."""
     file = scene / folder / f"{int(image):06d}_{index:06d}.png"
     return file if file.is_file() else None
 
 
 def _get_fraction(info: Mapping[str, Any]) -> float | None:
-    """Return the visible fraction that BOP states; None if it is no such number."""
+    """Return the visible fraction that BOP states; None if it is no valid number."""
     value = info.get("visib_fract")
     if not isinstance(value, (int, float)) or not 0.0 <= value <= 1.0:
         return None
@@ -416,7 +423,7 @@ def _read_row(row: Mapping[str, Any], path: Path, where: str) -> PhotographedObj
 
 
 def _check_keys(row: Mapping[str, Any], where: str) -> None:
-    """Refuse a row with an unknown key, or without one that it must have."""
+    """Reject a row with an unknown key, or without a required one."""
     unknown = sorted(map(str, set(row) - set(LIST_KEYS)))
     if unknown:
         raise errors.FileFormatError(
@@ -495,12 +502,12 @@ def _read_row_camera(
 
 
 def _to_numbers(value: Any, where: str, *counts: int) -> Float64Array:
-    """Return finite numbers from a list, or from a text with blanks between them.
+    """Return finite numbers from a list, or from a text with spaces between them.
 
     Args:
         value: value from a file, which may have any type.
-        where: place in the file, for messages.
-        *counts: how many numbers there may be.
+        where: location in the file, for messages.
+        *counts: allowed counts of numbers.
 
     Raises:
         FileFormatError: the value is not such a list or text.
@@ -523,9 +530,10 @@ def _to_numbers(value: Any, where: str, *counts: int) -> Float64Array:
 
 
 def _check_pose(matrix: Float64Array, where: str) -> Float64Array:
-    """Return a pose (4, 4) with the nearest rotation, and a shift before the camera.
+    """Return a pose (4, 4) with the nearest rotation.
 
-    Measured rotations are off by some thousandths.
+    Measured rotations are off by some thousandths. The object has to be in front of the
+    camera.
     """
     rotation = matrix[:3, :3]
     error = np.abs(rotation @ rotation.T - np.eye(3)).max()
@@ -545,11 +553,16 @@ def _check_pose(matrix: Float64Array, where: str) -> Float64Array:
 
 
 def _make_pinhole(numbers: Float64Array, where: str) -> Pinhole:
-    """Return the camera of a matrix K (9,) whose pixel centers are whole numbers."""
+    """Return the camera of a matrix K (9,).
+
+    In K, the centers of pixels have whole numbers as coordinates.
+    """
+    # K is [[fx, skew, cx], [0, fy, cy], [0, 0, 1]].
     fx, skew, cx, _, fy, cy, *_ = numbers.tolist()
     if not (fx > 0.0 and fy > 0.0 and math.isfinite(fx / fy)):
         raise errors.FileFormatError(f"{where}: expected focal lengths over 0")
     if abs(skew) > MAX_SKEW * fx:
         raise errors.FileFormatError(f"{where}: expected a camera without skew")
-    # from the corner of the photograph, where pixel centers are at halves
+    # A `Pinhole` measures from the corner of the photograph, from which the center of
+    # the first pixel is at 0.5.
     return Pinhole(fx, fy, cx + 0.5, cy + 0.5)

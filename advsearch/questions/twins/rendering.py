@@ -1,12 +1,12 @@
-"""Render twins: objects as photographs show them, over the photograph or in a place.
+"""Render twins: objects as in photographs, over the photograph or in an environment.
 
-A twin is rendered by the pinhole that took the photograph, in a window: a rectangle of
-whole pixels of the photograph, and laid over it as over any backdrop
-(`advsearch.scene.backdrop`). Both are brought to the size that the model takes by the
-same function, so that they are as blurred.
+A twin is rendered by the pinhole camera that took the photograph, in a window: a
+rectangle of pixels of the photograph. It is laid over the photograph as over any
+backdrop (`advsearch.scene.backdrop`). Photograph and twin are resized to the model's
+size by the same function, so that they are equally blurred.
 
-The scene has the coordinates of the mesh: the object stands as its file stands, with z
-up, and the camera is where the photograph's was.
+The scene has the coordinates of the mesh: the object stands as in its file, with z up,
+and the camera is where that of the photograph was.
 """
 
 from __future__ import annotations
@@ -31,11 +31,12 @@ from advsearch.questions.twins.result import COMPOSED, HOLE, PHOTOGRAPH
 
 Float64Array = npt.NDArray[np.float64]
 OBJECT = "object"  # the mesh under test
-MIN_FILM = 64  # pixels of a film's longer side
+MIN_FILM = 64  # minimum length of a film's longer side in pixels
 MAX_FILM = 512
-FILM_STEP = 32
-MIN_SILHOUETTE = 4.0  # pixels of a silhouette's longer side
-# camera coordinates of OpenCV (y down) to ours (+x to the left, +y up)
+FILM_STEP = 32  # films of similar windows get the same size
+MIN_SILHOUETTE = 4.0  # minimum length of a silhouette's longer side in pixels
+# from camera coordinates of OpenCV (+x to the right, +y down) to those of our scenes
+# (+x to the left, +y up)
 FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
@@ -53,15 +54,16 @@ class Twin:
     """Images of an object in a photograph and of its twins, at the model's size.
 
     Attributes:
-        images: (H, W, 3) sRGB in [0, 1], by what surrounds the object.
+        images: (H, W, 3) sRGB images in [0, 1], by the name of the surroundings.
         sight: what is visible of the object, for tasks.
-        coverage: (h, w) of the twin in the window, in the photograph's pixels.
-        size: square root of the silhouette's area, pixels of the photograph.
-        brightness: mean of the twin less that of the photograph where the twin covers
+        coverage: (h, w) how much of each pixel of the window the twin covers, hidden
+            parts included.
+        size: square root of the silhouette's area, in pixels of the photograph.
+        brightness: mean of the twin minus that of the photograph where the twin covers
             it, in sRGB.
         contrast: standard deviation of the photograph around the object, in sRGB.
-        texture: correlation of twin and photograph where the twin covers it, by
-            luminance in sRGB; None where one of them is even.
+        texture: correlation of the luminance of twin and photograph where the twin
+            covers it, in sRGB; None if one of them is uniform.
     """
 
     images: Mapping[str, Tensor]
@@ -128,14 +130,15 @@ def choose_window(
     high = positions.max(axis=0)
     photo_height, photo_width = photo_size
     longer = float((high - low).max())
-    is_outside = high.min() <= 0.0 or low[0] >= photo_width or low[1] >= photo_height
-    if is_outside or longer < MIN_SILHOUETTE:
+    is_left_or_above = high.min() <= 0.0  # the largest x or the largest y
+    is_right_or_below = low[0] >= photo_width or low[1] >= photo_height
+    if is_left_or_above or is_right_or_below or longer < MIN_SILHOUETTE:
         return None
-    # from here on, sizes are (width, height), as positions are (x, y)
-    model_shape = np.array([model_size[1], model_size[0]], np.float64)
+    # From here on, sizes are (width, height), as positions are (x, y).
+    model_width_height = np.array([model_size[1], model_size[0]], np.float64)
     widened = high - low + 2.0 * margin * longer
-    # the smallest of the model's shape that holds all of it
-    size = model_shape * float((widened / model_shape).max())
+    # the smallest size with the model's aspect ratio that contains the widened box
+    size = model_width_height * float((widened / model_width_height).max())
     size *= min(1.0, photo_width / size[0], photo_height / size[1])
     width, height = (max(1, math.floor(side)) for side in size)
     center = (low + high) / 2.0
@@ -148,18 +151,19 @@ def choose_window(
 
 
 def _center_within(center: float, length: int, limit: int) -> int:
-    """Return where a stretch begins: as near a center as it fits from 0 to a limit."""
+    """Return the start of an interval in [0, limit], as near to a center as possible."""
     return min(max(round(center - length / 2.0), 0), limit - length)
 
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """An object that is rendered into a window of its photograph.
+    """An object that was rendered into a window of its photograph.
 
     Attributes:
         composed: (h, w, 3) sRGB in [0, 1], in the photograph's pixels.
-        alpha: (h, w) in [0, 1], what the object covers, whether it is hidden or not.
-        sight: what is visible of it, for tasks, at the model's size.
+        alpha: (h, w) in [0, 1], how much of each pixel the object covers, hidden parts
+            included.
+        sight: what is visible of the object, for tasks, at the model's size.
     """
 
     composed: Tensor
@@ -168,16 +172,16 @@ class Layer:
 
 
 class LayerRenderer:
-    """Render one object into photographs.
+    """Renders one object into photographs.
 
     Args:
-        asset: the object, with `up` z and `front` +x.
+        asset: the object, with z up and its front at +x.
         unit: unit of its file.
         light: environment that lights it.
         film: (height, width) of renders in pixels.
         spp: samples per pixel.
         seed: seed of the noise.
-        is_matched: give the object the noise and the blur of the photograph, where
+        is_matched: whether the object gets the noise and the blur of the photograph, if
             they can be measured.
     """
 
@@ -207,10 +211,12 @@ class LayerRenderer:
         self._asset = asset
         self._spp = spp
         self._seed = seed
-        # The photograph shows the shadow of the object already.
+        # The photograph already has the object's shadow, so no ground is rendered.
         settings = {"ground.size": 0.0}
         scene = workbench.load_scene(asset, light, unit=unit, settings=settings)
+        # The control "background" puts a backdrop in place of the environment.
         self._renderer = scene.renderer({"background": {}}, resolution=film, seed=seed)
+        # used to lay renders over photographs (`_make_image_inputs`)
         self._description = scene.description
         if not is_matched:
             self._description = self._description.with_values(
@@ -231,25 +237,29 @@ class LayerRenderer:
             item: the object; its mesh is that of this renderer.
             photograph: photograph that shows it.
             window: window of the photograph around the object.
-            model_size: (height, width) of the mask and depths that are returned for
-                tasks.
+            model_size: (height, width) of the sight that is returned for tasks.
             number: number of the row, from which the seed of the noise is derived.
         """
         renderer = self._renderer
-        inputs = renderer.scene.assembly(make_camera_inputs(item, self._asset, window))
+        scene_inputs = renderer.scene.assembly(
+            make_camera_inputs(item, self._asset, window)
+        )
         seed = seeds.stream(self._seed, "layer", number)
         with torch.no_grad():
             # with an alpha channel, since the environment is hidden
             rendered = renderer.render_radiance(
-                inputs, seed, self._spp, hide_environment=True
+                scene_inputs, seed, self._spp, hide_environment=True
             )
-            surfaces = renderer.scene.find_surfaces(inputs)
-            size = (window.height, window.width)
-            rendered = resize(rendered, size)
+            surfaces = renderer.scene.find_surfaces(scene_inputs)
+            rendered = resize(rendered, (window.height, window.width))
             image_inputs = self._make_image_inputs(item, photograph, window)
+            # Controls may change the finished image; none varies here.
             composed = renderer.finish_image(rendered, image_inputs, renderer.start)
-        sight = _make_sight(surfaces, self._asset.size_in_metres, model_size)
-        return Layer(composed, rendered[..., 3].clamp(0.0, 1.0), sight)
+        return Layer(
+            composed=composed,
+            alpha=rendered[..., 3].clamp(0.0, 1.0),
+            sight=_make_sight(surfaces, self._asset.size_in_metres, model_size),
+        )
 
     def _make_image_inputs(
         self,
@@ -260,12 +270,14 @@ class LayerRenderer:
         """Return the inputs by which a render becomes a window of a photograph.
 
         They are the photograph's pixels, noise and blur, a mask of what hides the
-        object, and the exposure in stops relative to that of the renderer.
+        object, and the exposure in stops.
         """
         front = read_front(item, photograph)
         in_window = replace(photograph, crop=window, front=front)
         description = self._description.with_backdrop(in_window)
         size = (window.height, window.width)
+        # The renderer applies the gain of its scene. The exposure corrects it to the
+        # gain that suits this photograph.
         stops = math.log2(description.gain / self._renderer.formation.gain)
         return {
             **reading.backdrop.make_image_inputs(description, size),
@@ -274,7 +286,7 @@ class LayerRenderer:
 
 
 class SurroundedRenderer:
-    """Render one object in an environment; arguments as for `LayerRenderer`."""
+    """Renders one object in an environment; arguments as for `LayerRenderer`."""
 
     def __init__(
         self,
@@ -299,9 +311,8 @@ class SurroundedRenderer:
         self._asset = asset
         self._spp = spp
         self._seed = seed
-        self._renderer = workbench.load_scene(asset, environment, unit=unit).renderer(
-            "camera", resolution=film, seed=seed
-        )
+        scene = workbench.load_scene(asset, environment, unit=unit)
+        self._renderer = scene.renderer("camera", resolution=film, seed=seed)
 
     def render(
         self, item: PhotographedObject, window: PhotoWindow, number: int = 0
@@ -314,11 +325,13 @@ class SurroundedRenderer:
             number: number of the row, from which the seed of the noise is derived.
         """
         renderer = self._renderer
-        inputs = renderer.scene.assembly(make_camera_inputs(item, self._asset, window))
+        scene_inputs = renderer.scene.assembly(
+            make_camera_inputs(item, self._asset, window)
+        )
         seed = seeds.stream(self._seed, "surrounded", number)
         with torch.no_grad():
             radiance = renderer.render_radiance(
-                inputs, seed, self._spp, hide_environment=False
+                scene_inputs, seed, self._spp, hide_environment=False
             )
             image: Tensor = renderer.formation.display(radiance)
         return image
@@ -329,7 +342,7 @@ def make_twin(
     photograph: reading.backdrop.BackdropPhotograph,
     window: PhotoWindow,
     layer: Layer,
-    surrounded: Mapping[str, Tensor],
+    render_of_environment: Mapping[str, Tensor],
     model_size: tuple[int, int],
 ) -> Twin:
     """Resize a photograph and its twins to the model's size.
@@ -343,27 +356,33 @@ def make_twin(
         photograph: photograph that shows it.
         window: window of the photograph around the object.
         layer: the object rendered into the photograph, and its coverage of each pixel.
-        surrounded: sRGB renders (H, W, 3) of the object, by environment.
+        render_of_environment: sRGB renders (H, W, 3) of the object, by environment.
         model_size: (height, width) in pixels.
     """
     window_size = (window.height, window.width)
     crop = cut_photograph(photograph, window)
-    coverage = _compute_visible_coverage(item, photograph, window, layer)
-    is_covered = coverage >= 0.5
-    around = crop[coverage < 0.5]
-    # Where the object fills the window, the mean of all of it is the best guess.
+    visible_coverage = _compute_visible_coverage(item, photograph, window, layer)
+    is_covered = visible_coverage >= 0.5
+    around = crop[visible_coverage < 0.5]
+    # If the object fills the window, the mean of the window is the best guess.
     mean_around = around.mean(dim=0) if len(around) else crop.mean(dim=(0, 1))
+    in_environments = {
+        name: resize(image, window_size)
+        for name, image in render_of_environment.items()
+    }
+    hole = torch.lerp(crop, mean_around.expand_as(crop), visible_coverage[..., None])
     images = {
         PHOTOGRAPH: crop,
         COMPOSED: layer.composed,
-        **{name: resize(image, window_size) for name, image in surrounded.items()},
-        HOLE: torch.lerp(crop, mean_around.expand_as(crop), coverage[..., None]),
+        **in_environments,
+        HOLE: hole,
     }
     difference = (layer.composed - crop)[is_covered]
     return Twin(
-        {name: resize(image, model_size) for name, image in images.items()},
-        layer.sight,
-        layer.alpha,
+        images={name: resize(image, model_size) for name, image in images.items()},
+        sight=layer.sight,
+        # The full silhouette, with hidden parts, is compared with the data's mask.
+        coverage=layer.alpha,
         # the side in pixels of a square with the object's area
         size=math.sqrt(float(layer.alpha.sum())),
         brightness=float(difference.mean()) if len(difference) else 0.0,
@@ -382,15 +401,18 @@ def _compute_visible_coverage(
 
     Parts that other things hide in the photograph do not count.
     """
-    front = read_front(item, photograph)
-    if front is None:
+    hiding_levels = read_front(item, photograph)  # 255 where a thing hides the object
+    if hiding_levels is None:
         return layer.alpha
-    hidden = cut_window(torch.from_numpy(front), window) / 255.0
+    hidden = cut_window(torch.from_numpy(hiding_levels), window) / 255.0
     return layer.alpha * (1.0 - hidden)
 
 
 def correlate_luminance(first: Tensor, second: Tensor) -> float | None:
-    """Return the correlation of the luminance of pixels (N, 3); None if one is even."""
+    """Return the correlation of the luminance of two lists of pixels (N, 3).
+
+    None if one of them is uniform.
+    """
     weights = torch.from_numpy(reading.backdrop.LUMINANCE).to(first)
     values = torch.stack([first @ weights, second @ weights])
     if len(first) < 2 or bool((values.std(dim=1) < 1e-6).any()):
@@ -399,47 +421,49 @@ def correlate_luminance(first: Tensor, second: Tensor) -> float | None:
 
 
 def _make_sight(
-    surfaces: Any, metres: float | None, model_size: tuple[int, int]
+    surfaces: Any, size_in_metres: float | None, model_size: tuple[int, int]
 ) -> Any:
     """Return the visible mask and the depths of the object, as tasks take them.
 
     Args:
         surfaces: first surface and depth in each pixel of the film.
-        metres: size of the object in metres. Depths are in units of the object's size.
-            None if it is not known.
+        size_in_metres: size of the object in meters, which is the unit of the scene's
+            depths; None if it is unknown.
         model_size: (height, width) of the result.
     """
-    # imports the tasks
-    from advsearch.extend import tasks
+    from advsearch.extend import tasks  # loads the tasks only when one is needed
 
     def scale(values: Tensor) -> Tensor:
         """Scale values of pixels (h, w) to the model's size, by the nearest pixel."""
         return F.interpolate(values[None, None].float(), size=model_size)[0, 0]
 
-    # If the size is not known, depths stay in units of the object's size.
-    metres_per_unit = metres or 1.0
+    # If the size is unknown, depths stay in units of the object's size.
+    metres_per_unit = size_in_metres or 1.0
     return tasks.Sight(
         scale(surfaces.visible_mask(OBJECT)) > 0.5,
-        scale(surfaces.depth) * metres_per_unit,
-        scale(surfaces.z_depth) * metres_per_unit,
-        metres,
+        scale(surfaces.depth) * metres_per_unit,  # distance from the camera
+        scale(surfaces.z_depth) * metres_per_unit,  # along the camera's axis
+        size_in_metres,
     )
 
 
 def choose_film(windows: Sequence[PhotoWindow], pixel_aspect: float) -> tuple[int, int]:
     """Return the (height, width) of a film for windows of one shape, in pixels.
 
-    Pixels of a film are square in angles; those of a photograph with different focal
-    lengths are not.
+    Pixels of a film are square in angles. Those of a photograph are not if its two
+    focal lengths differ.
 
     Args:
-        windows: at least one.
+        windows: the windows, at least one.
         pixel_aspect: fx / fy of the camera.
     """
     largest = max(windows, key=lambda window: window.width * window.height)
+    # A pixel is `pixel_aspect` times as high as wide, in angles. Here heights are in
+    # widths of a pixel.
     height = largest.height * pixel_aspect
     longer = max(largest.width, height)
-    side = min(max(FILM_STEP * math.ceil(longer / FILM_STEP), MIN_FILM), MAX_FILM)
+    side = FILM_STEP * math.ceil(longer / FILM_STEP)  # rounded up
+    side = min(max(side, MIN_FILM), MAX_FILM)
     scale = side / longer
     return max(1, round(height * scale)), max(1, round(largest.width * scale))
 
@@ -449,7 +473,10 @@ def compute_mesh_to_camera(
 ) -> Float64Array:
     """Return the rigid map (4, 4) from a mesh to OpenCV's camera coordinates.
 
-    Both are in object sizes, which leaves the image as it is.
+    Both are in units of the object's size: the scale does not change the image.
+
+    Raises:
+        InputError: the object is a bundled one, which has no file coordinates.
     """
     if asset.file_to_mesh is None:
         raise InputError(f"{item.mesh}: expected a mesh file")
@@ -461,10 +488,10 @@ def make_camera_inputs(
 ) -> dict[str, Tensor]:
     """Return the scene inputs of the camera that sees a window of a photograph.
 
-    World coordinates are those of the mesh. The angle of view is that of the window's
-    longer side: 2 * atan(side / (2 * focal length)). The shifts lead from the camera's
-    principal point to the window's center, as fractions of the window's width and
-    height.
+    World coordinates are those of the mesh. The angle of view is that of the longer
+    side of the window: 2 * atan(side / (2 * focal length)). The shifts lead from the
+    camera's principal point to the window's center, as fractions of the window's width
+    (to the right) and height (down).
 
     Args:
         item: the object, with its pose and the camera of the photograph.
@@ -474,6 +501,7 @@ def make_camera_inputs(
     mesh_to_camera = FLIP @ compute_mesh_to_camera(item, asset)
     camera_to_world = np.linalg.inv(mesh_to_camera)
     camera = item.camera
+    # The longer side is compared in tangents, as the two focal lengths may differ.
     half_tangent = max(window.width / camera.fx, window.height / camera.fy) / 2.0
     fov = math.degrees(2.0 * math.atan(half_tangent))
     center_x = window.x + window.width / 2.0
@@ -529,8 +557,8 @@ def read_front(
 ) -> npt.NDArray[np.uint8] | None:
     """Return levels (H, W), 255 where another thing hides the object; None if unknown.
 
-    The mask of the object's visible part is widened by a pixel: its edge is jagged, and
-    would otherwise cut into the object.
+    The mask of the object's visible part is widened by a pixel first: its edge is
+    jagged, and would otherwise cut into the object.
     """
     if item.visible_mask is None:
         return None
@@ -544,7 +572,7 @@ def read_front(
 
 
 def load_mask(path: Path, window: PhotoWindow) -> Tensor:
-    """Read a window (h, w) bool of a mask, which is an image over 1/2 inside."""
+    """Read a window (h, w) bool of a mask; its file is an image, over 1/2 inside."""
     values = reading.pictures.read_image(path, None, is_raw=True)
     mask = cut_window(torch.from_numpy(values[..., 0] > 0.5), window)
     if tuple(mask.shape) != (window.height, window.width):
@@ -560,7 +588,7 @@ def measure_pose(
     It is the intersection over union (IoU) of the masks, or else of the boxes. It is
     None if the data set has neither. A low value means that the pose is wrong.
     """
-    covered = twin.coverage > 0.5
+    covered = twin.coverage > 0.5  # in pixels of the window
     if item.mask is not None:
         mask = load_mask(item.mask, window)
         union = int((mask | covered).sum())
@@ -571,7 +599,7 @@ def measure_pose(
 
 
 def _find_box(covered: Tensor, window: PhotoWindow) -> counting.Box:
-    """Return the box, in the photograph, of what is covered (h, w) bool of a window."""
+    """Return the box in the photograph around covered pixels (h, w) of a window."""
     columns = covered.any(dim=0).nonzero().flatten()
     rows = covered.any(dim=1).nonzero().flatten()
     left = window.x + float(columns[0])
@@ -584,11 +612,12 @@ def _find_box(covered: Tensor, window: PhotoWindow) -> counting.Box:
 
 @lru_cache(maxsize=64)
 def load_object(mesh: Path, unit: str) -> assets.ObjectAsset:
-    """Read the mesh of an object as its file has it, and its size.
+    """Read the mesh of an object in the coordinates of its file.
 
     Raises:
         InputError: the file cannot be used.
     """
+    # z up and the front at +x are those of the scene, so that nothing is rotated.
     scene = workbench.load_scene(mesh, up="z", facing="+x", unit=unit)
     asset: assets.ObjectAsset = scene.description.object
     return asset

@@ -26,12 +26,13 @@ COMPOSED = results.IN_PHOTOGRAPH
 HOLE = results.WITHOUT_OBJECT
 CLASSIFIER_MARGIN = 0.25
 DETECTOR_MARGIN = 1.5
-"""How far a window reaches beyond the object's box, in longer sides of it."""
-MAX_TEXT_PAIRS = 5  # pairs that are listed on a terminal
+"""How far a window extends beyond the object's box, as a fraction of its longer side.
+"""
+MAX_TEXT_PAIRS = 5  # number of pairs that a terminal lists
 
 
 class TwinsConfig(Config):
-    """Settings of `twins`: which photographs, which model, and how twins are made."""
+    """Settings of `twins`: the photographs, the model, and how twins are made."""
 
     command: ClassVar[str] = "twins"
     clashes: ClassVar[tuple[settings.Clash, ...]] = tuple(
@@ -43,7 +44,7 @@ class TwinsConfig(Config):
     photographs: str = setting(
         ...,
         "twins",
-        "photographs with the objects in them, where they stand, and their meshes",
+        "photographs of the objects, with their poses and meshes",
         "a folder in BOP's form, or a .csv, .json or .yaml list",
     )
     names: dict[str, str] = setting(
@@ -70,7 +71,8 @@ class TwinsConfig(Config):
     margin: float | None = setting(
         None,
         "twins",
-        "how far the window reaches beyond the object's box, in longer sides of it",
+        "how far the window reaches beyond the object's box, as a fraction of its "
+        "longer side",
         otherwise=f"{CLASSIFIER_MARGIN}, or {DETECTOR_MARGIN} for tasks that look for "
         "the object",
         ge=0.0,
@@ -101,7 +103,7 @@ class TwinsConfig(Config):
     pictures: int = setting(
         12,
         "twins",
-        "pairs that are displayed, the worst disagreements first",
+        "number of pairs that are displayed, the worst disagreements first",
         unit="pairs",
         ge=0,
         le=1000,
@@ -168,17 +170,20 @@ class TwinsConfig(Config):
 
 
 class TwinPrediction(results.Fields):
-    """What the model predicts of an image."""
+    """The prediction of a model about an image."""
 
-    surroundings: str = Field(description="which image: the photograph, or a twin")
+    surroundings: str = Field(
+        description="name of the image: the photograph, or a twin"
+    )
     label: str
     probability: float | None
     right: bool
     margin: results.JsonFloat = Field(
-        description="right less best wrong, in what the task compares; under 0 if wrong"
+        description="score of the right prediction minus that of the best wrong one; "
+        "negative if wrong"
     )
     payload: results.Payload = Field(
-        default=None, description="what the task stores, such as boxes; absent without"
+        default=None, description="further output, such as boxes; absent without any"
     )
 
 
@@ -188,28 +193,29 @@ class TwinRow(results.Fields):
     number: int
     model: str
     photograph: str
-    frame: str = Field(description="the independent unit that it is of")
+    frame: str = Field(description="independent unit that the photograph belongs to")
     object: str
-    label: str = Field(description="the right one")
+    label: str = Field(description="the right label")
     condition: str
     window: tuple[int, int, int, int] = Field(
-        description="x, y, width and height of what the model sees, pixels"
+        description="x, y, width and height in pixels of what the model is run on"
     )
-    size: float = Field(description="square root of the silhouette's area, pixels")
+    size: float = Field(description="square root of the silhouette's area in pixels")
     brightness: float = Field(
-        description="twin less photograph where the object is, sRGB from -1 to 1"
+        description="mean of the twin minus that of the photograph, where the object "
+        "is; in sRGB, from -1 to 1"
     )
     contrast: float = Field(
-        description="standard deviation around the object in the photograph, sRGB"
+        description="standard deviation of the photograph around the object, in sRGB"
     )
     texture: float | None = Field(
-        description="correlation of twin and photograph where the object is, by "
-        "luminance, from -1 to 1; null where one of them is even"
+        description="correlation of the luminance of twin and photograph where the "
+        "object is, from -1 to 1; null if one of them is uniform"
     )
-    visible: float | None = Field(description="fraction; null where it is not known")
+    visible: float | None = Field(description="visible fraction; null if unknown")
     overlap: float | None = Field(
-        description="of the twin's silhouette with the data's mask, or their boxes, "
-        "over the union; null without"
+        description="intersection over union of the twin's silhouette and the data's "
+        "mask, or of their boxes; null if the data has neither"
     )
     predictions: list[TwinPrediction]
 
@@ -219,7 +225,7 @@ class TwinRow(results.Fields):
         return self.twin(PHOTOGRAPH)
 
     def twin(self, surroundings: str) -> TwinPrediction:
-        """Return the prediction about one of the images."""
+        """Return the prediction about the image with these surroundings."""
         for prediction in self.predictions:
             if prediction.surroundings == surroundings:
                 return prediction
@@ -242,28 +248,29 @@ class TwinPair(results.Fields):
     """A pair that is displayed, with its images."""
 
     row: TwinRow
-    pictures: list[str] = Field(description="files: photograph, then twins")
+    pictures: list[str] = Field(description="files: the photograph, then its twins")
 
 
 class TwinsResult(views.InNotebook, results.RunResult):
-    """How far what a model predicts of renders holds for photographs of the same."""
+    """How far predictions about renders hold for photographs of the same objects."""
 
     command: ClassVar[str] = "twins"
 
-    photographs: str = Field(description="the folder or list")
+    photographs: str = Field(description="the folder or list of photographs")
     model: str
-    task: str = Field(description="what judges the predictions")
+    task: str = Field(description="the task that evaluates the predictions")
     table: list[results.TwinAgreement]
     overlap: float | None = Field(
-        description="median overlap of silhouettes; null where the data has none"
+        description="median overlap of silhouettes; null if the data has none"
     )
-    low_overlaps: int = Field(description="pairs with an overlap under 0.8")
+    low_overlaps: int = Field(description="number of pairs with an overlap below 0.8")
     factors: list[FactorPart] = Field(
-        description="of the twins in the photograph, by what may explain disagreement"
+        description="how often twins in the photograph disagree, by properties that "
+        "may explain it"
     )
     pairs: list[TwinPair]
     renders: int
-    warnings: list[str] = Field(description="sentences that a reader has to know")
+    warnings: list[str] = Field(description="remarks that limit what the result shows")
 
     @property
     def brief(self) -> str:
@@ -297,6 +304,8 @@ def format_conditional(row: results.TwinAgreement) -> str:
     return f"{wording.format_estimate(row.wrong_where_twin_wrong)}, {counts}"
 
 
+# heads of the tables; `_make_agreement_cells` and `_make_photograph_cells` have their
+# order
 HEADS = (
     "model sees",
     "pairs",
@@ -308,8 +317,11 @@ HEADS = (
 )
 
 
-def _agreement_cells(row: results.TwinAgreement, name: str) -> list[str]:
-    """Return the cells of a row under `HEADS`, with its name first."""
+def _make_agreement_cells(row: results.TwinAgreement, name: str) -> list[str]:
+    """Return the cells of a row under `HEADS`, about the twins of one surroundings.
+
+    The rows about photographs are made by `_make_photograph_cells`.
+    """
     agreement = wording.format_estimate(row.agreement)
     if row.boxes is not None:
         agreement += f"; boxes {wording.format_estimate(row.boxes)}"
@@ -319,13 +331,13 @@ def _agreement_cells(row: results.TwinAgreement, name: str) -> list[str]:
         wording.format_estimate(row.twin_right),
         agreement,
         wording.format_estimate(row.kappa, "too few wrong"),
-        wording.format_estimate(row.margins),
+        wording.format_estimate(row.margins),  # rank correlation of the margins
         format_conditional(row),
     ]
 
 
-def _photograph_cells(row: results.TwinAgreement, name: str) -> list[str]:
-    """Return the cells about photographs themselves: what compares twins is empty."""
+def _make_photograph_cells(row: results.TwinAgreement, name: str) -> list[str]:
+    """Return the cells about photographs; those that compare twins are empty."""
     no_agreement = ["", "", ""]
     return [
         name,
@@ -337,8 +349,10 @@ def _photograph_cells(row: results.TwinAgreement, name: str) -> list[str]:
 
 
 def make_agreement_part(table: Sequence[results.TwinAgreement]) -> ResultPart:
-    """Return the table of all objects and conditions: the twins of each model, each
-    after a row about the photographs.
+    """Return the table over all objects and conditions.
+
+    For each model there is a row about the photographs, and then one for each of the
+    surroundings of twins.
     """
     totals = _list_totals(table)
     models = {row.model for row in totals}
@@ -348,15 +362,17 @@ def make_agreement_part(table: Sequence[results.TwinAgreement]) -> ResultPart:
         prefix = f"{total.model}: " if len(models) > 1 else ""
         if total.model not in models_above:
             models_above.add(total.model)
-            rows.append(_photograph_cells(total, f"{prefix}{PHOTOGRAPH}"))
-        rows.append(_agreement_cells(total, f"{prefix}{_name_surroundings(total)}"))
+            rows.append(_make_photograph_cells(total, f"{prefix}{PHOTOGRAPH}"))
+        rows.append(
+            _make_agreement_cells(total, f"{prefix}{_name_surroundings(total)}")
+        )
     return ResultPart("How far twins hold", heads=HEADS, rows=rows, note=TABLE_NOTE)
 
 
 def _list_totals(
     table: Sequence[results.TwinAgreement],
 ) -> list[results.TwinAgreement]:
-    """Return the rows of all objects and conditions together."""
+    """Return the rows over all objects and conditions."""
     return [row for row in table if not row.object and not row.condition]
 
 
@@ -367,7 +383,7 @@ def _name_surroundings(row: results.TwinAgreement) -> str:
     return f"twin in the environment {row.surroundings}"
 
 
-def _group_parts(table: Sequence[results.TwinAgreement]) -> Iterator[ResultPart]:
+def _make_group_parts(table: Sequence[results.TwinAgreement]) -> Iterator[ResultPart]:
     """Yield the tables by object and by condition."""
     surroundings = list(dict.fromkeys(row.surroundings for row in table))
     several = len({row.model for row in table}) > 1
@@ -378,17 +394,17 @@ def _group_parts(table: Sequence[results.TwinAgreement]) -> Iterator[ResultPart]
                 group = getattr(row, kind)
                 if group and row.surroundings == name:
                     group = f"{row.model}: {group}" if several else group
-                    rows.append(_agreement_cells(row, group))
+                    rows.append(_make_agreement_cells(row, group))
             title = f"By {kind}: {name}"
             heads = (kind, *HEADS[1:])
             yield ResultPart(title, heads=heads, rows=rows, folded=True, only="page")
 
 
-def _factor_part(result: TwinsResult) -> ResultPart:
+def _make_factor_part(result: TwinsResult) -> ResultPart:
     """Return the table of how often twins disagree, by parts of each factor."""
     rows = []
     for part in result.factors:
-        bounds = f"{_factor_number(part.lower)} to {_factor_number(part.upper)}"
+        bounds = f"{_format_factor(part.lower)} to {_format_factor(part.upper)}"
         rows.append(
             [
                 part.factor,
@@ -406,7 +422,7 @@ def _factor_part(result: TwinsResult) -> ResultPart:
     )
 
 
-def _factor_number(value: float) -> str:
+def _format_factor(value: float) -> str:
     """Format a value of a factor, such as a size in pixels or a fraction."""
     return f"{value:.0f}" if abs(value) >= 10.0 else f"{value:.2f}"
 
@@ -415,7 +431,7 @@ def make_twins_view(result: TwinsResult) -> ShownResult:
     """Return the table, what explains disagreement, and the pairs."""
     facts = {
         "photographs": result.photographs,
-        "silhouettes": _overlap_text(result),
+        "silhouettes": _describe_overlap(result),
     }
     about = [result.photographs, result.model]
     if not result.table:
@@ -425,13 +441,13 @@ def make_twins_view(result: TwinsResult) -> ShownResult:
             about=about,
             says_interrupted=True,
         )
-    sections = [make_agreement_part(result.table), *_group_parts(result.table)]
-    sections += [_factor_part(result), *_pair_parts(result)]
+    sections = [make_agreement_part(result.table), *_make_group_parts(result.table)]
+    sections += [_make_factor_part(result), *_make_pair_parts(result)]
     return ShownResult(summarize_twins(result.table), sections, facts, about)
 
 
-def _overlap_text(result: TwinsResult) -> str:
-    """Describe how well silhouettes overlap; empty where the data has none."""
+def _describe_overlap(result: TwinsResult) -> str:
+    """Describe how well silhouettes overlap; empty if the data has none."""
     if result.overlap is None:
         return ""
     text = f"median overlap {result.overlap:.2f}"
@@ -471,8 +487,8 @@ def summarize_composed(composed: results.TwinAgreement) -> str:
     return " ".join(sentences)
 
 
-def _pair_parts(result: TwinsResult) -> Iterator[ResultPart]:
-    """Yield the pairs, for a terminal and for a page."""
+def _make_pair_parts(result: TwinsResult) -> Iterator[ResultPart]:
+    """Yield the displayed pairs, for a terminal and for a page."""
     title = "Worst disagreements first"
     has_several_models = "," in result.model
     lines = []
@@ -483,7 +499,8 @@ def _pair_parts(result: TwinsResult) -> Iterator[ResultPart]:
         if has_several_models:
             name = f"{row.model}, {name}"
         texts = [
-            f"{image.surroundings}: {_verdict(image)}" for image in row.predictions
+            f"{image.surroundings}: {_describe_prediction(image)}"
+            for image in row.predictions
         ]
         lines.append(f"{name}: {'; '.join(texts)}")
         # Fewer images are stored than there are predictions: the last have none.
@@ -495,18 +512,20 @@ def _pair_parts(result: TwinsResult) -> Iterator[ResultPart]:
     yield ResultPart(title, pictures=groups, only="page")
 
 
-def _verdict(image: TwinPrediction) -> str:
+def _describe_prediction(image: TwinPrediction) -> str:
     """Describe the prediction about an image: its label, verdict and margin."""
     verdict = "right" if image.right else "wrong"
     return f"{image.label or 'nothing'}, {verdict}, margin {image.margin:+.1f}"
 
 
 def make_twins_claims(result: TwinsResult) -> Iterator[views.Claim]:
-    """Yield a claim for each of the surroundings."""
+    """Yield a claim for each model and each of the surroundings."""
     for row in _list_totals(result.table):
+        # The agreement is a mean over frames, so this count of pairs is approximate.
+        n_agreeing = round(row.agreement.value * row.pairs)
         extent = results.Extent.from_count(
             "pairs of photograph and twin that agree",
-            round(row.agreement.value * row.pairs),
+            n_agreeing,
             row.pairs,
             row.agreement.interval,
             row.agreement.value,
