@@ -394,14 +394,12 @@ def read_ply(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     reader = _Properties(elements, notes)
     points = reader.read_columns("vertex", (("x", "y", "z"),))
     if reader.has_splats:
-        notes.warn(
-            f" has Gaussian splats, which are left out: a model that {SPLATS_ADVICE}"
-        )
+        notes.warn(f" has Gaussian splats, which are left out: {SPLATS_ADVICE}")
     if points is None:
         if reader.has_splats:
             raise FileFormatError(
                 f"{path}: expected a mesh with faces, got Gaussian "
-                f"splats, a model that {SPLATS_ADVICE}"
+                f"splats: {SPLATS_ADVICE}"
             )
         raise notes.damaged("a PLY file with vertices that have x, y and z", "none")
     return _make_parts(reader, points, _parse_texture_names(comments))
@@ -614,7 +612,7 @@ class _Properties:
         if (counts < 3).all():
             got = "points or lines only; export triangles"
             if self.has_splats:
-                got = f"Gaussian splats, a model that {SPLATS_ADVICE}"
+                got = f"Gaussian splats: {SPLATS_ADVICE}"
             raise FileFormatError(
                 f"{self.notes.path}: expected a mesh with faces, got {got}"
             )

@@ -179,8 +179,8 @@ class Conversion:
         header["scene"] = 0
         if has_splats and not header["meshes"]:
             raise errors.FileFormatError(
-                f"{self.source}: expected a mesh with faces, got Gaussian splats, a "
-                f"model that {reading.SPLATS_ADVICE}"
+                f"{self.source}: expected a mesh with faces, got Gaussian splats: "
+                f"{reading.SPLATS_ADVICE}"
             )
         if self.lights:
             header["extensions"] = {"KHR_lights_punctual": {"lights": self.lights}}
@@ -289,8 +289,7 @@ class Conversion:
         if has_splats:
             notes.insert(
                 0,
-                "has Gaussian splats, which are left out: a model that "
-                f"{reading.SPLATS_ADVICE}",
+                f"has Gaussian splats, which are left out: {reading.SPLATS_ADVICE}",
             )
         return notes[:100]
 
