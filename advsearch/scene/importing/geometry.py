@@ -451,8 +451,8 @@ def _find_turned_faces(soup: TriangleSoup) -> tuple[BoolArray, IntArray, bool]:
     _, shell = np.unique(
         np.minimum(component_as_is, component_turned), return_inverse=True
     )
-    is_one_sided = component_as_is == component_turned
-    return is_turned, shell.astype(np.int64), bool(is_one_sided.any())
+    has_moebius_strip = bool((component_as_is == component_turned).any())
+    return is_turned, shell.astype(np.int64), has_moebius_strip
 
 
 def _compute_shell_bounds(
@@ -506,11 +506,8 @@ def _find_inside_out_shells(soup: TriangleSoup, shell: IntArray) -> BoolArray:
     n_shells = len(face_counts)
     is_closed = _find_closed_shells(soup, shell, face_counts)
     volume = _compute_signed_volumes(soup, shell, vectors, face_counts)
-    # Agreement with the file's normals; 0 if it has none.
-    corner_agreement = (soup.normals * vectors[:, None]).sum(axis=2)
-    face_agreement = np.nan_to_num(corner_agreement).sum(axis=1)
-    agreement = np.bincount(shell, weights=face_agreement, minlength=n_shells)
-    lower, upper = _compute_shell_bounds(soup, shell, n_shells)
+    agreement = _compute_normal_agreement(soup, shell, vectors, n_shells)
+    bounds = _compute_shell_bounds(soup, shell, n_shells)
     # First step: all closed shells are turned over if most of the volume is negative.
     # That reverses the signs of volumes and agreements.
     is_object_turned = volume[is_closed].sum() < 0.0
@@ -519,19 +516,50 @@ def _find_inside_out_shells(soup: TriangleSoup, shell: IntArray) -> BoolArray:
     # Second step: single shells are turned over.
     is_shell_turned = is_negative.copy()
     for index in np.flatnonzero(is_closed & is_negative):
-        # Enclosing is tested by bounding boxes.
-        is_enclosing = (
-            is_closed
-            & (lower < lower[index]).all(axis=1)
-            & (upper > upper[index]).all(axis=1)
-        )
-        if is_enclosing.any():
+        if _is_enclosed(index, is_closed, bounds):
             # The wall of a hollow space, which stays if the normals agree with it.
             is_shell_turned[index] = step_agreement[index] < 0.0
     # A closed shell that is turned over in both steps is as before.
     is_closed_turned = is_shell_turned ^ is_object_turned
     is_sheet_turned = agreement < 0.0
     return np.where(is_closed, is_closed_turned, is_sheet_turned)
+
+
+def _is_enclosed(
+    index: int, is_closed: BoolArray, bounds: tuple[Float64Array, Float64Array]
+) -> bool:
+    """Return whether a closed shell has a bounding box around that of shell `index`.
+
+    Args:
+        index: index of the shell.
+        is_closed: (S,) which shells are closed.
+        bounds: lower and upper corners (S, 3) of the boxes of all shells.
+    """
+    lower, upper = bounds
+    is_enclosing = (
+        is_closed
+        & (lower < lower[index]).all(axis=1)
+        & (upper > upper[index]).all(axis=1)
+    )
+    return bool(is_enclosing.any())
+
+
+def _compute_normal_agreement(
+    soup: TriangleSoup, shell: IntArray, vectors: Float64Array, n_shells: int
+) -> Float64Array:
+    """Return how far the file's normals agree with the faces of each shell, (S,).
+
+    It is positive if normals are on the fronts of faces, and 0 without normals.
+
+    Args:
+        soup: the faces.
+        shell: (F,) the shell of each face.
+        vectors: (F, 3) normals of the faces, as long as twice the areas.
+        n_shells: number of shells.
+    """
+    corner_agreement = (soup.normals * vectors[:, None]).sum(axis=2)
+    face_agreement = np.nan_to_num(corner_agreement).sum(axis=1)
+    return np.bincount(shell, weights=face_agreement, minlength=n_shells)
 
 
 def _compute_signed_volumes(
