@@ -19,8 +19,7 @@ PACKAGE_SUFFIX = ".usdz"
 LAYER_SUFFIXES = (".usd", ".usda", ".usdc")
 USD_TIMEOUT_S = 120  # timeout in seconds, before `scale_limit`
 MAX_MEMORY = 8 << 30  # limit of the process's memory in bytes, before `scale_limit`
-# A glTF file has textures that are decoded and written anew, so it may be larger than
-# the USD file.
+# Limit of the bytes of the glTF file, in which textures may be written anew.
 MAX_RESULT_SIZE = 4 * stored_files.LARGEST_FILE
 USD_MAGIC_BYTES = (b"PXR-USDC", b"#usda", b"PK\x03\x04")
 REJECTED_PREFIX = "refused: "
