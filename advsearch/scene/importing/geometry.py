@@ -559,7 +559,7 @@ def _compute_normal_agreement(
     """
     corner_agreement = (soup.normals * vectors[:, None]).sum(axis=2)
     face_agreement = np.nan_to_num(corner_agreement).sum(axis=1)
-    return np.bincount(shell, weights=face_agreement, minlength=n_shells)
+    return np.asarray(np.bincount(shell, weights=face_agreement, minlength=n_shells))
 
 
 def _compute_signed_volumes(
