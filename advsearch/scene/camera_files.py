@@ -778,7 +778,7 @@ def _check_roi(entries: Entries, size: tuple[float, float]) -> list[str]:
         value = {}
     roi = Entries(entries.path, {str(key): value[key] for key in value})
     numbers = _read_optional_numbers(roi, ("x_offset", "y_offset", "height", "width"))
-    roi.get("dorectify")  # counts as read: it changes nothing in a full image
+    roi.get("dorectify")  # marks it as read: it changes nothing in a full image
     offset = (numbers["x_offset"], numbers["y_offset"])
     roi_size = (numbers["height"], numbers["width"])
     if offset != (0.0, 0.0) or roi_size not in ((0.0, 0.0), size):

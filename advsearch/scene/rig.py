@@ -596,7 +596,7 @@ def _read_colmap(path: str, image_ids: str) -> tuple[Mount, ...]:
 def _read_image_model(path: str, words: Sequence[str]) -> CameraModel:
     """Return the model of an image of COLMAP, from the cameras.txt beside it.
 
-    `words` are the image's line, of 10 words, of which the ninth is the camera's id.
+    `words` are the ten words of the image's line. The ninth is the camera's id.
     """
     return read_camera(_name_image_camera(path, words))
 

@@ -180,8 +180,8 @@ def read_bytes(path: Path, what: str, suffixes: Sequence[str]) -> bytes:
 
     Args:
         path: the file.
-        what: what it should hold, for messages: a word that follows "an", such as
-            "object" or "environment".
+        what: expected content, for messages: a word that follows "an", such as "object"
+            or "environment".
         suffixes: suffixes that it may have, in lower case with the dot.
 
     Raises:
@@ -216,8 +216,8 @@ def _check_suffix(path: Path, what: str, suffixes: Sequence[str]) -> None:
 
     Args:
         path: the file, perhaps with a part of it behind a #.
-        what: what it should hold, for messages: a word that follows "an", such as
-            "object" or "environment".
+        what: expected content, for messages: a word that follows "an", such as "object"
+            or "environment".
         suffixes: suffixes that it may have, in lower case with the dot.
     """
     if path.is_dir():

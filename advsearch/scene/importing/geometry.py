@@ -433,7 +433,7 @@ def _find_turned_faces(soup: TriangleSoup) -> tuple[BoolArray, IntArray, bool]:
     If two neighbours agree, their equal nodes are linked; otherwise the opposite ones.
     So a connected component is a consistent choice for all faces of a shell, and the
     shell's other component is the reverse choice. If both are the same component, the
-    shell is one-sided. Of both choices, the one that turns less area over is taken.
+    shell is one-sided. The choice that turns less area over is made.
 
     Returns:
         Which faces (F,) to turn over; the shell of each face (F,); and whether some
@@ -491,8 +491,8 @@ def _find_inside_out_shells(soup: TriangleSoup, shell: IntArray) -> BoolArray:
 
     A closed shell, all of whose edges belong to exactly two of its faces, is turned
     over if its signed volume is negative. An exception is a shell inside another closed
-    shell: it is taken for the wall of a hollow space, and stays as it is, unless the
-    file's normals point the other way. If the signed volume of all closed shells
+    shell: it may be the wall of a hollow space, and stays as it is, unless the file's
+    normals point the other way. If the signed volume of all closed shells
     together is negative, all closed shells are turned over first, and then the same
     rule is applied to the result. An open sheet is turned over if the file's normals
     point away from its front.
@@ -950,7 +950,7 @@ class _EarCutter:
         """Return which active polygons lose their corner b, between a and c.
 
         A polygon loses it if b is the tip of an ear, or if only three corners are left.
-        It also loses it, and counts as failed, if all corners were tried without
+        It also loses it, and is marked as failed, if all corners were tried without
         finding an ear, or once the budget is spent.
 
         Args:
@@ -1048,7 +1048,7 @@ def _is_ear(
     """Return which triangles have an area and contain no present point, (P,).
 
     A point is inside if it is on the left of all three sides, which run
-    counter-clockwise. A point on a side counts as inside, one at a corner does not.
+    counter-clockwise. A point on a side is inside, but one at a corner is not.
 
     Args:
         corners: the three corners of each triangle, (P, 2) each.

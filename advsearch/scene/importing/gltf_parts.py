@@ -453,8 +453,8 @@ class GltfSurfaces:
     ) -> tuple[float, float]:
         """Return roughness and metallic: the factors times the mean of their texture.
 
-        The mean is taken over the faces that show the texture, or over all texels if
-        faces have no texture coordinates.
+        The mean is that over the faces with the texture, or over all texels if faces
+        have no texture coordinates.
 
         Args:
             material: the material.
@@ -487,7 +487,7 @@ class GltfSurfaces:
 
         Args:
             use: the texture; None returns None.
-            kind: what it holds.
+            kind: content of the image, such as "colours".
             note_template: the note if it has no texels, with `{name}` for the image and
                 `{why}` for the reason; then None is returned.
         """
@@ -516,7 +516,7 @@ class GltfSurfaces:
 
         Args:
             use: the texture.
-            kind: what it holds, such as "colours".
+            kind: content of the image, such as "colours".
             note_template: the note if it has no texels, with `{name}` for the image and
                 `{why}` for the reason; then None is returned.
         """

@@ -166,7 +166,7 @@ class MtlReader:
         the number of the square in its name, such as "wood.1002.png". The material's
         first image with such a number decides. There are images for all squares if the
         name has the placeholder ``<UDIM>``, or if the file of another candidate square
-        exists. Otherwise the image is taken for an ordinary one that repeats, which is
+        exists. Otherwise the image is used as an ordinary one that repeats, which is
         noted.
 
         Args:
@@ -624,7 +624,7 @@ class MtlReader:
 
         Args:
             use: the image; None returns None.
-            kind: what it holds, such as "colours".
+            kind: content of the image, such as "colours".
             note_template: the note if it cannot be read, with `{name}` for the image
                 and `{why}` for the reason; then None is returned.
         """

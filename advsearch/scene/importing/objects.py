@@ -317,7 +317,7 @@ def _find_up(
 def _find_opacity(color: Float32Array, notes: Notes) -> Float32Array | None:
     """Return the opacity (H, W) in a map of colors (H, W, 3 or 4); None if opaque.
 
-    An object that is transparent everywhere would be invisible. It counts as opaque,
+    An object that is transparent everywhere would be invisible. It becomes opaque,
     with a note.
     """
     if color.shape[2] < 4:

@@ -330,7 +330,7 @@ class FileImages:
             key: identifies the image in the cache, such as its name.
             read_bytes: returns the content of its file; raises OSError or ValueError if
                 there is none.
-            kind: what it holds, such as "colours".
+            kind: content of the image, such as "colours".
             name: its name in the file.
             message: the note, with {name} and {why}.
         """
@@ -364,7 +364,7 @@ class FileImages:
 
         Args:
             read_bytes: returns the content of its file.
-            kind: what it holds, such as "numbers".
+            kind: content of the image, such as "numbers".
             name: its name in the file, for notes.
         """
         try:

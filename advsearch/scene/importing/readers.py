@@ -54,7 +54,7 @@ def read_mesh_bytes(path: Path, what: str, suffixes: tuple[str, ...]) -> bytes:
 
     Args:
         path: the file.
-        what: what it should hold, such as "object", for messages.
+        what: expected content, such as "object", for messages.
         suffixes: suffixes that it may have, in lower case with the dot.
 
     Raises:

@@ -1,6 +1,6 @@
 """Scenes from glTF files: one node as the object, the rest as its surroundings.
 
-``--object scene.glb#chair`` selects the node. Lengths are in object sizes: the whole
+``--object scene.glb#chair`` selects the node. Lengths are in object sizes: all of the
 scene is moved and scaled so that the object's largest extent is 1 and the object stands
 on z = 0. z is up. The axis of the file that its format defines as the front of an asset
 becomes +x.
