@@ -51,7 +51,7 @@ OTHER_FORMATS: tuple[tuple[str, str, str], ...] = (
     (
         r"# ?Bundle file",
         "a Bundler reconstruction, which has no size of its pictures",
-        "write the f, k1 and k2 of one of its cameras as COLMAP's cameras.txt: 1 "
+        "write f, k1 and k2 of one of its cameras as COLMAP's cameras.txt: 1 "
         "RADIAL WIDTH HEIGHT f WIDTH/2 HEIGHT/2 k1 k2",
     ),
     (
@@ -82,7 +82,7 @@ OTHER_FORMATS: tuple[tuple[str, str, str], ...] = (
         "export the registration as COLMAP's text, and give cameras.txt",
     ),
 )
-"""Formats that are not read: a pattern of how they begin, a description, and advice."""
+"""Formats that are not read: a pattern of their beginning, a description, and advice."""
 
 METASHAPE_FILE = "calibration"
 METASHAPE_PROJECT = ("document", "chunk", "sensors", "sensor")
@@ -137,7 +137,10 @@ OPENSFM_TRANSLATED_KEYS = (
 
 
 def describe_projection(name: str) -> str:
-    """Describe an unsupported model, to follow its name in an error; "" if unknown."""
+    """Describe an unsupported model: the end of an error message, after its name.
+
+    The text begins with a comma. It is "" if the model is not known.
+    """
     description = OTHER_PROJECTIONS.get(re.sub(r"[-\s]+", "_", name.strip().lower()))
     if description is None:
         return ""
@@ -146,7 +149,7 @@ def describe_projection(name: str) -> str:
 
 def check_text_format(path: str, text: str) -> None:
     """Raise FileFormatError for a text in a known format that is not read."""
-    start = text.lstrip()[:2000]  # where each of these formats is recognised
+    start = text.lstrip()[:2000]  # enough to recognize each of these formats
     for pattern, description, advice in OTHER_FORMATS:
         if re.match(pattern, start):
             raise FileFormatError(
@@ -169,9 +172,9 @@ def translate_entries(
 ) -> dict[str, Any] | None:
     """Translate the entries of one camera to those of OpenCV's files.
 
-    The names of the entries tell which tool wrote the file: ORB-SLAM, KITTI, OpenSfM,
-    stella_vslam, RealSense or Metashape. Files of the last three have one camera only,
-    which has no name.
+    The tool that wrote the file is recognized by the names of the entries: ORB-SLAM,
+    KITTI, OpenSfM, stella_vslam, RealSense or Metashape. Files of the last three have
+    one camera only, which has no name.
 
     Args:
         path: the file.
@@ -182,8 +185,8 @@ def translate_entries(
         The entries, or None if the file is not of a tool that is translated here.
 
     Raises:
-        FileFormatError: it has another projection, several cameras of which none is
-            named, or lacks numbers.
+        FileFormatError: the projection is not supported, numbers are missing, or the
+            file has several cameras and the user has not named one.
     """
     orbslam_matches = map(ORBSLAM_CAMERA.fullmatch, data)
     orbslam_cameras = [match[1] for match in orbslam_matches if match]
@@ -214,7 +217,8 @@ def translate_entries(
 def _translate_stella(camera: Mapping[str, Any]) -> dict[str, Any]:
     """Translate a camera of stella_vslam: its names, and the name of its model.
 
-    Entries that are not about the lens are left out; they are as in ORB-SLAM's files.
+    Entries that are not about the lens are left out. They have the same names as in
+    ORB-SLAM's files.
     """
     entries = {
         STELLA_NAMES.get(str(name), str(name)): value for name, value in camera.items()
@@ -234,30 +238,31 @@ def _translate_orbslam(
     """Translate a camera of ORB-SLAM, whose entries are `Camera.fx` or `Camera1.fx`.
 
     Entries of other cameras, and those that are not about the lens, are left out.
+    Entries of no camera keep their names.
 
     Args:
         path: the file, for messages.
-        camera_name: "" if none is named.
+        camera_name: "" if the user has not named one.
         data: all entries of the file.
-        cameras: names of its cameras, the part before the dot, such as "Camera1".
+        cameras: names of its cameras, the part before the dot: "Camera" if it has one
+            camera, else "Camera1", "Camera2".
     """
-    camera_group = select_camera(
-        path, camera_name, dict(zip(cameras, cameras, strict=True))
-    )
+    selected_camera = select_camera(path, camera_name, {name: name for name in cameras})
     stated_type = str(data.get("Camera.type", "PinHole"))
     entries: dict[str, Any] = {
         "distortion_model": ORBSLAM_KINDS.get(stated_type.lower(), stated_type)
     }
-    other_cameras = {name for name in cameras if name != camera_group}
+    other_cameras = {name for name in cameras if name != selected_camera}
     size_names = {"width": "image_width", "height": "image_height"}
     for name, value in data.items():
-        group, _, entry_name = name.partition(".")
-        is_about_lens = not ORBSLAM_NON_LENS_KEYS.fullmatch(name)
-        is_translated = name == "Camera.type"
-        if not is_about_lens or is_translated or group in other_cameras:
+        camera, _, entry_name = name.partition(".")
+        if camera in other_cameras or ORBSLAM_NON_LENS_KEYS.fullmatch(name):
             continue
-        # `Camera` has what all cameras of the file share
-        if group in (camera_group, "Camera"):
+        if name == "Camera.type":  # the distortion model above
+            continue
+        # Several cameras share the entries of `Camera`, such as `Camera.width`.
+        is_of_selected_camera = camera in (selected_camera, "Camera")
+        if is_of_selected_camera:
             entries[size_names.get(entry_name, entry_name)] = value
         else:
             entries[name] = value
@@ -267,18 +272,21 @@ def _translate_orbslam(
 def _find_kitti(data: Mapping[str, Any]) -> dict[str, str]:
     """Return the names of the matrices of KITTI's cameras, by the cameras' names.
 
-    Numbers separated by blanks are a text in YAML; a list P1 is no camera of KITTI's,
-    but of a stereo pair of OpenCV.
+    The matrix K_02 is of the camera "02", P_rect_02 of "rect_02", and P2 of "P2".
     """
     cameras = dict[str, str]()
     for name, value in data.items():
+        # KITTI separates numbers by blanks, which YAML reads as a string. A list is of
+        # another tool: P1 may be of a stereo pair of OpenCV.
         if not isinstance(value, str):
             continue
-        match = KITTI_RAW.fullmatch(name) or KITTI_RECTIFIED.fullmatch(name)
         if KITTI_PROJECTION.fullmatch(name):
             cameras[name] = name
-        elif match:
-            cameras[match[1]] = name
+            continue
+        match = KITTI_RAW.fullmatch(name) or KITTI_RECTIFIED.fullmatch(name)
+        if match:
+            camera_name = match[1]
+            cameras[camera_name] = name
     return cameras
 
 
@@ -310,7 +318,7 @@ def _translate_kitti(
 
     Args:
         path: the file, for messages.
-        camera_name: "" if none is named.
+        camera_name: "" if the user has not named one.
         data: all entries of the file.
         cameras: for each name of a camera the name of its matrix, such as "P_rect_02".
 
@@ -330,10 +338,15 @@ def _translate_kitti(
             path, data, f"D_{raw_match[1]}", 5
         )
     else:
-        # The projection is K [R | t]. A rectified camera has R = 1, so that the first
-        # three columns are K.
-        rows = _read_numbers(path, data, matrix_name, 12)
-        entries["camera_matrix"] = [*rows[0:3], *rows[4:7], *rows[8:11]]
+        # The projection (3, 4) is K [R | t]. A rectified camera has R = 1, so that the
+        # first three columns are K.
+        projection = _read_numbers(path, data, matrix_name, 12)
+        entries["camera_matrix"] = [
+            *projection[0:3],
+            *projection[4:7],
+            *projection[8:11],
+        ]
+    # K_02 has its size in S_02, P_rect_02 in S_rect_02, and P2 has none.
     size_name = re.sub(r"^[KP]_", "S_", matrix_name)
     if size_name != matrix_name and size_name in data:
         entries["image_size"] = _read_numbers(path, data, size_name, 2)
@@ -349,34 +362,33 @@ def _translate_kitti(
 def _translate_realsense(data: Mapping[str, Any]) -> dict[str, Any]:
     """Translate the intrinsics of RealSense.
 
-    Two of its models are not supported. If all their coefficients are 0 they are the
-    same as a pinhole, and are translated to "none".
+    Its inverse and its modified Brown-Conrady model are not supported. If all their
+    coefficients are 0 they are the same as a pinhole, and are translated to "none".
     """
     entries = {REALSENSE_NAMES.get(name, name): value for name, value in data.items()}
-    kind = re.sub(
-        r"[-\s]+",
-        "_",
-        str(data.get("model", "none")).rpartition(".")[2].strip().lower(),
-    )
+    # "distortion.brown_conrady" and "Brown Conrady" become "brown_conrady".
+    stated_model = str(data.get("model", "none"))
+    last_word = stated_model.rpartition(".")[2].strip().lower()
+    model = re.sub(r"[-\s]+", "_", last_word)
     coefficients = data.get("coeffs")
-    is_zero = isinstance(coefficients, list) and not any(coefficients)
-    if kind in ("kannala_brandt4", "kannala_brandt"):
-        kind = "kannala_brandt"
-        # the model has four; the list may be longer
+    is_undistorted = isinstance(coefficients, list) and not any(coefficients)
+    if model in ("kannala_brandt4", "kannala_brandt"):
+        model = "kannala_brandt"
+        # The model has four coefficients; the list may be longer.
         if isinstance(coefficients, list):
-            coefficients = coefficients[:4]
-        entries["coeffs"] = coefficients
-    elif is_zero and kind in ("inverse_brown_conrady", "modified_brown_conrady"):
-        kind = "none"
-    entries["distortion_model"] = kind
+            entries["coeffs"] = coefficients[:4]
+    elif model in ("inverse_brown_conrady", "modified_brown_conrady"):
+        if is_undistorted:
+            model = "none"
+    entries["distortion_model"] = model
     return entries
 
 
 def _translate_opensfm(path: str, camera: Mapping[str, Any]) -> dict[str, Any]:
     """Translate a camera of OpenSfM, whose lengths are fractions of the larger side.
 
-    Lengths of a panorama are not needed, and those of an unknown kind are not
-    translated, since the camera is rejected later.
+    A panorama needs no lengths. Those of an unknown kind are not translated, since the
+    camera is rejected later.
 
     Args:
         path: the file, for messages.
@@ -433,15 +445,15 @@ def _scale_opensfm_lengths(
 def _translate_metashape(path: str, data: Mapping[str, Any]) -> dict[str, Any]:
     """Translate a camera of Agisoft Metashape (manual, appendix "Camera models").
 
-    Metashape's p1 is OpenCV's p2, and the other way round. k4 is the fourth coefficient
-    of the radial polynomial. OpenCV has such a term only for a fisheye.
+    Metashape's p1 is OpenCV's p2, and vice versa. k4 is the fourth coefficient of the
+    radial polynomial. OpenCV has such a term only for a fisheye.
 
     Args:
         path: the file, for messages.
         data: entries of the file; a number that is missing is 0.
 
     Raises:
-        FileFormatError: it has a k4 and is no fisheye, or no size.
+        FileFormatError: the size is missing, or a camera that is no fisheye has a k4.
     """
     stated_type = str(data.get("projection", "frame"))
     value_by_name = {

@@ -1,4 +1,4 @@
-"""The entries of a camera file by name, and the camera model of their numbers.
+"""The entries of a camera file by name, and the camera model that they describe.
 
 An entry that is not read is noted, or rejected if it changes the image.
 """
@@ -22,22 +22,22 @@ from advsearch.scene.camera_model import (
 from advsearch.scene.importing.files import format_name
 from advsearch.scene.importing.unread import TrackedKeys, join_names
 
-MAX_SIDE = 1 << 16  # limit of the sides of an image
-# Limits of coefficients, and of focal lengths in sides of the image.
-MAX_COEFFICIENT = 1e4
+MAX_SIDE = 1 << 16  # largest width or height of an image, pixels
+MAX_COEFFICIENT = 1e4  # largest absolute value of a distortion coefficient
+# A focal length is at most this many sides of the image, and at least 1 / this many.
 MAX_FOCAL_RATIO = 1e3
 IMAGE_CHANGING_KEYS = re.compile(
     r"xi|mu|mv|[dkps]\d?|t(au)?[xy]|alpha|beta|gamma\d*|omega|.*dist(?!ance).*|.*skew.*|.*shear.*|.*mirror.*|.*tilt.*|"
     r".*coeff.*|.*flip.*|.*rotate.*|image(rotation|scale)|scale(factor)?|resize.*|(is|image)?rectified|"
     r".*roi.*|.*crop.*|.*binning.*|.*decimat.*|.*fisheye.*|.*lens.*model|.*poly.*|.*affine.*|.*projectionparam.*"
 )
-"""Plain names of entries that change the image, and are rejected unless they are
-read.
+"""Plain names of entries that change the image. An entry with such a name is rejected
+unless it is read.
 """
 # Plain names of entries about rectified images.
 RECTIFICATION_KEYS = re.compile(r"r|p|rectificationmatrix|projectionmatrix")
 IGNORED_KEYS = re.compile(
-    # Who made it, when, and how accurately.
+    # By whom, when and how accurately the camera was calibrated.
     r"camera(name|id|info|label|serial.*|index)?|camname|name|label|sensor(type|name|id)?|serial(number)?|comment|version"
     r"|header|stamp|frameid|seq|rostopic|topic|ratehz|fps|framerate|calibration(time|date|flags)|date|time|flags(value)?"
     r"|(nr?|numberof)?(of)?frames(count)?|nrof(frames|images)|nimages|(avg|mean)?reprojectionerrors?|rms(error)?|error"
@@ -56,30 +56,33 @@ def normalize_key(name: str) -> str:
 
 
 class Entries:
-    """The entries of a camera file by plain names, with a record of which are read.
+    """The entries of a camera file, with a record of which have been read.
 
         entries.get("cameramatrix", "k")   # the first that has a value, or None
         entries.find_unread()              # the entries that were not read
 
-    Raises:
-        FileFormatError: two entries have the same plain name.
+    Entries are found by their plain names, which `normalize_key` makes.
     """
 
     def __init__(self, path: str, values: Mapping[str, Any]) -> None:
-        """Keep the entries by plain names; raises as the class says."""
+        """Store the entries by plain names.
+
+        Raises FileFormatError if two entries have the same plain name.
+        """
         self.path = path
         self._keys: TrackedKeys[Any] = TrackedKeys(values, fold=normalize_key)
-        for key in self._keys.repeated:
+        if self._keys.repeated:
+            key = self._keys.repeated[0]
             later_key = self._keys.get_spelling(normalize_key(key))
             raise FileFormatError(
                 f"{path}: has {format_name(key)} and {format_name(later_key)}; leave "
                 "one of them out"
             )
-        # Keys of matrices that are not read.
+        # Keys inside matrices that `parse_numbers` did not read, as "matrix.key".
         self._unread_matrix_keys: list[str] = []
 
     def get(self, *names: str) -> Any:
-        """Return the first of some entries that has a value, or None."""
+        """Return the value of the first of these names that has one, or None."""
         return self._keys.get(*names)
 
     def require(self, name: str, aliases: Sequence[str] = ()) -> Any:
@@ -125,9 +128,10 @@ class Entries:
             counts: the lengths that it may have.
 
         Raises:
-            FileFormatError: it has another length, or other values.
+            FileFormatError: the list has another length, or a value is no finite number.
         """
-        # OpenCV writes a matrix as a mapping; keys that are not of its format are noted
+        # OpenCV writes a matrix as a mapping. Its keys are noted if they are not of
+        # OpenCV's format.
         if isinstance(entry, Mapping):
             self._unread_matrix_keys += [
                 f"{name}.{key}" for key in entry if key not in MATRIX_KEYS
@@ -145,7 +149,8 @@ class Entries:
     def find_unread(self, prefix: str = "") -> list[str]:
         """Return the names of entries that were not read and need a note.
 
-        They are spelled as in the file. Entries that change nothing need no note.
+        They are spelled as in the file. An entry that could change the image, but has
+        a neutral value such as 0, needs no note.
 
         Args:
             prefix: for entries inside another one, its name with a dot, such as "roi.".
@@ -159,32 +164,36 @@ class Entries:
         ):
             name = normalize_key(spelling)
             value = self._keys.peek(name)
-            if not self._may_change_image(name, value):
+            if not self._is_image_changing_entry(name, value):
                 unread.append(prefix + spelling)
             elif not is_neutral(value):
                 raise FileFormatError(
                     f"{self.path}: expected no {format_name(prefix + spelling)}, got "
-                    f"{format_name(str(value))}: it makes another picture and is not "
+                    f"{format_name(str(value))}: it changes the picture and is not "
                     "read; calibrate with one of the models in docs/cameras.md"
                 )
         return unread
 
-    def _may_change_image(self, name: str, value: object) -> bool:
-        """Return whether an entry of a plain name would change the image if it were
-        read.
+    def _is_image_changing_entry(self, name: str, value: object) -> bool:
+        """Return whether an entry belongs to those that change the image when read.
 
-        Entries about rectified images would not; nor would those of the second camera
-        of a stereo pair, which have a 2 at the end, as M2 beside M1.
+        Entries about rectified images do not, nor do those of the second camera of a
+        stereo pair: M2 if there is an M1.
+
+        Args:
+            name: plain name of the entry.
+            value: its value. A single number k2 is a coefficient of the same camera as
+                k1; a list or a matrix k2 is of the second camera.
         """
         if not IMAGE_CHANGING_KEYS.fullmatch(name):
             return False
         if RECTIFICATION_KEYS.fullmatch(name):
             return False
-        is_matrix = isinstance(value, (list, Mapping))
-        # k2 beside k1 is of the same camera
-        is_coefficient = name in COEFFICIENTS and not is_matrix
-        has_first_camera = name.endswith("2") and f"{name[:-1]}1" in self._keys
-        return is_coefficient or not has_first_camera
+        is_single_value = not isinstance(value, (list, Mapping))
+        if is_single_value and name in COEFFICIENTS:
+            return True
+        is_of_second_camera = name.endswith("2") and f"{name[:-1]}1" in self._keys
+        return not is_of_second_camera
 
 
 def select_camera(path: str, camera_name: str, cameras: Mapping[str, Any]) -> Any:
@@ -192,12 +201,12 @@ def select_camera(path: str, camera_name: str, cameras: Mapping[str, Any]) -> An
 
     Args:
         path: the file, for messages.
-        camera_name: "" if none is named.
+        camera_name: "" if the user has not named one.
         cameras: at least one, by name.
 
     Raises:
-        FileFormatError: there is none of that name, or there are several and none is
-            named.
+        FileFormatError: there is none of that name, or there are several and the user
+            has not named one.
     """
     names = list(map(str, cameras))
     listing = ", ".join(names[:8])
@@ -211,20 +220,21 @@ def select_camera(path: str, camera_name: str, cameras: Mapping[str, Any]) -> An
         )
     if not camera_name and len(names) > 1:
         raise FileFormatError(
-            f"{path}: has {len(names)} cameras, {listing}: say which one takes the "
+            f"{path}: has {len(names)} cameras, {listing}: name the one that takes the "
             f"picture, as in {example}"
         )
     return cameras[camera_name or names[0]]
 
 
 def is_neutral(value: object) -> bool:
-    """Return whether an entry changes nothing: it is zero, empty, false or "none".
+    """Return whether an entry changes nothing: it is missing, 0, "", false or "none".
 
     A matrix, a list or a mapping is neutral if all of its values are.
     """
     if isinstance(value, Mapping):
-        # a matrix has its numbers as `data`
-        value = value.get("data", list(value.values()))
+        all_values = list(value.values())
+        # OpenCV's matrix is a mapping with its numbers as `data`.
+        value = value.get("data", all_values)
     return all(
         cell in (None, False, "", "none") or _to_float(str(cell)) == 0.0
         for cell in _flatten(value)
@@ -276,13 +286,14 @@ def add_notes(
     """
     unread = [f"{join_names(unread_keys)}."] if unread_keys else []
     if rectified_keys:
-        reason = "which are made of the camera's own ones; these are its own."
+        names = " and ".join(rectified_keys)
         unread.append(
-            f"{' and '.join(rectified_keys)}, about rectified pictures, {reason}"
+            f"{names}, about rectified pictures; the model is for the camera's "
+            "pictures before rectification."
         )
     return replace(
         model,
-        reading_notes=tuple(f"{model.name}: not read: {names}" for names in unread),
+        reading_notes=tuple(f"{model.name}: not read: {text}" for text in unread),
     )
 
 
@@ -293,22 +304,23 @@ def make_camera_model(
     pixel_values: Mapping[str, float],
     pixel_offset: float = 0.0,
 ) -> CameraModel:
-    """Make a camera model of numbers in pixels.
+    """Make a camera model from numbers in pixels.
 
     The model stores lengths along x in widths of the image, and those along y in
-    heights. The numbers of a panorama follow from its size, whatever the file has.
+    heights. The numbers of a panorama follow from its size; those of the file are
+    ignored.
 
     Args:
-        spec: the file, and perhaps the camera in it.
+        spec: the file, and perhaps the camera in it, such as ``calib.yaml#cam1``.
         kind: the kind of model.
         size: height and width of the image.
         pixel_values: numbers by their names in `NUMBER_NAMES`; 0 by default.
-        pixel_offset: coordinate of the image's corner in the file, with the sign
-            reversed: 0.5 if the file counts from the center of the first pixel. It is
-            added to the principal point.
+        pixel_offset: number that is added to the principal point, so that it counts
+            from the image's corner: 0.5 if the file counts from the center of the first
+            pixel, 0.0 if it counts from the corner.
 
     Raises:
-        FileFormatError: no camera has such numbers.
+        FileFormatError: a size or a number is out of its range.
     """
     path = spec.partition("#")[0]
     height, width = size
@@ -329,6 +341,7 @@ def make_camera_model(
     value_by_name["cx"] = value_by_name["cx"] + pixel_offset
     value_by_name["cy"] = value_by_name["cy"] + pixel_offset
     _check_numbers(path, value_by_name, width, height)
+    # Lengths are divided by a side of the image; coefficients have no unit.
     unit_by_name = {"fx": width, "fy": height, "cx": width, "cy": height, "skew": width}
     numbers = tuple(
         number / unit_by_name.get(name, 1.0) for name, number in value_by_name.items()
@@ -339,11 +352,11 @@ def make_camera_model(
 def _check_numbers(
     path: str, value_by_name: Mapping[str, float], width: float, height: float
 ) -> None:
-    """Raise FileFormatError if numbers in pixels are those of no camera.
+    """Raise FileFormatError if a number of a camera, in pixels, is out of its range.
 
     Focal lengths have to be within a factor of `MAX_FOCAL_RATIO` of the image's sides,
-    the principal point inside of the image, the skew at most fx, and coefficients at
-    most `MAX_COEFFICIENT`, without their sign.
+    and the principal point inside the image. The absolute value of the skew is at most
+    fx, and that of a coefficient at most `MAX_COEFFICIENT`.
 
     Args:
         path: the file, for messages.
@@ -396,24 +409,25 @@ def _check_numbers(
 
 @dataclass(frozen=True)
 class CameraPreset:
-    """The pose of a mounted camera, and what the control `camera` searches of it."""
+    """The pose of a mounted camera, and the ranges that a search of it covers."""
 
-    height: float  # height of the lens above the floor or the road, metres
+    height: float  # height of the lens above the floor or the road, meters
     fov: float  # field of view along the larger side of the picture, degrees
-    # From the object's center, metres; further if the object would not fit.
+    # Distance from the object's center, meters. It is larger if the object would not
+    # fit into the image.
     distance: float
-    # Whether azimuth 0 is in the object's lane, behind what drives there.
+    # Whether azimuth 0 is in the object's lane, behind an object that drives there.
     in_lane: bool
-    # how far to either side a search goes, degrees; 180 for all around
-    search_azimuth: float
-    # Other ranges that are searched by default; what has none stays.
+    search_azimuth: float  # largest azimuth to either side, degrees; 180: all around
+    # Ranges of other parameters that are searched by default. A parameter without a
+    # range stays fixed.
     search_ranges: Mapping[str, tuple[float, float]]
 
 
 PRESETS: Mapping[str, CameraPreset] = MappingProxyType(
     {
-        # Behind the windscreen of a car, in the lane of the object. What glass and
-        # dashboard do to a picture is not in it.
+        # Behind the windscreen of a car, in the lane of the object. Effects of the glass
+        # and the dashboard on the picture are not modeled.
         "dashcam": CameraPreset(
             height=1.3,
             fov=75.0,
@@ -423,9 +437,9 @@ PRESETS: Mapping[str, CameraPreset] = MappingProxyType(
             search_ranges={"distance": (6.0, 60.0), "fov": (60.0, 90.0)},
         ),
         # The head of a humanoid: the Unitree G1 is 1.32 m tall (its product page), with
-        # a RealSense D435i in its face, about a tenth of a metre below the top. The
-        # colour picture of that has 69 x 42 degrees, and its depth reaches to 3 m
-        # (Clearpath Robotics, documentation of the RealSense D435).
+        # a RealSense D435i in its face, about a tenth of a meter below the top. Its
+        # color picture has a field of view of 69 x 42 degrees, and its depth reaches to
+        # 3 m (Clearpath Robotics, documentation of the RealSense D435).
         "robot": CameraPreset(
             height=1.2,
             fov=69.0,
@@ -439,7 +453,7 @@ PRESETS: Mapping[str, CameraPreset] = MappingProxyType(
 """The mounted cameras by name."""
 TABLE_HEIGHT = 0.75
 TABLE_SIDE = 1.2
-"""Height and side in metres of a table of a bundled room, on which objects stand that
-are no larger than `MAX_TABLETOP_SIZE`.
+"""Height and side, in meters, of the table of a bundled room. Objects stand on it if
+they are no larger than `MAX_TABLETOP_SIZE`.
 """
-MAX_TABLETOP_SIZE = 0.5  # metres of the longest side
+MAX_TABLETOP_SIZE = 0.5  # longest side of an object on a table, meters

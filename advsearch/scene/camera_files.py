@@ -49,10 +49,11 @@ from advsearch.trust.yaml_text import MAX_YAML_BYTES, parse_yaml
 
 # Limit of the bytes of a JSON file, which may have the pose of every image.
 MAX_JSON_SIZE = 1 << 25
-# The coordinates of the center of the first pixel, where 0 is its corner; added to a
-# principal point of a tool that counts from that center.
+# Coordinates of the center of the first pixel, measured from its corner. They are added
+# to the principal point of a tool that measures from that center.
 FIRST_PIXEL_CENTER = 0.5
 MAX_BINNING = 64  # limit of the pixels along a side that a sensor bins into one
+COLMAP_LINE = re.compile(r"\d+\s+[A-Za-z_]\w*\s.*")  # "1 PINHOLE 640 480 ..."
 # Coefficients in the order of OpenCV and ROS.
 OPENCV_COEFFICIENTS = (
     "k1",
@@ -141,7 +142,7 @@ MAX_FOCAL_MISMATCH = (
 LENS_KEYS = frozenset(
     ("camera_model", "fl_x", "fl_y", "cx", "cy", "w", "h", *OPENCV_COEFFICIENTS)
 )
-"""Entries of nerfstudio about a camera, of all frames or of one."""
+"""Entries of nerfstudio about a camera; they are of all frames, or of a single one."""
 SCENE_KEYS = frozenset(
     "frames aabb_scale scale offset applied_transform applied_scale ply_file_path "
     "orientation_override auto_scale_poses_override train_filenames val_filenames "
@@ -149,8 +150,8 @@ SCENE_KEYS = frozenset(
     "colmap_im_id mask_path depth_file_path "
     "semantic_path time rotation".split()
 )
-"""Entries of a transforms.json, and of its frames, that are not about the lens; angles
-are used if focal lengths are missing.
+"""Entries of a transforms.json, and of its frames, that are not about the lens. The
+angles among them replace focal lengths that are missing.
 """
 VIEW_KEYS = frozenset(("object_to_camera", "up", "part", "set", "occluder"))
 """Entries of the camera file of a single photograph that are not about the lens (see
@@ -170,8 +171,8 @@ def _list_lines(text: str) -> list[str]:
 def read_camera(spec: str) -> CameraModel:
     """Read a camera's model from a file.
 
-    The content tells the format: COLMAP's text, files of OpenCV, ROS, Kalibr,
-    nerfstudio, and of some other tools.
+    The format is recognized by the content: COLMAP's text, files of OpenCV, ROS,
+    Kalibr, nerfstudio, and of some other tools.
 
     Args:
         spec: the file. If it has several cameras, one is named behind a #:
@@ -179,13 +180,13 @@ def read_camera(spec: str) -> CameraModel:
 
     Raises:
         FileFormatError: the file is missing or of no known format; its projection is
-            not supported; it has numbers that no camera has; or an entry changes the
-            image, but is not supported.
+            not supported; a number is out of its range; or an entry changes the image,
+            but is not supported.
     """
     path, _, camera_name = spec.partition("#")
     text = _read_camera_text(path)
     lines = _list_lines(text)
-    if lines and re.fullmatch(r"\d+\s+[A-Za-z_]\w*\s.*", lines[0].strip()):
+    if lines and COLMAP_LINE.fullmatch(lines[0].strip()):
         return _read_colmap(spec, path, camera_name, lines)
     check_text_format(path, text)
     return make_camera(spec, _parse_file(path, text))
@@ -200,11 +201,12 @@ def make_camera(spec: str, entries: Mapping[str, Any]) -> CameraModel:
         entries: contents of the file, by name.
 
     Raises:
-        FileFormatError: the projection is another one, numbers are missing or those of
-            no camera, or the camera that is named is not there.
+        FileFormatError: the projection is not supported, numbers are missing or out of
+            their ranges, or the file has no camera of that name.
     """
     path, _, camera_name = spec.partition("#")
     data = {name: value for name, value in entries.items() if name not in VIEW_KEYS}
+    # The translated entries are those of the selected camera alone.
     translated = translate_entries(path, camera_name, data)
     if translated is not None:
         return _read_opencv(spec, Entries(path, translated))
@@ -220,10 +222,11 @@ def make_camera(spec: str, entries: Mapping[str, Any]) -> CameraModel:
             name: entry for name, entry in data.items() if name not in cameras
         }
         camera = Entries(path, select_camera(path, camera_name, cameras))
-        return _read_kalibr(spec, camera, Entries(path, other_entries).find_unread())
+        unread_outside = Entries(path, other_entries).find_unread()
+        return _read_kalibr(spec, camera, unread_outside)
     if camera_name:
         raise FileFormatError(
-            f"{path}: expected several cameras, as {camera_name!r} is asked for, got "
+            f"{path}: expected several cameras, as {camera_name!r} is requested, got "
             f"one; leave #{camera_name} out"
         )
     if "intrinsics" in data and "camera_model" in data:
@@ -234,7 +237,7 @@ def make_camera(spec: str, entries: Mapping[str, Any]) -> CameraModel:
 def read_camera_entries(path: str) -> dict[str, Any]:
     """Return the entries of a camera file in YAML, JSON or XML, by name.
 
-    Raises FileFormatError: it is none, or cannot be read.
+    Raises FileFormatError: it is no camera file, or cannot be read.
     """
     text = _read_camera_text(path)
     check_text_format(path, text)
@@ -283,7 +286,7 @@ def _flatten_groups(data: Mapping[str, Any]) -> dict[str, Any]:
 def _parse_file(path: str, text: str) -> dict[str, Any]:
     """Parse a camera file that is XML, JSON or YAML.
 
-    If a YAML file has several documents, the first one counts.
+    If a YAML file has several documents, the first one is parsed.
 
     Raises FileFormatError: it cannot be parsed, or is no mapping of names.
     """
@@ -354,9 +357,9 @@ def _read_colmap(
         spec: the file, and perhaps the camera in it.
         path: the file, for messages.
         camera_name: its CAMERA_ID; "" if the user has not named one.
-        lines: the lines of the file without comments.
+        lines: the lines of the file that are neither blank nor comments.
     """
-    words_by_id = {line.split()[0]: line.split() for line in lines if line.split()}
+    words_by_id = {line.split()[0]: line.split() for line in lines}
     if len(words_by_id) < len(lines):
         raise FileFormatError(
             f"{path}: expected each camera once, got one with the same number twice; "
@@ -366,8 +369,8 @@ def _read_colmap(
     if name not in COLMAP_MODELS:
         raise FileFormatError(
             f"{path}: expected one of COLMAP's models {', '.join(COLMAP_MODELS)}, got "
-            f"{name[:40]}, which is another projection; fit one of these to it (colmap "
-            "model_converter does not), or undistort the pictures"
+            f"{name[:40]}, which is another projection; calibrate with one of these "
+            "(colmap model_converter cannot convert it), or undistort the pictures"
         )
     kind, parameters = COLMAP_MODELS[name]
     keys = ["width", "height", *parameters.split()]
@@ -385,6 +388,7 @@ def _read_colmap(
         focal_length = numbers.pop("f")
         numbers["fy"] = focal_length
         numbers["fx"] = focal_length
+    # Without a pixel offset: COLMAP measures from the corner of the image.
     return make_camera_model(spec, kind, size, numbers)
 
 
@@ -409,6 +413,7 @@ def _read_nerfstudio(
     width = entries.get_number("w")
     height = entries.get_number("h")
     kind = _read_projection(path, entries)
+    # The angles of view are among the `SCENE_KEYS`, so that `entries` lacks them.
     numbers = _read_focal_lengths(path, data, entries, width, height)
     numbers["cx"] = entries.get_number("cx", width / 2.0)
     numbers["cy"] = entries.get_number("cy", height / 2.0)
@@ -423,7 +428,7 @@ def _read_nerfstudio(
 
 
 def _list_frames(data: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the frames of a transforms.json; none if they are malformed."""
+    """Return the frames of a transforms.json that are mappings; [] if there are none."""
     frames = data.get("frames") or []
     if not isinstance(frames, list):
         return []
@@ -433,7 +438,7 @@ def _list_frames(data: Mapping[str, Any]) -> list[dict[str, Any]]:
 def _select_other_entries(frames: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return the entries of frames that are about neither the lens nor the scene.
 
-    Of entries of one name that of the last frame wins.
+    If several frames have an entry of the same name, the last one's is returned.
     """
     other_entries = {}
     for frame in frames:
@@ -447,14 +452,14 @@ def _read_projection(path: str, entries: Entries) -> str:
     """Return the kind of a camera model by nerfstudio's entries.
 
     Raises:
-        FileFormatError: the model is not one of ours.
+        FileFormatError: the model is not supported.
     """
     name = str(entries.get("cameramodel") or "PINHOLE").upper()
     if name not in (*COLMAP_MODELS, "PERSPECTIVE"):
         raise FileFormatError(
             f"{path}: expected one of the camera models {', '.join(COLMAP_MODELS)}, "
-            f"got {format_name(name)}, which is another projection; fit one of these "
-            "to it"
+            f"got {format_name(name)}, which is another projection; calibrate with one "
+            "of these"
         )
     if entries.get("isfisheye"):
         return FISHEYE
@@ -466,7 +471,7 @@ def _read_focal_lengths(
 ) -> dict[str, float]:
     """Return fx and fy in pixels, from lengths or from angles of view.
 
-    If the file has both, the length counts. If it has neither for y, fy is fx.
+    If the file has both, the length is returned. If it has neither for y, fy is fx.
 
     Args:
         path: the file, for messages.
@@ -481,14 +486,15 @@ def _read_focal_lengths(
     """
     fx_by_angle = _compute_focal_length(path, data.get("camera_angle_x"), width)
     fy_by_angle = _compute_focal_length(path, data.get("camera_angle_y"), height)
-    fx = entries.get_number("fl_x", fx_by_angle)
+    # Without an angle there is no default, and the length is required.
+    fx = entries.get_number("fl_x", default=fx_by_angle)
     if fx_by_angle is not None and abs(fx - fx_by_angle) > MAX_FOCAL_MISMATCH * fx:
         raise FileFormatError(
-            f"{path}: fl_x: expected {fx_by_angle:g}, as camera_angle_x says, got "
+            f"{path}: fl_x: expected {fx_by_angle:g}, as camera_angle_x states, got "
             f"{fx:g}; leave one out"
         )
     default_fy = fx if fy_by_angle is None else fy_by_angle
-    return {"fx": fx, "fy": entries.get_number("fl_y", default_fy)}
+    return {"fx": fx, "fy": entries.get_number("fl_y", default=default_fy)}
 
 
 def _select_lens(
@@ -498,17 +504,18 @@ def _select_lens(
 
     Args:
         path: the file, for messages.
-        camera_name: index of the frame, as text; "" if none is named.
+        camera_name: index of the frame, as text; "" if the user has not named one.
         frames: frames of the file.
 
     Raises:
-        FileFormatError: there is no such frame, or none is named and lenses differ.
+        FileFormatError: there is no such frame, or the lenses of the frames differ and
+            the user has not named one.
     """
     lenses = [
         {key: frame[key] for key in frame if key in LENS_KEYS} for frame in frames
     ]
     if not lenses:
-        lenses = [{}]  # a file without frames has all of its lens outside of them
+        lenses = [{}]  # the entries outside of the frames describe the full lens
     first_lens: dict[str, Any] = lenses[0]
     if not camera_name and all(lens == first_lens for lens in lenses):
         return first_lens
@@ -540,7 +547,8 @@ def _read_kalibr(
     Args:
         spec: the file, and perhaps the camera in it.
         entries: entries of the camera.
-        unread: other entries of the file that were not read: the user gets a note.
+        unread: names of entries outside of the camera that were not read. They are
+            noted.
 
     Raises:
         FileFormatError: the camera is no pinhole, or numbers are missing.
@@ -584,27 +592,31 @@ def _read_opencv(spec: str, entries: Entries) -> CameraModel:
     path = entries.path
     kind = _find_opencv_kind(path, entries)
     if kind == EQUIRECTANGULAR:
+        # Binning and a region are not read here: `find_unread` rejects them.
         panorama = make_camera_model(spec, kind, _read_size(entries), {})
         return add_notes(panorama, entries.find_unread())
     matrix = _read_camera_matrix(path, entries)
     height, width = _read_size(entries)
-    unread = _check_roi(entries, (height, width))
+    unread_roi_keys = _check_roi(entries, (height, width))
     numbers = _read_opencv_distortion(entries, kind) | _name_matrix_entries(matrix)
     y_binning, x_binning = _read_binning(entries)
-    # Pixels that fill no bin are cut off; the model is in fractions of what is left.
+    # Pixels that fill no bin are cut off; the model is in fractions of the rest.
     used_size = (height - height % y_binning, width - width % x_binning)
     model = make_camera_model(spec, kind, used_size, numbers, FIRST_PIXEL_CENTER)
     binned_size = (int(height // y_binning), int(width // x_binning))
     model = replace(model, size=binned_size)
-    rectified = _find_rectified(entries, matrix)
-    return add_notes(model, unread + entries.find_unread(), rectified)
+    rectified_keys = _find_rectified(entries, matrix)
+    return add_notes(model, unread_roi_keys + entries.find_unread(), rectified_keys)
 
 
 def _find_opencv_kind(path: str, entries: Entries) -> str:
     """Return the kind of model that a camera of OpenCV or ROS states.
 
-    Without an entry that states it, it is Brown's and Conrady's. Raises
-    FileFormatError: two entries contradict each other, or the model is not one of ours.
+    Without an entry that states it, it is Brown's and Conrady's. The flag
+    `fisheye_model` of OpenCV overrides the other entries.
+
+    Raises FileFormatError: two entries contradict each other, or the model is not
+    supported.
     """
     keys = ("distortionmodel", "cameramodel", "modeltype")
     models = [entries.get(key) for key in keys]
@@ -612,7 +624,7 @@ def _find_opencv_kind(path: str, entries: Entries) -> str:
     is_fisheye = not is_neutral(entries.get("fisheyemodel"))
     if len(kinds) > 1:
         raise FileFormatError(
-            f"{path}: expected one model, got a camera_model beside another "
+            f"{path}: expected one model, got a camera_model that contradicts the "
             "distortion_model"
         )
     return FISHEYE if is_fisheye else next(iter(kinds), BROWN_CONRADY)
@@ -637,12 +649,13 @@ def _read_camera_matrix(path: str, entries: Entries) -> list[float]:
     if not any(matrix):
         raise FileFormatError(
             f"{path}: expected a calibrated camera, got a camera_matrix (K) of zeros, "
-            "as ROS says of one that is not calibrated; calibrate it, and give the "
-            "file that this writes"
+            "which ROS writes for a camera that is not calibrated; calibrate it, and "
+            "use the file that this writes"
         )
-    # Written by columns, the skew, cx and cy are where a camera matrix has zeros.
+    # Open3D and ARKit write the matrix by columns: cx and cy are in the last row, where
+    # a camera matrix has zeros, and zeros are where it has the skew, cx and cy.
     is_by_columns = not any(matrix[index] for index in (1, 2, 5)) and any(matrix[6:8])
-    if is_by_columns:  # as Open3D and ARKit write it
+    if is_by_columns:
         matrix = [matrix[3 * column + row] for row in range(3) for column in range(3)]
     if matrix[3] or matrix[6] or matrix[7] or matrix[8] != 1.0:
         raise FileFormatError(
@@ -673,16 +686,18 @@ def _read_distortion(
             the model is "none".
     """
     distortion = entries.get(*DISTORTION_KEYS)
-    # a matrix (a mapping) is a list even if it is all zeros
+    # A list of zeros leaves the coefficients to single entries; a matrix (a mapping)
+    # does not.
     has_list = isinstance(distortion, Mapping) or not is_neutral(distortion)
     if not has_list:
         coefficients = _read_optional_numbers(entries, names)
     else:
         values = entries.parse_numbers("distortion_coefficients", distortion, counts)
+        # The list may have fewer coefficients than there are names.
         coefficients = dict(zip(names, values, strict=False))
     model = entries.get("distortionmodel")
-    is_none = isinstance(model, str) and model.strip().lower() == "none"
-    if is_none and any(coefficients.values()):
+    is_undistorted = isinstance(model, str) and model.strip().lower() == "none"
+    if is_undistorted and any(coefficients.values()):
         raise FileFormatError(
             f"{entries.path}: expected no distortion, as its distortion_model is none, "
             "got coefficients"
@@ -693,7 +708,7 @@ def _read_distortion(
 def _read_opencv_distortion(entries: Entries, kind: str) -> dict[str, float]:
     """Return the distortion coefficients of a camera of OpenCV or ROS, by name.
 
-    Raises FileFormatError: the sensor is tilted, for which our models have no numbers.
+    Raises FileFormatError: the sensor is tilted, which `CameraModel` cannot express.
     """
     if kind == FISHEYE:
         return _read_distortion(entries, COEFFICIENTS[:4], (0, 4))
@@ -731,8 +746,8 @@ def _find_rectified(entries: Entries, matrix: Sequence[float]) -> list[str]:
         ("rectification_matrix", "r", [1.0, 0, 0, 0, 1, 0, 0, 0, 1]),
         ("projection_matrix", "p", [fx, skew, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0]),
     ):
-        value = entries.get(normalize_key(name), short_name)
-        if is_neutral(value):
+        value = entries.get(normalize_key(name), short_name)  # either of its names
+        if is_neutral(value):  # missing, or all zeros
             continue
         numbers = entries.parse_numbers(name, value, (len(expected),))
         if any(
@@ -753,22 +768,22 @@ def _check_roi(entries: Entries, size: tuple[float, float]) -> list[str]:
         size: height and width of the image in pixels.
 
     Returns:
-        The entries of the region that were not read.
+        The names of the region's entries that were not read, such as "roi.stamp".
 
     Raises:
-        FileFormatError: the region is a part of the image.
+        FileFormatError: the region is only a part of the image.
     """
     value = entries.get("roi")
     if not isinstance(value, Mapping):
         value = {}
     roi = Entries(entries.path, {str(key): value[key] for key in value})
     numbers = _read_optional_numbers(roi, ("x_offset", "y_offset", "height", "width"))
-    roi.get("dorectify")  # counts as read: it changes nothing in a full image
+    roi.get("dorectify")  # marks it as read: it changes nothing in a full image
     offset = (numbers["x_offset"], numbers["y_offset"])
     roi_size = (numbers["height"], numbers["width"])
     if offset != (0.0, 0.0) or roi_size not in ((0.0, 0.0), size):
         raise FileFormatError(
-            f"{entries.path}: expected a camera_info of whole pictures, got one of a "
+            f"{entries.path}: expected a camera_info of full pictures, got one of a "
             "part (roi); set it to 0"
         )
     return roi.find_unread("roi.")
@@ -777,13 +792,15 @@ def _check_roi(entries: Entries, size: tuple[float, float]) -> list[str]:
 def _find_kind(path: str, model: object) -> str:
     """Return the kind of a distortion model by the name that a tool gives it."""
     name = re.sub(r"[-\s]", "_", str(model or "").strip().lower())
-    if name == "pinhole":  # without distortion, or with this one
+    if name == "pinhole":  # its distortion is Brown's and Conrady's, or none
         return BROWN_CONRADY
     if name not in KIND_OF_DISTORTION:
+        # "" is among the names, for a model that is not stated.
+        supported_names = ", ".join(key for key in KIND_OF_DISTORTION if key)
         advice = describe_projection(name) or "; calibrate with one of these"
         raise FileFormatError(
-            f"{path}: expected one of the distortion models "
-            f"{', '.join(filter(None, KIND_OF_DISTORTION))}, got {name[:40]!r}{advice}"
+            f"{path}: expected one of the distortion models {supported_names}, got "
+            f"{name[:40]!r}{advice}"
         )
     return KIND_OF_DISTORTION[name]
 
@@ -799,10 +816,7 @@ def _read_size(entries: Entries) -> tuple[float, float]:
 
 
 def _read_binning(entries: Entries) -> tuple[float, float]:
-    """Return how many pixels ROS bins into one, along y and x.
-
-    The calibration is that of the pixels before.
-    """
+    """Return how many of the sensor's pixels ROS bins into one, along y and x."""
     # ROS writes 0 for no binning, as for 1.
     y_binning = entries.get_number("binning_y", 1.0) or 1.0
     x_binning = entries.get_number("binning_x", 1.0) or 1.0

@@ -16,8 +16,9 @@ camera model and calibration method for conventional, wide-angle, and fish-eye l
 equation 6). theta is the angle to the axis.
 
 Points are in the camera's coordinates: x to the right, y down, z ahead. Image
-coordinates are fractions of its width and height from the top left corner, and so are
-the focal lengths: an image of another size is the same one, scaled.
+coordinates are fractions of the image's width and height, measured from the top left
+corner. Focal lengths are such fractions, too, so that a model does not depend on the
+number of pixels.
 """
 
 from __future__ import annotations
@@ -51,12 +52,12 @@ COEFFICIENTS_OF_KIND: Mapping[str, tuple[str, ...]] = {
 """The coefficients that each kind of model has."""
 # Limit of the steps of an inversion of radii; nearly all converge in five.
 MAX_STEPS = 60
-# The same in two dimensions, where no bisection can follow when Newton's method fails.
+# Limit of the steps of an inversion in two dimensions, where bisection is not possible
+# when Newton's method fails.
 MAX_STEPS_2D = 20
 TOLERANCE = 1e-10  # distance, in focal lengths, under which an inversion has converged
-MAX_TANGENT = math.tan(
-    math.radians(80.0)
-)  # tangent of the widest half angle that is framed
+# Tangent of the largest half angle of view into which an object is framed.
+MAX_TANGENT = math.tan(math.radians(80.0))
 MAX_RAY_TANGENT = 1e6  # limit of the tangents of rays
 BORDER_POINTS = 512  # points on a line from the axis to a border of the image
 VectorFunction = Callable[[Tensor], Tensor]
@@ -70,13 +71,13 @@ class CameraModel:
     # (17,) in the order of `NUMBER_NAMES`: fx, cx and skew in image widths, fy and cy
     # in image heights, the coefficients.
     numbers: tuple[float, ...]
-    # The user's name for it: a file, or a bundled model; empty if `camera.fov` sets its
-    # focal length.
+    # The file or the bundled model that the user named; "" if the camera is a pinhole
+    # whose focal length `camera.fov` sets.
     name: str = ""
-    # (height, width) in pixels that it was calibrated for; None for any.
+    # (height, width) in pixels for which it was calibrated; None for any size.
     size: tuple[int, int] | None = None
-    max_angle: float = 180.0  # largest angle to the axis that it sees, degrees
-    reading_notes: tuple[str, ...] = ()  # sentences about how its file was read
+    max_angle: float = 180.0  # largest visible angle to the optical axis, degrees
+    reading_notes: tuple[str, ...] = ()  # sentences about entries that were not read
 
     @property
     def values(self) -> dict[str, float]:
@@ -176,9 +177,10 @@ class CameraModel:
         radius = distorted.norm(dim=-1)
         # 0 for the center, which has no direction
         radial_direction = distorted / radius.clamp_min(1e-300)[..., None]
-        # Angles beyond the circle of the image are solved for too, so that the margin
-        # changes its sign at the circle.
-        angle, converged = self._invert_radial(radius, min(self.fold_angle, math.pi))
+        # The limit is the fold, not the visible angle: points just outside the view
+        # get a solution as well, and the margin passes through 0 at its edge.
+        max_solved_angle = min(self.fold_angle, math.pi)
+        angle, converged = self._invert_radial(radius, max_solved_angle)
         directions = torch.cat(
             [radial_direction * angle.sin()[..., None], angle.cos()[..., None]], dim=-1
         )
@@ -209,6 +211,7 @@ class CameraModel:
             undistorted, converged = self._invert_distortion(
                 undistorted, distorted, max_visible
             )
+            # The edge of the view is a radius without decentering.
             radius = (distorted - self._compute_decentering(undistorted)).norm(dim=-1)
         directions = torch.cat(
             [undistorted, torch.ones_like(undistorted[..., :1])], dim=-1
@@ -243,11 +246,11 @@ class CameraModel:
         ).float()
 
     def _invert_radial(self, target: Tensor, max_value: float) -> tuple[Tensor, Tensor]:
-        """Solve radial(x) = target for x within [0, max_value], where radial grows.
+        """Find the radii in [0, max_value] that `_distort_radius` maps to a target.
 
-        The method is Newton's, guarded by bisection. Two bounds enclose each solution,
-        and every step narrows them. A step that would leave the bounds goes to their
-        middle instead.
+        The distortion has to grow within these bounds. The method is Newton's, guarded
+        by bisection. Two bounds enclose each solution, and every step narrows them. A
+        step that would leave the bounds goes to their middle instead.
 
         Args:
             target: (N,) distorted radii.
@@ -256,14 +259,16 @@ class CameraModel:
         Returns:
             The solutions (N,), and which of them have converged.
         """
+
+        def distort_to_column(radii: Tensor) -> Tensor:
+            """Return distorted radii as (N, 1), for `_evaluate_with_jacobian`."""
+            return self._distort_radius(radii)[..., None]
+
         lower = torch.zeros_like(target)
         upper = torch.full_like(target, self._find_upper_bound(target, max_value))
         radius = torch.minimum(target, upper)
         for _ in range(MAX_STEPS):
-            # `radial` as a function with one component for each point
-            values, (slope,) = _evaluate_with_jacobian(
-                lambda radii: self._distort_radius(radii)[..., None], radius
-            )
+            values, (slope,) = _evaluate_with_jacobian(distort_to_column, radius)
             residual = values[..., 0] - target
             is_solved = (residual.abs() <= TOLERANCE) | (upper - lower <= TOLERANCE)
             if bool(is_solved.all()):
@@ -275,21 +280,24 @@ class CameraModel:
             radius = torch.where(is_within, newton_radius, (lower + upper) / 2.0)
         residual = (self._distort_radius(radius) - target).abs()
         # A solution may also have been accepted because its bounds were close to each
-        # other. Its residual may be larger, hence the factor of 1e3.
+        # other. Its residual may be larger, hence the factor of 1e3. The tolerance is
+        # absolute for small targets and relative for large ones.
         return radius, residual <= 1e3 * TOLERANCE * (1.0 + target)
 
     def _find_upper_bound(self, target: Tensor, max_value: float) -> float:
-        """Return a bound of all solutions of `_invert_radial`, doubled up from 1.
+        """Return a common upper bound of the solutions of `_invert_radial`.
 
-        A small bound takes fewer bisections than `max_value`, which it does not exceed.
+        It is doubled, starting from 1, until it suffices or is `max_value`. `max_value`
+        alone would be a bound, too, but may be far away and need more bisections.
         """
         bound = min(1.0, max_value)
         while bound < max_value:
-            # the largest radius with a solution up to the bound
-            reached_radius = self._distort_radius(
+            # the largest target that has a solution up to the bound
+            reached_target = self._distort_radius(
                 torch.tensor(bound, dtype=torch.float64)
             )
-            if not float(reached_radius) < float(target.max()):
+            must_grow = float(reached_target) < float(target.max())  # False for NaN
+            if not must_grow:
                 break
             bound = min(2.0 * bound, max_value)
         return bound
@@ -297,15 +305,15 @@ class CameraModel:
     def _invert_distortion(
         self, undistorted: Tensor, distorted: Tensor, max_radius: float
     ) -> tuple[Tensor, Tensor]:
-        """Solve distort(x) = distorted for points x by Newton's method.
+        """Find the points that `_distort` maps to `distorted`, by Newton's method.
 
         A step that leaves the circle of `max_radius` is cut at the circle, and one that
         is not finite is not taken.
 
         Args:
             undistorted: (N, 2) points at which the iteration starts.
-            distorted: (N, 2) distorted points to which solutions are searched.
-            max_radius: largest radius of a solution.
+            distorted: (N, 2) distorted points.
+            max_radius: largest radius of a solution; finite.
 
         Returns:
             The solutions (N, 2); and which have converged before the lens folds.
@@ -315,8 +323,9 @@ class CameraModel:
             values, jacobian_rows = _evaluate_with_jacobian(self._distort, undistorted)
             residual = values - distorted
             step, determinant = _solve_two_by_two(jacobian_rows, residual)
-            # Where the determinant of the distortion's derivative is 0 the lens folds:
-            # beyond, two points have the same image. Such solutions do not count.
+            # The lens folds where the determinant of the distortion's derivative is 0.
+            # Beyond the fold, two points have the same image. Such solutions are
+            # rejected.
             is_inside = (determinant > 0.0) & (undistorted.norm(dim=-1) < max_radius)
             converged = is_inside & (
                 residual.norm(dim=-1) <= TOLERANCE * (1.0 + distorted.norm(dim=-1))
@@ -390,7 +399,7 @@ class CameraModel:
         return radius * self._compute_radial_scale(radius * radius)
 
     def _distort(self, undistorted: Tensor) -> Tensor:
-        """Return distorted points (N, 2) of undistorted ones, in focal lengths."""
+        """Distort points (N, 2), which are in focal lengths from the optical axis."""
         scale = self._compute_radial_scale(undistorted.square().sum(dim=-1))
         return undistorted * scale[..., None] + self._compute_decentering(undistorted)
 
@@ -398,8 +407,10 @@ class CameraModel:
         """Return the shifts (N, 2) of undistorted points that are not radial.
 
         They are the tangential distortion (p1 and p2: the lens stands off the axis) and
-        that of a thin prism (s1 to s4), in focal lengths; see the formulas above.
+        that of a thin prism (s1 to s4), in focal lengths. The formulas are at the top of
+        this module.
         """
+        # the last six of `NUMBER_NAMES`
         p1, p2, s1, s2, s3, s4 = self.numbers[NUMBER_NAMES.index("p1") :]
         x, y = undistorted.unbind(dim=-1)
         square = x * x + y * y
@@ -438,14 +449,14 @@ class CameraModel:
             is_in_image = (coordinates >= -1e-6) & (coordinates <= 1.0 + 1e-6)
             if bool((is_visible & is_in_image.all(dim=-1)).all()):
                 break
-        # of the last step if no step has all of the border in the image
+        # If no step has all of the border in the image, this is the last fraction.
         return fraction * edges[0], fraction * edges[1]
 
     def _compute_edge_tangents(self) -> list[float]:
         """Return the tangents at which the image ends along x and along y.
 
-        A tangent is that of the angle to the axis. Of both edges along an axis the
-        nearer one counts, at most `MAX_TANGENT`.
+        A tangent is that of the angle to the axis. It is measured to the nearer one of
+        both edges, and is at most `MAX_TANGENT`.
         """
         center, _ = self.project(torch.tensor([[0.0, 0.0, 1.0]]))
         edge_tangents = []
@@ -493,7 +504,7 @@ class CameraModel:
     def notes(self) -> tuple[str, ...]:
         """Notes for the user, as sentences.
 
-        They are about entries of the file that were not read, and about a part of the
+        They report entries of the file that were not read, and the fraction of the
         image that the lens leaves black.
         """
         if self.black_fraction == 0.0:
@@ -542,7 +553,7 @@ def make_pinhole(fov: float, aspect: float) -> CameraModel:
         fov: field of view of the larger side, degrees.
         aspect: width divided by height.
     """
-    # in larger sides: half a side is seen at half the angle
+    # In units of the larger side. Half of that side is at half the angle from the axis.
     focal = 0.5 / math.tan(math.radians(fov) / 2.0)
     # Lengths along x are in image widths, those along y in image heights.
     fx = focal * max(1.0, 1.0 / aspect)
@@ -564,13 +575,17 @@ def make_bundled_models(aspect: float = 1.0) -> Mapping[str, CameraModel]:
     focal_x = focal * min(1.0, 1.0 / aspect)
     focal_y = focal * min(1.0, aspect)
     no_distortion = [0.0] * len(COEFFICIENTS)
-    # in the order of `NUMBER_NAMES`: fx, fy, cx, cy, skew and the coefficients
-    fisheye = (focal_x, focal_y, 0.5, 0.5, 0.0, *no_distortion)
-    panorama = (1.0, 1.0, 0.5, 0.5, 0.0, *no_distortion)
-    return {
-        FISHEYE: CameraModel(FISHEYE, fisheye, FISHEYE, max_angle=90.0),
-        EQUIRECTANGULAR: CameraModel(EQUIRECTANGULAR, panorama, EQUIRECTANGULAR),
-    }
+    # In the order of `NUMBER_NAMES`: fx, fy, cx, cy, skew and the coefficients. The
+    # projection of a panorama does not depend on its numbers.
+    fisheye_numbers = (focal_x, focal_y, 0.5, 0.5, 0.0, *no_distortion)
+    panorama_numbers = (1.0, 1.0, 0.5, 0.5, 0.0, *no_distortion)
+    fisheye = CameraModel(
+        kind=FISHEYE, numbers=fisheye_numbers, name=FISHEYE, max_angle=90.0
+    )
+    panorama = CameraModel(
+        kind=EQUIRECTANGULAR, numbers=panorama_numbers, name=EQUIRECTANGULAR
+    )
+    return {FISHEYE: fisheye, EQUIRECTANGULAR: panorama}
 
 
 def _solve_two_by_two(rows: Sequence[Tensor], right: Tensor) -> tuple[Tensor, Tensor]:
@@ -635,8 +650,8 @@ def _evaluate_with_jacobian(
 ) -> tuple[Tensor, list[Tensor]]:
     """Evaluate a function that maps each of N points separately, and differentiate it.
 
-    No value depends on another point. So one derivative of the sum over all points has
-    the derivatives of all.
+    No value depends on another point. So the gradient of the sum over all points
+    contains the derivative of each.
 
     Args:
         function: function from points to values (N, k).
@@ -658,9 +673,10 @@ def _evaluate_with_jacobian(
 def _clip_margin(margin: Tensor, converged: Tensor) -> Tensor:
     """Return margins (N,) in [-1, 1], below zero if an inversion has not converged.
 
-    Positive is inside the view. A margin that is negative already stays, so that it
-    changes its sign continuously; another without convergence becomes a tiny negative.
+    A margin is positive inside the view. Where the inversion has not converged, a
+    positive margin is replaced by a tiny negative one. A negative margin stays as it is,
+    so that margins pass continuously through zero at the edge of the view.
     """
-    return torch.where(
-        converged | (margin <= 0.0), margin, torch.full_like(margin, -1e-6)
-    ).clamp(-1.0, 1.0)
+    is_valid = converged | (margin <= 0.0)
+    just_outside = torch.full_like(margin, -1e-6)
+    return torch.where(is_valid, margin, just_outside).clamp(-1.0, 1.0)

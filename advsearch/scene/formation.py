@@ -46,14 +46,14 @@ from advsearch.scene.settings import ORBIT_CAMERA, resolve_settings
 DENOISERS = ("oidn", "none")
 # samplers of a run's image formation; `advsearch precision` compares more
 SAMPLERS = ("independent", "multijitter")
-# the default: its images are as good with a third of the samples
+# the default sampler: its images are as good with a third of the samples
 SAMPLER = "multijitter"
 PRIMES = (
     *(2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41),
     *(43, 47, 53, 59, 61, 67, 71, 73, 79, 83, 89, 97, 101),
 )
-# keeps the slope of a power finite in black; it changes a value by at most half of one
-# of 255 levels
+# Smallest value to which the gamma curve is applied, so that its slope is finite in
+# black. It changes a value by at most half of one of 255 levels.
 MIN_GAMMA_VALUE = 1e-6
 
 
@@ -63,13 +63,14 @@ class ImageFormation:
 
     # "oidn", Intel Open Image Denoise with albedo and normals as guides, or "none"
     denoiser: str = "oidn"
-    # Filter of reconstruction: all others correlate pixels, and then the denoiser does
-    # nothing.
+    # Reconstruction filter. Other filters correlate pixels, and then the denoiser has
+    # no effect.
     filter: ClassVar[str] = "box"
     # how samples are spread over a pixel: "multijitter" (Kensler 2013, Correlated
     # multi-jittered sampling), or "independent", which has more noise
     sampler: str = SAMPLER
-    # stops over the metered exposure; stored for the record, `gain` is what is applied
+    # Stops above the metered exposure. They are only stored for the record: `gain`
+    # includes them.
     exposure: float = 0.0
     resolution: tuple[int, int] = (128, 128)  # (height, width) in pixels
     gain: float = 1.0  # factor from radiance to display-linear values
@@ -79,14 +80,14 @@ class ImageFormation:
     # encoded, for checks of derivatives: the mean of a noisy image after a curve is not
     # the curve of the mean
     transfer: str = "srgb"
-    # the denoiser takes some 0.6 of its time and leaves a little more error
+    # whether the denoiser runs in about 0.6 of its time, with a slightly larger error
     quick: bool = False
 
     def __post_init__(self) -> None:
         """Check the fields.
 
-        Raises InputError: an unknown denoiser or sampler, or a resolution that is too
-        small or too large.
+        Raises InputError: the denoiser or the sampler is unknown, or the resolution is
+        too small or too large.
         """
         if self.denoiser not in DENOISERS:
             raise InputError(
@@ -155,7 +156,9 @@ class _SrgbDisplay(torch.autograd.Function):
         is clipped the derivative is 0.
         """
         (radiance,) = ctx.saved_tensors
-        if torch.is_grad_enabled():  # for a second derivative
+        if torch.is_grad_enabled():
+            # For a second derivative autograd differentiates the plain formula. The
+            # saved radiance is the input itself, so that it requires a gradient.
             image = linear_to_srgb(radiance * ctx.gain)
             (gradient,) = torch.autograd.grad(
                 image, radiance, cotangent, create_graph=True
@@ -163,15 +166,19 @@ class _SrgbDisplay(torch.autograd.Function):
             return gradient, None
         linear = radiance * ctx.gain
         is_inside = (linear >= 0.0) & (linear <= 1.0)
-        slope = linear.clamp(LINEAR_LIMIT, 1.0).pow_(1.0 / 2.4 - 1.0).mul_(1.0 / 2.4)
-        slope = slope.mul_(cotangent * 1.055)
-        slope = torch.where(linear <= LINEAR_LIMIT, cotangent * 12.92, slope)
-        return torch.where(is_inside, slope, 0.0).mul_(ctx.gain), None
+        is_dark = linear <= LINEAR_LIMIT
+        # The slope of the power is infinite at 0; values that the clamp changes are
+        # replaced below. Operations are in place to save memory.
+        gradient = linear.clamp(LINEAR_LIMIT, 1.0).pow_(1.0 / 2.4 - 1.0)
+        gradient = gradient.mul_(1.0 / 2.4).mul_(cotangent * 1.055)
+        gradient = torch.where(is_dark, cotangent * 12.92, gradient)
+        gradient = torch.where(is_inside, gradient, 0.0)
+        return gradient.mul_(ctx.gain), None
 
 
 @lru_cache(maxsize=64)
 def round_sample_count(sampler: str, samples: float) -> int:
-    """Return the number of samples that a sampler takes if it is to take at least some.
+    """Round a number of samples up to one that a sampler can take.
 
     Samplers of Mitsuba take only certain numbers: "stratified" squares, "multijitter"
     products of two similar numbers, "orthogonal" squares of primes, "ldsampler" powers
@@ -179,7 +186,7 @@ def round_sample_count(sampler: str, samples: float) -> int:
 
     Args:
         sampler: name of the sampler.
-        samples: least number of samples per pixel.
+        samples: smallest number of samples per pixel.
     """
     # Here and below 1e-9 is subtracted before rounding up: a number that is above an
     # integer only by a rounding error needs no further sample.
@@ -208,43 +215,43 @@ OMISSIONS: Mapping[str, str] = {
     "lobes": "lobes of the object's surface that have no strength",
     "emitters": "samples of lamps that emit nothing",
 }
-"""What a scene inside Mitsuba leaves out because a search doesn't need it.
+"""Steps that a scene inside Mitsuba omits because a search doesn't need them.
 
-Each can be put back by its name. None of it changes what is computed: images and
-gradients with and without agree to within their noise, and where the random numbers are
-the same ones, to within rounding, which `advsearch check` shows on the scene at hand.
-Bounces of light are another matter
-(`engine.gradients.planning`): leaving those out has a bias, so only the search does it,
-within a measured bound, and the verification renders all of them.
+Each step can be put back by its name. None of them changes the result: images and
+gradients agree to within their noise with and without it, and to within rounding if the
+random numbers are the same; `advsearch check` verifies that for a scene. Omitting
+bounces of light is different (`engine.gradients.planning`), since it has a bias. So only
+the search does it, within a measured bound, and the verification renders all bounces.
 """
 
-ALL_OMISSIONS = frozenset(OMISSIONS)  # leave out all that can be
-# leave out nothing: what a program has to do that knows neither scene nor search
+ALL_OMISSIONS = frozenset(OMISSIONS)
+# For a program that knows neither the scene nor the search.
 NO_OMISSIONS: frozenset[str] = frozenset()
 
 
 # ----------------------------------------------------------------------------------
-# Exposure: an incident-light meter held where the camera sees the object.
+# Exposure: an incident-light meter at the visible surface of the object.
 #
-# A grey card is laid against every piece of the object's surface that the camera sees,
-# and the light that arrives there is averaged over the image: from the environment as
-# far as the surface faces it, and from the ground plane, which is lit by the
-# environment itself, from lamps, and from surroundings that emit light. What the object
-# is made of does not count, so that a black object stays black; nor do shadows, which
+# The irradiance of every visible piece of the object's surface is computed, and averaged
+# over the image. It has light from the environment, from the ground plane (which the
+# environment lights), from lamps, and from surroundings that emit light. The material
+# of the object is ignored, so that a black object stays black. So are shadows, which
 # would need a render.
 #
-# The meter is held with camera, pose and rotation of the environment as they are by
-# default, and then does not change. So a configuration has the same exposure whether
-# its camera is a setting, a control's fixed value or a point of a grid.
+# Camera, pose and rotation of the environment have their default values while the
+# exposure is metered. So a configuration has the same exposure whether its camera is a
+# setting, a control's fixed value or a point of a grid.
 #
-#     E(n) = integral over directions w of L(w) max(n . w, 0),    L(w) = albedo / pi
-# E(up) where w ends on the ground
+#     E(n) = integral over directions w of L(w) max(n . w, 0)
+#
+# where n is the normal of the surface, and L(w) the radiance from the direction w. It
+# is albedo / pi * E(up) if w ends on the ground.
 
 # pixels along the longer side of the image in which the surface is sampled
 METERING_SIZE = 32
 METERING_ROWS = 32  # rows of a coarse environment: irradiance varies slowly
 CARD_REFLECTANCE = 0.8  # reflectance of the card that is metered
-# linear display value that it gets, on average over what the camera sees of the object
+# linear display value of the card, on average over the visible surface of the object
 CARD_DISPLAY_VALUE = 0.5
 _BARYCENTRIC_STEPS = [(a, b) for a in range(4) for b in range(4 - a)]
 FACE_SAMPLE_WEIGHTS = (
@@ -255,7 +262,9 @@ FACE_SAMPLE_WEIGHTS = (
 )
 """Barycentric weights (10, 3) of the points of a face at which its radiance is read."""
 METERED_DEFAULTS = ("camera.", "pose.", "environment.")
-"""Beginnings of names of settings whose defaults are metered: controls move these."""
+"""Prefixes of the settings that have their defaults while the exposure is metered, such
+as "camera.azimuth": controls change these.
+"""
 
 
 @cache_per_scene
@@ -263,34 +272,33 @@ def compute_metered_gain(scene: SceneData) -> float:
     """Return the factor from radiance to display values, as an exposure meter would.
 
     With it a card of the reflectance `CARD_REFLECTANCE` has the display-linear value
-    `CARD_DISPLAY_VALUE`. The card has the orientation of each surface of the object
-    that the default camera sees, in the default pose and light, and the mean counts. If
-    the camera sees nothing of the object, the card lies flat on the ground. If no light
-    arrives, the factor is 1.
+    `CARD_DISPLAY_VALUE`, on average over the orientations of the visible surface of the
+    object. Camera, pose and light are the default ones. If the object is not visible,
+    the card lies flat on the ground. If no light arrives, the factor is 1.
     """
-    default = {
+    default_values = {
         name: value
         for name, value in resolve_settings({}).items()
         if name.startswith(METERED_DEFAULTS)
     }
-    scene = replace(
+    # The gain must not depend on the camera in use: here it is a pinhole on an orbit,
+    # with a square image.
+    default_scene = replace(
         scene,
-        values={**scene.values, **default},
+        values={**scene.values, **default_values},
         aspect=1.0,
         camera=ORBIT_CAMERA,
         camera_model=None,
     )
-    normals = compute_visible_normals(scene)
-    # a card on the ground faces up
-    if not len(normals):
+    normals = compute_visible_normals(default_scene)
+    if not len(normals):  # the object is not visible
         normals = np.array([[0.0, 0.0, 1.0]])
-    metered = float(compute_irradiance(scene, normals).mean())
-    # the card's radiance is reflectance * irradiance / pi, as it is diffuse
-    return (
-        CARD_DISPLAY_VALUE * math.pi / (CARD_REFLECTANCE * metered)
-        if metered > 0.0
-        else 1.0
-    )
+    irradiance = float(compute_irradiance(default_scene, normals).mean())
+    has_light = irradiance > 0.0
+    if not has_light:
+        return 1.0
+    # The card is diffuse: its radiance is reflectance * irradiance / pi.
+    return CARD_DISPLAY_VALUE * math.pi / (CARD_REFLECTANCE * irradiance)
 
 
 def compute_irradiance(scene: SceneData, normals: Float64Array) -> Float64Array:
@@ -317,7 +325,7 @@ def compute_irradiance(scene: SceneData, normals: Float64Array) -> Float64Array:
             distance = max(float(np.linalg.norm(to_lamp)), 1e-12)
             cosine = np.maximum(normals @ (to_lamp / distance), 0.0)
             irradiances = irradiances + cosine[:, None] * lamp_irradiance
-    # what the object itself emits does not light it from outside
+    # The object's own emission is left out: it does not light the object from outside.
     for name in scene.surrounding_meshes:
         part = scene.meshes[name]
         if part.emission is not None:
@@ -332,8 +340,8 @@ def _compute_distant_light(
 ) -> tuple[Float64Array, Float64Array]:
     """Return the light that arrives at a point from environment and ground.
 
-    The ground is a matt square at height 0, lit by the upper half of the environment:
-    from directions that hit it comes what it reflects, instead of the environment.
+    The ground is a matt square at height 0, lit by the upper half of the environment.
+    Its reflected light replaces the environment in directions that hit it.
 
     Args:
         scene: the scene.
@@ -347,17 +355,19 @@ def _compute_distant_light(
     # irradiance of level ground, where the cosine is the z of the direction
     on_ground = (power[is_up] * directions[is_up, 2:]).sum(axis=0)
     albedo = srgb_to_linear(np.array(scene.ground_color, np.float32))
-    reflected = albedo * on_ground / math.pi
+    reflected_radiance = albedo * on_ground / math.pi
     # The offset from the middle of the ground at which a direction meets the height 0.
-    # For directions that point up it means nothing, and they are left out below.
+    # It has no meaning for directions that point up, which are left out below.
     distance = center[2] / np.maximum(-directions[:, 2:], 1e-9)
     offset = np.abs(center[:2] + directions[:, :2] * distance)
-    # Over a photographed or paved ground, the lower half of the map has the light from
-    # below already.
+    # A photographed or paved ground is a part of the environment map: the light from
+    # below is in its lower half.
     has_plain_ground = scene.photograph is None and not is_paved(scene)
-    in_reach = (offset <= scene.get_number("ground.size") / 2.0).all(axis=1)
-    hits = has_plain_ground & ~is_up & in_reach
-    power = np.where(hits[:, None], reflected * solid_angle[:, None], power)
+    is_above_square = (offset <= scene.get_number("ground.size") / 2.0).all(axis=1)
+    hits_ground = has_plain_ground & ~is_up & is_above_square
+    power = np.where(
+        hits_ground[:, None], reflected_radiance * solid_angle[:, None], power
+    )
     return directions, power
 
 
@@ -379,9 +389,9 @@ def _compute_emitted_light(
 ) -> tuple[Float64Array, Float64Array]:
     """Return the light that arrives at a point (3,) from the faces of a mesh.
 
-    A face is taken for a disk of the same area and of its mean radiance, which shines
-    on its front alone. Unlike area / distance^2, the form factor of a disk stays finite
-    however near the point is.
+    A face is approximated by a disk of the same area and mean radiance, which emits
+    from its front only. Unlike area / distance^2, the form factor of a disk is finite
+    at any distance.
 
     Args:
         part: the mesh, in its base pose.
@@ -399,7 +409,8 @@ def _compute_emitted_light(
     direction = offset / np.maximum(np.sqrt(squared_distance), 1e-12)[:, None]
     # (F, P, 2) of P points on each face
     uv = np.einsum("pk,fkc->fpc", FACE_SAMPLE_WEIGHTS, part.mesh.uvs[part.mesh.faces])
-    # In columns and rows, which are whole at texel centers. v points up, rows go down.
+    # In columns and rows, which are integers at texel centers. v points up, and rows
+    # are numbered downwards.
     height, width = emission.shape[:2]
     column = uv[..., 0] * width - 0.5
     row = (1.0 - uv[..., 1]) * height - 0.5
@@ -414,8 +425,8 @@ def _choose_metering_shape(frame: Frame) -> tuple[float, tuple[int, int]]:
     """Return the width of a pixel of a small image, as a tangent, and its shape."""
     width = frame.right - frame.left
     height = frame.high - frame.low
-    pixel = max(width, height) / METERING_SIZE
-    return pixel, (round(height / pixel), round(width / pixel))
+    pixel_width = max(width, height) / METERING_SIZE
+    return pixel_width, (round(height / pixel_width), round(width / pixel_width))
 
 
 def _find_nearest(
@@ -430,19 +441,20 @@ def _find_nearest(
         shape: height and width of the image.
     """
     order = np.argsort(nearness, kind="stable")
-    front = np.full(shape, -1)
-    # of several samples in a pixel, the one written last stays: the nearest
-    front[row[order], column[order]] = order
-    return np.asarray(front[front >= 0])
+    front_sample = np.full(shape, -1)
+    # Samples are written from the farthest to the nearest, which overwrites the others
+    # in its pixel.
+    front_sample[row[order], column[order]] = order
+    return np.asarray(front_sample[front_sample >= 0])
 
 
 def compute_visible_normals(scene: SceneData) -> Float64Array:
     """Return the object's unit normals (N, 3) in the pixels of a small image.
 
-    N is the number of pixels that show the object. Other things do not hide it. A pixel
-    has the normal of the face nearest to the camera, in world space, and turned to
-    point towards the camera. The image has `METERING_SIZE` pixels along its longer
-    side.
+    N is the number of pixels that show the object, which nothing else hides. A pixel
+    has the normal of the face nearest to the camera, in world space. Normals are
+    reversed if they point away from the camera. The image has `METERING_SIZE` pixels
+    along its longer side.
     """
     camera = camera_to_world(scene)
     # in the camera's coordinates: left, up and ahead
@@ -452,16 +464,20 @@ def compute_visible_normals(scene: SceneData) -> Float64Array:
     frame = Frame.from_fov(scene.get_number("camera.fov"), scene.aspect)
     pixel_width, shape = _choose_metering_shape(frame)
     tangents = points[faces][..., :2] / points[faces][..., 2:]
+    # Columns run to the left and rows up, as the camera's coordinates do. The frame is
+    # symmetric, so that its bounds hold for these directions, too.
+    from_corner = tangents - (frame.left, frame.low)
     # minus half a pixel, since the raster's coordinates are 0 at the center of its
     # first pixel
     face, row, column, weights = rasterize_triangles(
-        (tangents - (frame.left, frame.low)) / pixel_width - 0.5, shape
+        from_corner / pixel_width - 0.5, shape
     )
     # 1 / depth, unlike depth, may be interpolated linearly over the image
     nearness = (weights / points[faces[face]][..., 2]).sum(axis=1)
     visible = _find_nearest(nearness, row, column, shape)
 
-    corners = faces[face[visible]]
+    visible_face = face[visible]
+    corners = faces[visible_face]
     normals = _interpolate_normals(scene, corners, weights[visible])
     from_camera = points[corners].mean(axis=1) @ camera[:3, :3].T
     is_back_facing = (normals * from_camera).sum(axis=1, keepdims=True) > 0.0
@@ -490,7 +506,7 @@ def _compute_unrotated_light(
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return an environment's light without its rotation; z is up.
 
-    The map is divided into blocks of texels, and the light of each block is summed up.
+    The map is divided into blocks of texels. The light of each block is summed up.
 
     Returns:
         For N blocks: unit directions (N, 3), solid angles (N,) in steradians, and
@@ -522,6 +538,9 @@ def _compute_block_directions(
 ) -> Float64Array:
     """Return the directions (blocks, 3) of the centers of blocks of an environment map.
 
+    The first row of the map is straight up. Its first column begins at +y, and columns
+    continue over +x, -y and -x.
+
     Args:
         rows: the first row of each block.
         columns: the first column of each block.
@@ -530,9 +549,11 @@ def _compute_block_directions(
     height, width = shape
     row_ends = np.append(rows[1:], height)
     column_ends = np.append(columns[1:], width)
-    # The middle row is (first + last) / 2, and a row is pi / (height - 1). Columns have
-    # their centers half a column further: there the middle is (start + end) / 2.
+    # The center of row r is at the angle r * pi / (height - 1) from straight up. The
+    # rows of a block, from start to end - 1, have the mean (start + end - 1) / 2.
     theta = (rows + row_ends - 1)[:, None] * (0.5 * math.pi / (height - 1))
+    # The center of column c is at (c + 0.5) * 2 pi / width. The mean of c + 0.5 over a
+    # block is (start + end) / 2.
     azimuth = 0.5 * math.pi - (columns + column_ends) * (math.pi / width)
     z = np.broadcast_to(np.cos(theta), (len(rows), len(columns)))
     x = np.sin(theta) * np.cos(azimuth)
@@ -541,21 +562,23 @@ def _compute_block_directions(
 
 
 def _find_block_starts(size: int, count: int) -> IntArray:
-    """Return where `count` blocks of rows or columns begin, or fewer of one each."""
+    """Return the first row (or column) of each of `count` blocks of about equal size.
+
+    If there are fewer than `count` rows, each is a block.
+    """
     bounds = np.linspace(0, size, min(count, size) + 1).astype(np.int64)
     return np.unique(bounds[:-1])
 
 
 # ----------------------------------------------------------------------------------
-# When the rows of an image are exposed: an open shutter (motion blur) and rows that are
-# read one after the other.
+# Times at which the rows of an image are exposed: an open shutter (motion blur), and
+# rows that are read one after the other (rolling shutter).
 #
-# A row r of H is exposed for `shutter` seconds, and rows are read within `rolling`
-# seconds, the first at the top, or at the bottom where that is below 0; the middle of
-# the image's exposure is the time of the configuration. What a sensor counts is
-# light, so a row is the mean of linear radiance over its exposure, before the denoiser
-# and the tone curve. The mean is over M moments, evenly spaced, of which each row takes
-# those in its own exposure.
+# Each row is exposed for `shutter` seconds. Rows are read within `rolling` seconds, from
+# the top, or from the bottom if `rolling` is negative. The middle of the image's
+# exposure is the time of the configuration. A sensor adds up light, so a row is the mean
+# of linear radiance over its exposure, before the denoiser and the tone curve. The mean
+# is taken over moments, evenly spaced, of which each row has those in its own exposure.
 
 MIN_MOMENTS = 8
 MAX_MOMENTS = 64
@@ -564,7 +587,7 @@ MOMENTS_PER_PIXEL = 2
 
 
 class InputMapping(Protocol):
-    """Maps a configuration to scene inputs, as `InputSpace` does, at another time."""
+    """Maps a configuration to scene inputs, as `InputSpace` does, at some moment."""
 
     def inputs(self, u: Tensor) -> dict[str, Tensor]:
         """Map u (d,) to scene inputs by torch operations; differentiable."""
@@ -575,9 +598,7 @@ class Moment:
     """A part of an exposure."""
 
     space: InputMapping  # maps configurations to scene inputs at that time
-    row_fractions: (
-        Tensor  # (H,) its fraction of each row, which adds up to 1 over all moments
-    )
+    row_fractions: Tensor  # (H,) its weight in each row; 1 in sum over all moments
     sample_fraction: float  # its fraction of the samples per pixel
 
 
@@ -596,13 +617,13 @@ def divide_exposure(
         rolling: seconds within which rows are read one after the other. If it is
             negative, the lowest row comes first.
         height: height of the image.
-        count: M, number of moments. With as many as rows and no shutter, each row has a
-            moment of its own.
+        count: M, number of moments. Without a shutter, and with as many moments as
+            rows, each row has its own moment.
 
     Returns:
-        (M,) seconds from the middle of the exposure; (M, H) the fraction of each row
-        that each moment has, whose columns add up to 1; and the fraction of a pixel's
-        samples that each moment takes.
+        (M,) seconds from the middle of the exposure to each moment; (M, H) the weight
+        of each moment in each row, 1 in sum over moments; and the fraction of a
+        pixel's samples that each moment takes.
     """
     is_from_bottom = rolling < 0.0
     rolling = abs(rolling)
@@ -610,9 +631,9 @@ def divide_exposure(
     starts = torch.arange(count, dtype=torch.float64) * duration
     # (H,) when each row opens, seconds after the first
     opens = rolling * (torch.arange(height, dtype=torch.float64) + 0.5) / height
-    # A row that is exposed for less than a moment has the moment in which the middle of
-    # its exposure lies.
     if shutter < duration:
+        # A row is exposed for less than a moment, and belongs to only one: that in
+        # which the middle of its exposure is.
         moment = ((opens + shutter / 2.0) / duration).long().clamp_max(count - 1)
         fractions = torch.nn.functional.one_hot(moment, count).T.double()
     else:
@@ -622,11 +643,12 @@ def divide_exposure(
         fractions = (overlap_end - overlap_start).clamp_min(0.0)
     fractions = fractions / fractions.sum(dim=0)
     if is_from_bottom:
-        fractions = fractions.flip(1)
-    # middle of each moment, from the middle of the exposure
+        row_dimension = 1
+        fractions = fractions.flip(row_dimension)
+    # from the middle of the exposure to the middle of each moment
     offsets = starts + duration / 2.0 - (shutter + rolling) / 2.0
-    # A row overlaps with shutter / duration moments, which share its samples; without a
-    # shutter one moment has all of them.
+    # A row overlaps with shutter / duration moments, each of which takes this fraction
+    # of its samples. Without a shutter one moment takes all of them.
     sample_fraction = 1.0
     if shutter:
         sample_fraction = min(1.0, duration / shutter)
@@ -634,18 +656,18 @@ def divide_exposure(
 
 
 # ----------------------------------------------------------------------------------
-# What the camera sees first through the center of each pixel: ground truth of an image,
-# without noise.
+# The surface that the ray through the center of each pixel hits first: ground truth of
+# an image, without noise.
 
 AOVS: Mapping[str, str] = {
-    "mask": "1 where the object is seen first, else 0",
-    "depth": "distance from the camera along the ray, metres (object sizes where the "
+    "mask": "1 where the object is visible, else 0",
+    "depth": "distance from the camera along the ray, meters (object sizes if the "
     "object's size is not known); "
     "infinite where there is nothing",
     "normal": "unit shading normal, world space (z up); 0 where there is nothing",
     "uv": "texture coordinates, v = 0 at the bottom row of the texture; 0 where there "
     "is nothing",
-    "id": "number of the mesh; 0 where there is nothing",
+    "id": "index of the mesh, from 1; 0 where there is nothing",
 }
 """Layers that can be requested, and what their values mean."""
 CHANNELS: Mapping[str, str] = {
@@ -682,11 +704,11 @@ class Surfaces:
     names: tuple[str, ...]  # names of the shapes
     # (H, W) int64: 1 for the first of the names and so on, 0 where there is nothing
     id: Tensor
-    # (H, W) distance from the camera, infinite where there is nothing: metres, as
-    # renderers return it; object sizes where the object's size is not known, and as
-    # Mitsuba's scenes return it
+    # (H, W) distance from the camera, infinite where there is nothing. Renderers return
+    # it in meters, or in object sizes if the object's size is not known; Mitsuba's
+    # scenes always return object sizes.
     depth: Tensor
-    z_depth: Tensor  # (H, W) the part of it that lies along the camera's axis
+    z_depth: Tensor  # (H, W) component of the distance along the camera's axis
     normal: Tensor  # (H, W, 3) unit shading normal in world space
     uv: Tensor  # (H, W, 2) texture coordinates; v = 0 is the bottom row
     face: Tensor  # (H, W) int64 index of the triangle in its mesh

@@ -1,20 +1,19 @@
-"""Where things stand: the object's pose and the camera's place, as 4 x 4 matrices in
-numpy (column vectors, z up).
+"""Poses of the object and of the camera: 4 x 4 matrices (column vectors, z up).
 
-Framing is how far from the object the camera stands where nobody says so. The distance
-depends on the object, the field of view and the shape of the picture alone, never on
-where the camera is moved to: a configuration is one picture, whether its azimuth is a
+Framing chooses the distance of a camera for which the user has set none. The distance
+depends only on the object, the field of view and the shape of the image, and not on the
+direction of the camera. So a configuration has the same image whether its azimuth is a
 setting, a fixed value or a point of a grid. It is the smallest distance at which
 
 - from the default direction the object reaches at most `FRAME_FILL` of the way to the
-edge of the picture,
-- from every azimuth at the default elevation all of it is in the picture, so that no
-  search turns the end of a long object out of it, and
-- the camera stays outside the sphere around the object.
+  edge of the image,
+- from every azimuth at the default elevation all of the object is in the image, so that
+  a search over azimuths cannot cut off the end of a long object, and
+- the camera is outside the sphere around the object.
 
-A vertex at offset `o` from the middle projects at `(o.left, o.up) / (distance -
-o.outwards)`, so that each vertex asks for `distance >= o.outwards + max(|o.left| / tx,
-|o.up| / ty)`, where tx and ty are the tangents of half the picture.
+A vertex at offset `o` from the middle projects to `(o.left, o.up) / (distance -
+o.outwards)`. So each vertex requires `distance >= o.outwards + max(|o.left| / tx,
+|o.up| / ty)`, where tx and ty are the tangents of half the angles of view.
 """
 
 from __future__ import annotations
@@ -47,21 +46,20 @@ from advsearch.scene.skeleton import (
     compute_rotation_entries as compute_rotation_entries,
 )
 
-# share of the picture's half-width that the object may reach when the distance is
-# worked out
+# Fraction of half the image's width or height that the object may reach when the
+# distance is computed.
 FRAME_FILL = 0.86
-MIN_SPHERE_DISTANCE = (
-    0.02  # smallest distance, in object sizes, to the sphere around the object
-)
-# sine of the largest elevation, for a height that would need a steeper one
+# Smallest distance, in object sizes, to the sphere around the object.
+MIN_SPHERE_DISTANCE = 0.02
+# Sine of the largest elevation, for a height that would need a steeper one.
 MAX_ELEVATION_SINE = math.sin(math.radians(89.0))
-MIN_DEPTH = 1e-3  # depth up to which points have no place in the picture
+MIN_DEPTH = 1e-3  # depth up to which points are not projected
 DEFAULT_VIEW = ("camera.azimuth", "camera.elevation", "camera.roll")
 
 
 @dataclass(frozen=True)
 class Frame:
-    """What the picture shows, as tangents: the ranges to the right and upwards.
+    """The field of view of an image, as ranges of tangents to the right and upwards.
 
     A direction is (x, y, 1): x to the right, y up, and 1 ahead.
     """
@@ -81,20 +79,21 @@ class Frame:
             fov: field of view along the larger side, degrees.
             aspect: width over height.
             shift: shift of the frame to the right, in widths of the image, and
-                downwards, in heights. What it shows moves the other way.
+                downwards, in heights. The contents of the image move the other way.
         """
         # the tangent of half the larger side; the smaller side follows by the aspect
         half_tangent = math.tan(math.radians(fov) / 2.0)
         half_width = half_tangent * min(1.0, aspect)
         half_height = half_tangent * min(1.0, 1.0 / aspect)
-        # shifts are fractions of the full width and height, and heights count upwards
+        # Shifts are fractions of the full width and height.
         right_shift = 2.0 * half_width * shift[0]
         down_shift = 2.0 * half_height * shift[1]
+        # A frame measures upwards, so that a shift downwards is subtracted.
         return Frame(
-            -half_width + right_shift,
-            half_width + right_shift,
-            -half_height - down_shift,
-            half_height - down_shift,
+            left=-half_width + right_shift,
+            right=half_width + right_shift,
+            low=-half_height - down_shift,
+            high=half_height - down_shift,
         )
 
     def corners(self) -> Float64Array:
@@ -114,12 +113,14 @@ def _compute_edge_tangents(
     The first is to the side, the second to the top.
 
     Args:
-        description: the scene; a lens of the user's wins over `fov`.
+        description: the scene; if the user has chosen a lens, it replaces `fov`.
         fov: () field of view along the larger side of the image, degrees.
         aspect: width over height.
     """
     model = description.camera_model
-    if model is not None and model.name:  # of what it shows, a rectangle
+    # A model without a name is a pinhole whose focal length follows from `fov`.
+    if model is not None and model.name:
+        # the largest rectangle around the axis that is in the image
         return torch.tensor(
             model.visible_tangents, dtype=torch.float64, device=fov.device
         )
@@ -143,7 +144,7 @@ def compute_framing_distance(
     camera is outside of the sphere around the object.
 
     The distance is in object sizes, float64, and differentiable in the field of view.
-    If the user has given a lens, that counts in place of the field of view.
+    If the user has chosen a lens, it replaces the field of view.
 
     Args:
         description: the scene.
@@ -202,9 +203,9 @@ def compute_camera_axes(azimuth: float, elevation: float, roll: float) -> Float6
 
 
 def compute_center(description: SceneData) -> Float64Array:
-    """Return what the camera looks at.
+    """Return the point that the camera looks at.
 
-    The middle (3,) of the object's bounding box in its default pose.
+    It is the middle (3,) of the object's bounding box in its default pose.
     """
     vertices = description.object.mesh.vertices.astype(np.float64)
     return np.asarray((vertices.min(axis=0) + vertices.max(axis=0)) / 2.0)
@@ -215,11 +216,19 @@ def _compute_framing_distance_all_around(
 ) -> Tensor:
     """Return the distance at which every vertex is in the image from every azimuth.
 
-    Seen from all around, a vertex runs through a circle of radius rho at height z. For
-    each edge of the image, the distance that it needs is a constant plus a sine of the
-    azimuth: `A sin + B cos` is at most `sqrt(A^2 + B^2)`, so that the largest distance
-    is known in closed form. The result is the largest over all vertices and edges, in
-    the unit of the offsets.
+    While the camera goes around the object, a vertex at height z and at the distance
+    rho from the vertical axis has every azimuth a relative to the camera. In the axes
+    of a camera at the elevation e its offset is
+
+        outwards = rho cos(e) cos(a) + z sin(e)      towards the camera
+        left     = rho sin(a)
+        up       = z cos(e) - rho sin(e) cos(a)
+
+    It is inside an edge of the image if the distance is at least outwards +
+    left / tangent, or outwards + up / tangent for the top edge, and likewise with -left
+    and -up. The largest value of A sin(a) + B cos(a) over all a is sqrt(A^2 + B^2).
+    The result is the largest distance over all vertices and edges, in the unit of the
+    offsets.
 
     Args:
         offsets: (V, 3) from the middle of the object to its vertices.
@@ -232,20 +241,23 @@ def _compute_framing_distance_all_around(
     sine = math.sin(math.radians(elevation))
     inverse_width = 1.0 / tangents[0]
     inverse_height = 1.0 / tangents[1]
-    # A vertex at azimuth a of the circle is `outwards` towards the camera, and at
-    # `left` and `up` in its image. It is inside an edge if the distance is at least
-    # outwards + side / tangent, where side is left or up. The largest value of the
-    # terms with cos(a) and sin(a) is the norm of their two factors.
-    # outwards = rho cosine cos(a) + z sine, left = rho sin(a)
-    for_sides = rho * torch.sqrt(inverse_width**2 + cosine**2) + z * sine
-    # up = z cosine - rho sine cos(a), and its negative for the bottom edge
-    for_top = rho * (cosine - sine * inverse_height).abs() + z * (
-        sine + cosine * inverse_height
-    )
-    for_bottom = rho * (cosine + sine * inverse_height).abs() + z * (
-        sine - cosine * inverse_height
-    )
-    return torch.stack([for_sides.max(), for_top.max(), for_bottom.max()]).max()
+
+    # outwards + left / tangent: terms with sin(a) and cos(a), and a constant. With
+    # -left the largest value is the same.
+    sides_amplitude = rho * torch.sqrt(inverse_width**2 + cosine**2)
+    distance_for_sides = sides_amplitude + z * sine
+
+    # outwards + up / tangent: a term with cos(a) alone, and a constant.
+    top_amplitude = rho * (cosine - sine * inverse_height).abs()
+    distance_for_top = top_amplitude + z * (sine + cosine * inverse_height)
+
+    # outwards - up / tangent
+    bottom_amplitude = rho * (cosine + sine * inverse_height).abs()
+    distance_for_bottom = bottom_amplitude + z * (sine - cosine * inverse_height)
+
+    return torch.stack(
+        [distance_for_sides.max(), distance_for_top.max(), distance_for_bottom.max()]
+    ).max()
 
 
 def make_affine(linear: torch.Tensor, translation: torch.Tensor) -> torch.Tensor:
@@ -306,11 +318,11 @@ def project_points(
     points: Tensor,
     size: tuple[int, int],
 ) -> tuple[Tensor, Tensor]:
-    """Return where the camera of scene inputs sees points.
+    """Project points to the image of a scene's camera.
 
     Points are projected by the camera's lens if it has one. Otherwise the camera is a
-    pinhole. Its field of view and shift are those of the inputs; without any, the field
-    of view is the scene's.
+    pinhole. Its field of view and shift are those of the inputs. Without them, the
+    field of view is the scene's and there is no shift.
 
     Args:
         description: the scene.
@@ -320,7 +332,7 @@ def project_points(
 
     Returns:
         (N, 2) pixels to the right and down from the middle of the image; (N,) bool,
-        which are before the camera.
+        which points are in front of the camera.
     """
     image_size = torch.tensor(size[::-1], dtype=torch.float64)
     # to the right, down and ahead
@@ -328,6 +340,7 @@ def project_points(
     model = description.camera_model
     if model is not None:
         if "camera.lens" in inputs:
+            # A model stores floats, so that there is no derivative by the lens.
             model = model.with_numbers(inputs["camera.lens"].detach())
         positions, is_visible = model.project(points)
         return (positions - 0.5) * image_size, is_visible
@@ -342,18 +355,20 @@ def project_points(
     positions = focal * points[:, :2] / depth.clamp_min(MIN_DEPTH)[:, None]
     for axis, name in enumerate(("camera.shift_x", "camera.shift_y")):
         if name in inputs:
+            # The frame is shifted to the right or down, so that points in it move to
+            # the left or up.
             positions[:, axis] -= image_size[axis] * inputs[name].double().reshape(())
     return positions, depth > MIN_DEPTH
 
 
 def compute_carried_pose(carrier: Tensor, pose_on_carrier: Tensor) -> Tensor:
-    """Return the pose (4, 4) of what is fixed to a carrier, without a scale.
+    """Return the pose (4, 4), without a scale, of an object that is fixed to a carrier.
 
-    Its position is scaled with the carrier, its axes are only turned.
+    Its position is scaled with the carrier; its axes are only rotated.
 
     Args:
-        carrier: (4, 4) pose of the carrier, which may be scaled: what it carries keeps
-            its size.
+        carrier: (4, 4) pose of the carrier, which may be scaled. The carried object
+            keeps its size.
         pose_on_carrier: (4, 4) pose in the carrier's coordinates.
     """
     # the scale of a uniformly scaled rotation is the cube root of its determinant
@@ -365,10 +380,11 @@ def compute_carried_pose(carrier: Tensor, pose_on_carrier: Tensor) -> Tensor:
 
 
 def compute_car_pose(camera: Tensor) -> Tensor:
-    """Return the pose (4, 4) of a car that a camera (4, 4) looks ahead from.
+    """Return the pose (4, 4) of a car on which a camera (4, 4) looks ahead.
 
-    It is level, with its +x ahead and +z up, at the height 0 below the camera;
-    differentiable. A camera looks along its own +z, the third column of its pose.
+    The car is level, with its +x ahead and +z up, at the height 0 below the camera. The
+    pose is differentiable. A camera looks along its own +z, the third column of its
+    pose.
     """
     x, y = camera[:2, 2] / camera[:2, 2].norm().clamp_min(1e-6)
     zero = torch.zeros_like(x)
@@ -380,12 +396,14 @@ def compute_car_pose(camera: Tensor) -> Tensor:
 
 
 def get_positioned_part(scene: SceneData, part: ScenePart) -> Any:
-    """Return one of a scene's parts where the settings and the camera put it.
+    """Return a part of a scene in the pose that the settings and the camera define.
 
-    A mesh gets the pose and the material of its settings. A beam gets its pose from its
-    carrier, which is a mesh or the camera's car. Other parts are returned as they are.
+    A mesh gets the pose and the material of its settings. A lamp with a beam gets its
+    pose from its carrier, which is a mesh, or the car of a camera that is mounted on
+    one. Other parts are returned as they are.
     """
     if not isinstance(part, BeamLamp):
+        # `scene.meshes` has the settings applied. Only meshes are in it.
         return scene.meshes.get(part.name, part)
     if part.carrier == CAMERA:
         carrier = compute_car_pose(torch.from_numpy(camera_to_world(scene)))
@@ -400,7 +418,7 @@ def get_positioned_part(scene: SceneData, part: ScenePart) -> Any:
 
 
 def list_lamps(scene: SceneData) -> dict[str, Lamp]:
-    """Return every light of a scene beside its environment, by name."""
+    """Return every lamp of a scene by name; the environment is none."""
     return {
         part.name: get_positioned_part(scene, part)
         for part in scene.parts
@@ -413,7 +431,7 @@ def compute_real_harmonics(height: int, width: int) -> Tensor:
     """Return the nine real spherical harmonics of degrees 0 to 2: (height, width, 9).
 
     They are evaluated at the texel centers of an equirectangular map: row 0 is around
-    +z, and columns go round from +x to +y. Each has root mean square 1 over the sphere,
+    +z, and columns run from +x over +y. Each has root mean square 1 over the sphere,
     which is sqrt(4 pi) times the factors of Ramamoorthi and Hanrahan 2001, section 3.
     The last axis has the degrees 0 (one), 1 (y, z, x) and 2 (five).
     """
@@ -486,7 +504,7 @@ def make_vector_rotation(degrees: Tensor) -> Tensor:
     )
 
 
-HIDDEN_SCALE = 1e-3  # size of an occluder that is put away, behind the camera
+HIDDEN_SCALE = 1e-3  # scale of an occluder that is hidden behind the camera
 OCCLUDER_INPUTS = (
     "camera.to_world",
     "camera.fov",
@@ -495,18 +513,18 @@ OCCLUDER_INPUTS = (
     "object.to_world",
     "object.offsets",
 )
-"""Inputs of other controls that an occluder goes by."""
+"""Inputs of other controls on which the pose of an occluder depends."""
 
 
 def get_camera_pose(scene: SceneData, earlier_inputs: Mapping[str, Tensor]) -> Tensor:
-    """Return the pose (4, 4) of the camera where the controls before have it."""
+    """Return the pose (4, 4) of the camera after earlier controls have moved it."""
     return earlier_inputs.get(
         "camera.to_world", torch.from_numpy(camera_to_world(scene))
     )
 
 
 def make_hidden_pose(camera: Tensor) -> Tensor:
-    """Return the pose (4, 4) of what is out of sight: tiny, behind a camera (4, 4)."""
+    """Return a pose (4, 4) that hides an object: tiny, behind a camera (4, 4)."""
     return make_affine(
         HIDDEN_SCALE * torch.eye(3).to(camera), camera[:3, 3] - camera[:3, 2]
     )
@@ -514,7 +532,7 @@ def make_hidden_pose(camera: Tensor) -> Tensor:
 
 def compute_footprint(points: Float64Array) -> Footprint:
     """Return the convex outline from above and the height range of points (N, 3)."""
-    # QJ jogs the input: points on one line have a (thin) hull too
+    # QJ jogs the points slightly, so that points on a line have a (thin) hull, too
     corners = ConvexHull(points[:, :2], qhull_options="QJ").vertices
     return Footprint(
         points[corners, :2], float(points[:, 2].min()), float(points[:, 2].max())
@@ -522,8 +540,8 @@ def compute_footprint(points: Float64Array) -> Footprint:
 
 
 def is_overlapping(first: Footprint, second: Footprint) -> bool:
-    """Return whether two footprints overlap from above, at heights that both have."""
-    # any direction will do: they overlap if they do so at a shift of 0
+    """Return whether two footprints overlap, seen from above, and in height."""
+    # They overlap now if they do so at a shift of 0, along any direction.
     first_shift, last_shift = find_overlap_interval(first, second, np.array([1.0, 0.0]))
     return first_shift < 0.0 < last_shift
 
@@ -531,7 +549,7 @@ def is_overlapping(first: Footprint, second: Footprint) -> bool:
 def find_overlap_interval(
     first: Footprint, second: Footprint, direction: Float64Array
 ) -> tuple[float, float]:
-    """Return between which shifts along a direction one footprint overlaps another.
+    """Return the interval of shifts at which one footprint overlaps another.
 
     The method is that of separating axes (Ericson 2005, Real-Time Collision Detection,
     section 5.2.1). Projected on the normal of an edge, both footprints are intervals,
@@ -539,15 +557,17 @@ def find_overlap_interval(
     projections on all normals do. Touching is no overlap.
 
     Args:
-        first: the footprint that is shifted.
+        first: the footprint that is shifted horizontally.
         second: the footprint that stays.
         direction: (2,) a shift of t moves the first footprint by t times this.
 
     Returns:
-        The first and the last t; (inf, -inf) where they never overlap.
+        The first and the last t; (inf, -inf) if they never overlap.
     """
-    if min(first.upper, second.upper) <= max(first.lower, second.lower):
-        return math.inf, -math.inf
+    never = (math.inf, -math.inf)
+    has_common_height = min(first.upper, second.upper) > max(first.lower, second.lower)
+    if not has_common_height:
+        return never
     edges = np.concatenate(
         [
             np.roll(points, -1, axis=0) - points
@@ -556,30 +576,28 @@ def find_overlap_interval(
     )
     # normals (k, 2) of the edges, without those between two corners at one point
     normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1)[edges.any(axis=1)]
-    # positions (corners, k) of the corners along each normal, and how far a shift of 1
-    # moves the first footprint along it
-    moving_range = first.outline @ normals.T
-    fixed_range = second.outline @ normals.T
-    shift_speeds = normals @ direction
-    # (2, k): how far the first has to move along each axis until it overlaps the
+    # positions (corners, k) of the corners along each normal
+    first_positions = first.outline @ normals.T
+    second_positions = second.outline @ normals.T
+    # (2, k) how far the first has to move along each normal until it overlaps the
     # second, and until it no longer does
     separations = np.stack(
         [
-            fixed_range.min(axis=0) - moving_range.max(axis=0),
-            fixed_range.max(axis=0) - moving_range.min(axis=0),
+            second_positions.min(axis=0) - first_positions.max(axis=0),
+            second_positions.max(axis=0) - first_positions.min(axis=0),
         ]
     )
-    # A shift does not move the first footprint along an axis at a right angle to it. On
-    # such an axis the two are always apart, if 0 is not between the separations, or
-    # never.
-    is_parallel = shift_speeds == 0.0
-    if (is_parallel & ((separations[0] >= 0.0) | (separations[1] <= 0.0))).any():
-        return math.inf, -math.inf
+    # (k,) how far a shift of 1 moves the first along each normal
+    speeds = normals @ direction
+    # Along a normal at a right angle to the shift nothing moves. The projections on it
+    # overlap at every shift, if 0 is between the separations, or at none.
+    is_still = speeds == 0.0
+    is_separated = (separations[0] >= 0.0) | (separations[1] <= 0.0)
+    if (is_still & is_separated).any():
+        return never
     # Distance over speed is the shift at which an overlap begins and ends. A negative
     # speed swaps the two, and so they are sorted.
-    intervals = np.sort(
-        separations[:, ~is_parallel] / shift_speeds[~is_parallel], axis=0
-    )
+    intervals = np.sort(separations[:, ~is_still] / speeds[~is_still], axis=0)
     start = float(intervals[0].max())
     end = float(intervals[1].min())
-    return (start, end) if start < end else (math.inf, -math.inf)
+    return (start, end) if start < end else never

@@ -1,10 +1,10 @@
 """Writer of binary glTF 2.0 (.glb): one node for each mesh, textures as PNG or JPEG.
 
-Up is +y, and the front, our +x, is +z, as the format says of an asset (glTF 2.0,
-section 3.4).
+Up is +y. The front, which is our +x, is +z, as the format requires (glTF 2.0, section
+3.4).
 
-Materials have the numbers of the principled surface (glTF 2.0, section 3.9, and the
-extensions KHR_materials_specular and KHR_materials_clearcoat): a specular of 0.5
+Materials have the parameters of the principled surface (glTF 2.0, section 3.9, and the
+extensions KHR_materials_specular and KHR_materials_clearcoat). A specular of 0.5
 reflects 4 % at normal incidence, as glTF's default does.
 """
 
@@ -46,8 +46,9 @@ class GlbBuffer:
     Bytes that are already in it are not added again.
 
     Attributes:
-        data: the bytes.
-        views, accessors: their entries in the document.
+        data: the bytes of the buffer.
+        views: entries of the buffer views in the document.
+        accessors: entries of the accessors in the document.
     """
 
     def __init__(self) -> None:
@@ -59,8 +60,12 @@ class GlbBuffer:
     def add_view(self, data: bytes, target: int | None = None) -> int:
         """Append bytes, padded to four, and return the index of their view.
 
-        Bytes that were added before with the same target keep their view. `target` is
-        one of the two above; None for what is no geometry, such as an image.
+        Bytes that were added before with the same target keep their view.
+
+        Args:
+            data: the bytes.
+            target: `ARRAY_BUFFER` for vertex attributes, `ELEMENT_ARRAY_BUFFER` for
+                indices; None if the bytes are no geometry, such as an image.
         """
         key = (data, target)
         if key in self._view_of_data:
@@ -77,7 +82,8 @@ class GlbBuffer:
         """Append an array and return the index of its accessor.
 
         Args:
-            values: (N,) or (N, width), float32, uint32 or uint16.
+            values: (N,) or (N, width); float32 for vertex attributes, uint32 or uint16
+                for indices.
             kind: glTF's type of a row, such as "VEC3".
             bounds: whether minimum and maximum are written too, which glTF requires of
                 positions.
@@ -133,7 +139,7 @@ WEB_QUALITY = 90
 # Filter and wrap mode of textures, as OpenGL numbers them.
 LINEAR = 9729
 REPEAT = 10497
-# Entry of a camera, of which only the pose of its node counts.
+# Entry of a camera. Viewers need only the pose of its node; its numbers are examples.
 CAMERA_ENTRY = {"type": "perspective", "perspective": {"yfov": 0.7, "znear": 0.01}}
 
 
@@ -161,14 +167,15 @@ def encode_web_glb(
     """
     buffer = GlbBuffer()
     document = _make_document(buffer, [*adversarial, *clean], _encode_jpeg)
-    # Rows of 3: its axes to the left, up and ahead, then its position.
-    camera_rows = camera[:3].T.astype(np.float32)
-    camera_matrix = np.eye(4)
-    # glTF's cameras look along their -z, with +x to the right: the opposite of left and
-    # ahead, while up and the position stay. A row here is a column of the node's
-    # matrix, as the format stores it.
+    # The columns of the pose as rows (4, 3): the camera's axes to the left, up and
+    # ahead, then its position. All four are vectors that `_to_y_up` can rotate.
+    pose_columns = camera[:3].T.astype(np.float32)
+    # glTF's cameras look along their -z, with +x to the right. So the axes to the left
+    # and ahead are reversed.
     signs = np.array([[-1.0], [1.0], [-1.0], [1.0]], np.float32)
-    camera_matrix[:, :3] = _to_y_up(camera_rows * signs)
+    # The format stores matrices by columns, which are the rows here.
+    camera_matrix = np.eye(4)
+    camera_matrix[:, :3] = _to_y_up(pose_columns * signs)
     document["cameras"] = [CAMERA_ENTRY]
     document["nodes"].append(
         {"name": "camera", "camera": 0, "matrix": camera_matrix.ravel().tolist()}
@@ -244,7 +251,6 @@ def _add_geometry(buffer: GlbBuffer, shape: Shape) -> dict[str, Any]:
     """
     mesh = shape.mesh
     lengths = np.linalg.norm(mesh.normals, axis=1, keepdims=True)
-    # The format requires unit normals.
     normals = np.where(
         lengths > 0.0, mesh.normals / np.maximum(lengths, 1e-12), np.eye(3)[2]
     ).astype(np.float32)

@@ -1,14 +1,15 @@
-"""Measure the noise and the blur of a photograph, and make others of the same kind.
+"""Measurement of the noise and the blur of a photograph, and their simulation.
 
-    noise  the median of the high-pass residual of a block, over the quieter blocks
-    blur   the ratio of an edge's slopes in two blurred copies,
-           R^2 = (s^2 + b^2) / (s^2 + a^2) for a step blurred by s; two fifths of the
-           edges are sharper than what is returned
+Noise is measured by the median of the high-pass residual in each block of pixels, over
+the blocks with the smallest medians. The residual is that of Immerkaer 1996, Fast noise
+variance estimation; the median is that of Donoho and Johnstone 1994, Ideal spatial
+adaptation by wavelet shrinkage.
 
-Noise: Immerkaer 1996, Fast noise variance estimation (the residual); Donoho and
-Johnstone 1994, Ideal spatial adaptation by wavelet shrinkage (the median). Blur: Zhuo
-and Sim 2011, Defocus map estimation from a single image, section 3. The blur of a
-rendered edge, which pixels average over their area, counts as none.
+Blur is measured by the ratio R of an edge's slopes in two copies of the image, blurred
+by a and by b. For a step blurred by s, R^2 = (s^2 + b^2) / (s^2 + a^2) (Zhuo and Sim
+2011, Defocus map estimation from a single image, section 3). A fraction of the edges,
+`SHARP_FRACTION`, is sharper than the result. A rendered edge, which pixels average over
+their area, has the blur 0.
 """
 
 from __future__ import annotations
@@ -24,27 +25,29 @@ from torch import Tensor
 from advsearch.scene.assets import Float32Array, Float64Array
 
 BLOCK = 16  # side of the blocks in which noise is measured, pixels
-QUIET_FRACTION = 0.25  # of the blocks that has less noise than what is returned
-MAX_CLIPPED = 0.1  # fraction of black or white pixels of a block that counts
-MEDIAN_TO_SIGMA = 1.4826  # of a normal distribution
+QUIET_FRACTION = 0.25  # fraction of the blocks with less noise than the result
+MAX_CLIPPED = 0.1  # largest fraction of black or white pixels in a block that is used
+# Standard deviation of a normal distribution over its median absolute deviation.
+MEDIAN_TO_SIGMA = 1.4826
+# High-pass filter of norm 1, so that white noise keeps its standard deviation.
 RESIDUAL = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]]) / 6.0
-ROUNDING_VARIANCE = 1.0 / 12.0  # of levels
+ROUNDING_VARIANCE = 1.0 / 12.0  # variance that rounding to levels adds, squared levels
 
-NARROW = 1.0  # blur of the two copies, pixels
-WIDE = 2.0
-MIN_EDGES = 40  # fewer pixels of edges say nothing about the blur
-MIN_SLOPE = 0.15  # of an edge, as a fraction of the steepest of the image
-SHARP_FRACTION = 0.4  # of the edges that is sharper than what is returned
-MAX_BLUR = 4.0  # pixels
-CALIBRATION_SIZE = 64  # pixels of the images of edges that are known
-CALIBRATION_ANGLES = (10.0, 35.0, 65.0, 80.0)  # of these edges, degrees
+NARROW = 1.0  # blur of one copy of the image, pixels
+WIDE = 2.0  # blur of the other copy, pixels
+MIN_EDGES = 40  # smallest number of pixels of edges from which a blur is computed
+MIN_SLOPE = 0.15  # smallest slope of an edge, as a fraction of the image's steepest
+SHARP_FRACTION = 0.4  # fraction of the edges that is sharper than the result
+MAX_BLUR = 4.0  # largest blur that can be measured, pixels
+CALIBRATION_SIZE = 64  # width and height of images of edges with known blurs, pixels
+CALIBRATION_ANGLES = (10.0, 35.0, 65.0, 80.0)  # angles of these edges, degrees
 
 
 def measure_noise(levels: npt.NDArray[np.uint8]) -> Float64Array:
     """Return the standard deviation (3,) of the noise of an image, in levels.
 
-    A high-pass filter removes what is smooth. Blocks of pixels are compared, and those
-    with the smallest residuals count, since the others have texture.
+    A high-pass filter removes smooth shading. Of the blocks of pixels, those with the
+    smallest residuals are used, since the others have texture.
 
     Args:
         levels: (H, W, 3) 8-bit sRGB.
@@ -52,7 +55,6 @@ def measure_noise(levels: npt.NDArray[np.uint8]) -> Float64Array:
     sigmas = []
     for channel in range(levels.shape[2]):
         values = levels[..., channel].astype(np.float64)
-        # `RESIDUAL` has a norm of 1, so that it leaves the deviation of noise as it is
         residual = np.abs(ndimage.convolve(values, RESIDUAL)[1:-1, 1:-1])
         is_clipped = ((values == 0.0) | (values == 255.0))[1:-1, 1:-1]
         by_block = _split_blocks(residual)
@@ -62,7 +64,7 @@ def measure_noise(levels: npt.NDArray[np.uint8]) -> Float64Array:
         if len(usable):
             medians = np.median(usable, axis=1)
             sigma = MEDIAN_TO_SIGMA * float(np.quantile(medians, QUIET_FRACTION))
-        # The rounding to whole levels adds a variance of its own, which is subtracted.
+        # The variance that rounding to integer levels adds is subtracted.
         sigmas.append(np.sqrt(max(0.0, sigma**2 - ROUNDING_VARIANCE)))
     return np.array(sigmas)
 
@@ -70,8 +72,8 @@ def measure_noise(levels: npt.NDArray[np.uint8]) -> Float64Array:
 def _split_blocks(image: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
     """Return the blocks of an image (H, W) as rows (blocks, pixels).
 
-    Blocks are squares of `BLOCK` pixels; what is left at the right and the bottom is
-    cut off. A smaller image is one block.
+    Blocks are squares of `BLOCK` pixels. Incomplete blocks at the right and the bottom
+    are cut off. An image smaller than a block is one block.
     """
     rows = image.shape[0] // BLOCK
     columns = image.shape[1] // BLOCK
@@ -92,8 +94,8 @@ def make_noise(sigma: Float64Array, size: tuple[int, int], seed: int) -> Tensor:
 def measure_blur(image: Float32Array) -> float:
     """Return by how much an image is blurred beyond a rendered one, in pixels.
 
-    It is the standard deviation of a normal blur, 0 where there are too few edges. What
-    is measured on edges is looked up among measurements of edges with known blurs.
+    It is the standard deviation of a Gaussian blur, 0 if there are too few edges. The
+    measurement is corrected by a table of measurements of edges with known blurs.
 
     Args:
         image: (H, W) linear luminance.
@@ -109,22 +111,22 @@ def _measure_edges(image: Float64Array) -> float | None:
     """Return the blur of the sharper edges of an image (H, W); None if it has too few.
 
     The blur is the standard deviation of a Gaussian, in pixels. Two copies of the image
-    are blurred, by `NARROW` and by `WIDE`. The sharper an edge is, the more of its
-    slope the wide blur takes away: so the ratio of the two slopes tells the edge's own
-    blur.
+    are blurred, by `NARROW` and by `WIDE`. The sharper an edge is, the more the wide
+    blur reduces its slope. So the blur of the edge follows from the ratio of the two
+    slopes.
     """
     row_slope = np.abs(ndimage.gaussian_filter(image, NARROW, order=(1, 0)))
     column_slope = np.abs(ndimage.gaussian_filter(image, NARROW, order=(0, 1)))
     narrow = np.hypot(row_slope, column_slope)
     wide = ndimage.gaussian_gradient_magnitude(image, WIDE)
-    # An edge counts at its steepest pixel, in the direction across it.
+    # Only the steepest pixel across an edge is used.
     is_steepest_row = narrow >= ndimage.maximum_filter(narrow, size=(3, 1))
     is_steepest_column = narrow >= ndimage.maximum_filter(narrow, size=(1, 3))
     is_edge = np.where(row_slope > column_slope, is_steepest_row, is_steepest_column)
-    # Weak edges are left out. The quantile stands for the steepest slope of the image,
+    # Weak edges are left out. The quantile estimates the steepest slope of the image,
     # without outliers.
     is_edge &= narrow > MIN_SLOPE * float(np.quantile(narrow, 0.995))
-    # So near to the border the filters reach beyond it.
+    # Within this margin the filters reach beyond the border of the image.
     margin = int(3 * WIDE)
     is_edge[:margin] = is_edge[-margin:] = False
     is_edge[:, :margin] = is_edge[:, -margin:] = False
@@ -142,16 +144,16 @@ def _measure_edges(image: Float64Array) -> float | None:
 
 @lru_cache(maxsize=1)
 def _calibrate() -> tuple[Float64Array, Float64Array]:
-    """Return blurs (N,), and what `_measure_edges` gives for edges with these blurs.
+    """Return blurs (N,), and what `_measure_edges` returns for edges with these blurs.
 
     Both are in pixels. The edges are straight, at several angles, and averaged over
-    pixels as a renderer does. That blurs an edge already, so that the measurement of an
-    edge without further blur is not 0: a measurement is corrected by this table.
+    pixels as a renderer does. This average blurs an edge, so that the measurement of an
+    edge without any other blur is not 0.
     """
     oversampling = 8
     size = CALIBRATION_SIZE
     grid = (np.arange(size * oversampling) + 0.5) / oversampling - size / 2.0
-    blurs = np.arange(0.0, MAX_BLUR + 0.1, 0.25)  # up to `MAX_BLUR`, which counts
+    blurs = np.arange(0.0, MAX_BLUR + 0.1, 0.25)  # up to and including `MAX_BLUR`
     measured_blurs = np.zeros(len(blurs))
     for angle in np.radians(CALIBRATION_ANGLES):
         is_bright = grid[None] * np.cos(angle) + grid[:, None] * np.sin(angle) > 0.0
@@ -160,18 +162,20 @@ def _calibrate() -> tuple[Float64Array, Float64Array]:
         )
         for index, blur in enumerate(blurs):
             image = ndimage.gaussian_filter(pixels, blur) if blur else pixels
-            # never None: an edge across the image has enough pixels
-            measured = _measure_edges(image) or 0.0
-            measured_blurs[index] += measured / len(CALIBRATION_ANGLES)
-    # Strictly rising, as an interpolation needs it.
-    return blurs, np.maximum.accumulate(measured_blurs + 1e-9 * np.arange(len(blurs)))
+            # It is never None here, since an edge across the image has enough pixels;
+            # "or" is for the type.
+            measured_blur = _measure_edges(image) or 0.0
+            measured_blurs[index] += measured_blur / len(CALIBRATION_ANGLES)
+    # An interpolation needs strictly rising values: equal ones get tiny differences.
+    tiny_steps = 1e-9 * np.arange(len(blurs))
+    return blurs, np.maximum.accumulate(measured_blurs + tiny_steps)
 
 
 def blur_image(image: Tensor, sigma: float) -> Tensor:
     """Return an image (H, W, C) blurred by a normal distribution; differentiable.
 
-    `sigma` is its standard deviation in pixels. The image's edges are repeated beyond
-    it. One pass along columns and one along rows are the blur in two dimensions.
+    `sigma` is the standard deviation in pixels. The image is padded with its edge
+    pixels. The blur in two dimensions is one along columns, then one along rows.
     """
     radius = int(np.ceil(3.0 * sigma))
     offsets = torch.arange(-radius, radius + 1, dtype=torch.float32)

@@ -6,16 +6,16 @@ joint j at h_j:
     points = mean + sum_r c_r(gender, age, weight, height) b_r
     posed  = sum_j w_j (A_j Z_j (p - h_j) + t_j)
 
-Z_j brings the arms of MakeHuman's rest pose down and the legs together: there all
-angles are 0. A_j are the joints' turns about the body's axes (x ahead, y to its left,
-z up), from the pelvis outwards. The lowest point stands on the ground.
+Z_j brings the arms of MakeHuman's rest pose down and the legs together: in this pose
+all angles are 0. A_j are the rotations of joints about the body's axes (x ahead, y to
+its left, z up), from the pelvis outwards. The lowest point stands on the ground.
 `scenes/person.py` makes the data.
 
-Walking adds the mean angles of a gait over its cycle, as measured of adults (Winter
-1991, "The Biomechanics and Motor Control of Human Gait", chapter 2), rounded, by a
-Fourier series. A body with other proportions would hover with its standing foot, or
-drag the other through the ground. So the legs are stretched or shortened a little,
-between hip and ankle, until each foot in stance touches the ground.
+Walking adds the mean angles of a gait over its cycle, measured on adults (Winter 1991,
+"The Biomechanics and Motor Control of Human Gait", chapter 2) and rounded, as a Fourier
+series. With other body proportions the standing foot would hover, or the other foot
+would go through the ground. So the legs are stretched or shortened a little, between
+hip and ankle, until each foot in stance touches the ground.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ PHENOTYPE = (
         low=0.0,
         high=1.0,
         default=0.5,
-        text="0 is thin, 0.5 average, 1 heavy; `body.mass` says kilograms.",
+        text="0 is thin, 0.5 average, 1 heavy; `body.mass` has the kilograms.",
         search=(0.2, 0.8),
     ),
     _make_body_parameter(
@@ -78,7 +78,7 @@ PHENOTYPE = (
         low=0.0,
         high=1.0,
         default=1.0,
-        text="0 is a woman, 1 a man, between them a mixture.",
+        text="0 is a woman, 1 a man; values between are a mixture.",
         search=(0.0, 1.0),
     ),
 )
@@ -99,7 +99,7 @@ WALK = (
         low=0.0,
         high=1.3,
         default=0.0,
-        text="How far the walk swings: 0 stands, 1 is an ordinary step.",
+        text="Amplitude of the walk: 0 stands, 1 is an ordinary step.",
         search=(0.0, 1.0),
     ),
 )
@@ -148,16 +148,14 @@ GAIT = {
 """Mean angles in degrees at each tenth of a cycle from the heel strike of the same
 side.
 
-The hip's are those of the thigh against the vertical: 9 degrees less than against the
-pelvis, which is tilted ahead.
+The angle of the hip is that between the thigh and the vertical: 9 degrees less than
+the angle to the pelvis, which is tilted ahead.
 """
-STANCE = 216.0
-LIFTED = 252.0
-LOWERED = 324.0
-"""Degrees of a cycle at which the toes of a foot leave the ground, from which it
-swings, and from which it comes down; at 360 its heel strikes.
-"""
-# Stride from which both feet are put onto the ground; below, in proportion.
+STANCE = 216.0  # degrees of a cycle at which the toes of a foot leave the ground
+LIFTED = 252.0  # degrees at which the foot is fully lifted
+LOWERED = 324.0  # degrees at which it starts to come down; at 360 its heel strikes
+# Stride from which on feet are fully corrected to touch the ground. For smaller strides
+# the correction is proportional to the stride.
 FULL_CONTACT_STRIDE = 0.1
 STRAIGHT = {
     "upperarm": ("lowerarm", (0.02, 0.15, -1.0)),
@@ -165,21 +163,19 @@ STRAIGHT = {
     "thigh": ("calf", (0.0, 0.03, -1.0)),
     "calf": ("foot", (-0.03, 0.0, -1.0)),
 }
-"""For each bone the joint at its end, and its direction with all angles 0 on the
-left.
+"""For each bone the joint at its end, and its direction (x, y, z) on the left side if
+all angles are 0.
 """
 
 
 class Person:
     """A dressed person as a `MeshRig`.
 
-    Args:
-        data: the arrays of body.npz, which `scenes/person.py` makes.
-        defaults: default values that replace those of `PARAMETERS`.
-
     Attributes:
-        standing_points: (V, 3) the vertices at the defaults, metres.
-        size: their largest extent, metres.
+        data: the arrays of body.npz.
+        defaults: default values of all parameters, by name.
+        standing_points: (V, 3) the vertices at the defaults, meters.
+        size: their largest extent, meters.
     """
 
     parameters = PARAMETERS
@@ -192,12 +188,19 @@ class Person:
     ) -> None:
         """Convert the arrays to tensors, and pose the person at its defaults.
 
-        Lengths become metres. Weights, which are stored as integers, are divided so
+        Lengths become meters. Weights, which are stored as integers, are divided so
         that those of a point sum to 1.
 
         Args:
-            data: arrays of the file of a body, by name.
-            defaults: values of parameters that differ from their usual defaults.
+            data: arrays of body.npz by name, which `scenes/person.py` makes: `mean`
+                (P, 3), points of the mean body in tenths of a millimeter; `basis`
+                (R, P, 3), shapes that are added to it, in meters; `shares`
+                (G, A, W, H, R), the factor of each shape in each extreme body;
+                `stature` and `mass`, height and mass of each extreme body; `weights`
+                (P, J), skinning weights; `index` (V,), the point of each vertex;
+                `tags` and `points`, the name and the number of vertices of each piece
+                of clothing; `bones` and `parents`.
+            defaults: default values that replace those of `PARAMETERS`.
         """
         default_by_name = {
             parameter.name: float(parameter.default) for parameter in PARAMETERS
@@ -206,9 +209,6 @@ class Person:
         self.defaults = default_by_name | dict(defaults)
         self._bones = [str(bone) for bone in data["bones"]]
         self._parents = [int(parent) for parent in data["parents"]]
-        # `mean` (P, 3) are points in tenths of a millimetre, `basis` (R, P, 3) shapes
-        # by which they move, `shares` (G, A, W, H, R) the factors of the shapes in each
-        # extreme body, with `stature` and `mass`, and `index` the point of each vertex.
         weight_sums = data["weights"].sum(axis=1, keepdims=True, dtype=np.float32)
         self._tensors = {
             "mean": torch.from_numpy(data["mean"].astype(np.float32) * 1e-4),
@@ -218,8 +218,7 @@ class Person:
         } | {
             name: torch.from_numpy(data[name]) for name in ("shares", "stature", "mass")
         }
-        # Points of the left and of the right shoe; `points` is how many vertices each
-        # piece of clothing has, and `tags` what it is.
+        # Points of the left and of the right shoe.
         tag_of_vertex = np.repeat(data["tags"], data["points"])
         is_shoe = tag_of_vertex == "shoes"
         shoe_points = np.unique(data["index"][is_shoe].astype(np.int64))
@@ -240,7 +239,7 @@ class Person:
         return (posed - self.standing_points.to(posed.device)) / self.size
 
     def pose(self, values: Mapping[str, Tensor]) -> Tensor:
-        """Return the vertices (V, 3), in metres, of the person in a pose.
+        """Return the vertices (V, 3), in meters, of the person in a pose.
 
         The pelvis is above the origin, and the lowest vertex on z = 0.
 
@@ -258,21 +257,22 @@ class Person:
         if bool(number_by_name["stride"] > 0.0):
             raised = self._compute_leg_corrections(points, joints, number_by_name)
             posed = self._correct_legs(posed, rotations, translations, joints, raised)
-        # the body's origin: below the pelvis, at the height of the lowest point
+        # the origin: below the pelvis (the first bone), at the height of the lowest
+        # point
         pelvis = translations[0] + rotations[0] @ joints[0]
-        foot_point = torch.cat([pelvis[:2], posed[:, 2].amin()[None]])
-        return (scale * (posed - foot_point)).index_select(
+        origin = torch.cat([pelvis[:2], posed[:, 2].amin()[None]])
+        return (scale * (posed - origin)).index_select(
             0, self._get_tensor("index", device)
         )
 
     def _compute_leg_corrections(
         self, points: Tensor, joints: Tensor, number_by_name: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return the metres by which each foot has to rise to walk on the ground.
+        """Return by how many meters each foot has to rise to walk on the ground.
 
         With the correction, a foot in stance touches the ground. It is computed for the
-        walk alone, without the joint angles that a user sets in addition: a foot that
-        the user raises stays raised.
+        walk alone, without the joint angles that a user sets in addition. So a foot
+        that the user raises stays raised.
 
         Args:
             points: (P, 3) points of the body in the rest pose.
@@ -289,6 +289,8 @@ class Person:
         weights = self._get_tensor("weights", points.device)
         lowest_heights = dict[str, Tensor]()
         contacts = dict[str, Tensor]()
+        # The right foot is half a cycle behind the left one. (`add_walk` has shifted
+        # the joint angles already.)
         for side, phase_shift in (("l", 0.0), ("r", 180.0)):
             shoe = self._get_tensor(f"shoe_{side}", points.device)
             shoe_points = skin_points(
@@ -296,8 +298,8 @@ class Person:
             )
             lowest_heights[side] = shoe_points[:, 2].amin()
             contacts[side] = compute_contact(number_by_name["walk"] + phase_shift)
-        amount = (number_by_name["stride"] / FULL_CONTACT_STRIDE).clamp(max=1.0)
-        return _correct_heights(lowest_heights, contacts, amount)
+        fraction = (number_by_name["stride"] / FULL_CONTACT_STRIDE).clamp(max=1.0)
+        return _compute_rises(lowest_heights, contacts, fraction)
 
     def _correct_legs(
         self,
@@ -309,17 +311,17 @@ class Person:
     ) -> Tensor:
         """Return posed points (P, 3) with raised feet and legs stretched to them.
 
-        A point of the foot rises by all of the foot's rise. A point of the leg rises by
-        a fraction of it, from 0 at the hip to 1 at the ankle. Each rise is multiplied
-        by the point's skinning weight for these bones, so that the rest of the body
-        stays as it is.
+        A point of the foot rises by the foot's rise. A point of the leg rises by a
+        fraction of it, from 0 at the hip to 1 at the ankle. Each rise is multiplied by
+        the point's skinning weight for these bones, so that the rest of the body does
+        not move.
 
         Args:
             posed: (P, 3) points after skinning.
             rotations: (J, 3, 3) rotations of the bones.
             translations: (J, 3): a point p of a bone moves to rotation p + translation.
             joints: (J, 3) positions of the joints in the rest pose.
-            foot_rises: metres by which the left ("l") and the right foot ("r") rise.
+            foot_rises: meters by which the left ("l") and the right foot ("r") rise.
         """
         weights = self._get_tensor("weights", posed.device)
         rise = torch.zeros_like(posed[:, 2])
@@ -328,7 +330,7 @@ class Person:
                 self._bones.index(f"{bone}_{side}")
                 for bone in ("thigh", "calf", "foot")
             )
-            # where skinning puts the joints at the upper ends of thigh and foot
+            # heights of the joints at the upper ends of thigh and foot
             hip_height = (rotations[thigh] @ joints[thigh] + translations[thigh])[2]
             ankle_height = (rotations[foot] @ joints[foot] + translations[foot])[2]
             # 0 at the hip, 1 at the ankle
@@ -372,7 +374,7 @@ class Person:
     def _mix_phenotype(
         self, number_by_name: Mapping[str, Tensor]
     ) -> tuple[Tensor, Tensor]:
-        """Return the mixture of extreme bodies, and the scale that it still needs.
+        """Return the mixture of extreme bodies, and the scale to the requested height.
 
         Args:
             number_by_name: scalar tensors of the parameters; gender, age, weight and
@@ -393,7 +395,7 @@ class Person:
             number_by_name["weight"],
             number_by_name["weight"].new_tensor([0.0, 0.5, 1.0]),
         )
-        # The mixture (G, A, W) without the height, and the heights (H,) in metres of
+        # The mixture (G, A, W) without the height, and the heights (H,) in meters of
         # the shortest, the average and the tallest body of that mixture.
         mixture = torch.einsum(
             "g,a,w->gaw", gender_weights, age_weights, weight_weights
@@ -475,8 +477,8 @@ class Person:
         """Return the rotations (3, 3) of limbs from the rest pose to all angles 0.
 
         A bone goes from its joint to the next one. Its rotation is the smallest that
-        turns it to its direction in `STRAIGHT`. Hands follow the forearm, and are also
-        rotated by 60 degrees about the vertical.
+        rotates it to its direction in `STRAIGHT`. Hands follow the forearm, and are
+        also rotated by 60 degrees about the vertical.
 
         Args:
             joints: (J, 3) positions in the rest pose.
@@ -486,17 +488,16 @@ class Person:
         """
         rotations = dict[str, Tensor]()
         for side, sign in (("l", 1.0), ("r", -1.0)):
-            for bone, (end, (x, y, z)) in STRAIGHT.items():
-                start_point, end_point = (
-                    joints[self._bones.index(f"{name}_{side}")] for name in (bone, end)
-                )
+            for bone, (end_joint, (x, y, z)) in STRAIGHT.items():
+                start_point = joints[self._bones.index(f"{bone}_{side}")]
+                end_point = joints[self._bones.index(f"{end_joint}_{side}")]
+                # the right side is the mirror image of the left
+                straight_direction = joints.new_tensor([x, sign * y, z])
                 rotations[f"{bone}_{side}"] = compute_least_rotation(
-                    end_point - start_point, joints.new_tensor([x, sign * y, z])
+                    end_point - start_point, straight_direction
                 )
-            rotations[f"hand_{side}"] = (
-                make_axis_rotation("z", joints.new_tensor(sign * 60.0))
-                @ rotations[f"lowerarm_{side}"]
-            )
+            hand_turn = make_axis_rotation("z", joints.new_tensor(sign * 60.0))
+            rotations[f"hand_{side}"] = hand_turn @ rotations[f"lowerarm_{side}"]
         return rotations
 
 
@@ -595,14 +596,14 @@ def _compute_gait_angle(
 
 
 def compute_contact(phase: Tensor) -> Tensor:
-    """Return how much a foot is held to the ground: 1 while it stands, 0 in its swing.
+    """Return the contact of a foot with the ground: 1 while it stands, 0 in its swing.
 
-    Between them lies half a cosine wave. `phase` is in degrees of the foot's cycle from
-    its heel strike: it stands up to `STANCE`, swings from `LIFTED` to `LOWERED`, and
-    stands again at 360.
+    Between these it is half a cosine wave. `phase` is in degrees of the foot's cycle
+    from its heel strike: the foot stands up to `STANCE`, swings from `LIFTED` to
+    `LOWERED`, and stands again at 360.
     """
     degrees = torch.remainder(phase, 360.0)
-    # each rises from 0 to 1 while the foot is lifted, or lowered
+    # `lifted` rises from 0 to 1 while the foot is lifted, `lowered` while it is lowered
     lifted = ((degrees - STANCE) / (LIFTED - STANCE)).clamp(0.0, 1.0)
     lowered = ((degrees - LOWERED) / (360.0 - LOWERED)).clamp(0.0, 1.0)
     return 0.5 + 0.5 * torch.cos(np.pi * (lifted - lowered))
@@ -632,28 +633,30 @@ def skin_points(
     )
 
 
-def _correct_heights(
-    lowest: Mapping[str, Tensor], contact: Mapping[str, Tensor], amount: Tensor
+def _compute_rises(
+    lowest: Mapping[str, Tensor], contact: Mapping[str, Tensor], fraction: Tensor
 ) -> dict[str, Tensor]:
-    """Return how much each foot has to rise to touch the ground, "l" and "r".
+    """Return by how many meters each foot has to rise to touch the ground.
 
     The ground is assumed at the mean height of both feet, weighted by contact. A foot
     with full contact is moved to the ground. A foot without contact keeps its height
-    above the ground, but is not left below it. In between it is in proportion. A
-    negative rise lowers the foot.
+    above the ground, but is not left below it. With a partial contact, it keeps a
+    proportional part of its height. A negative rise lowers the foot.
 
     Args:
-        lowest: height in metres of the lowest point of each foot, "l" and "r".
-        contact: contact of each foot with the ground, 0 to 1.
-        amount: () fraction of the correction that is made.
+        lowest: height in meters of the lowest point of each foot, "l" and "r".
+        contact: contact of each foot with the ground, from 0 to 1. At least one foot
+            has contact, since the feet are half a cycle apart.
+        fraction: () fraction of the correction that is applied.
     """
     ground_height = (contact["l"] * lowest["l"] + contact["r"] * lowest["r"]) / (
         contact["l"] + contact["r"]
     )
     rises = dict[str, Tensor]()
     for side, height in lowest.items():
-        clearance = (height - ground_height).clamp(min=0.0) * (1.0 - contact[side])
-        rises[side] = amount * (ground_height + clearance - height)
+        height_above_ground = (height - ground_height).clamp(min=0.0)
+        clearance = height_above_ground * (1.0 - contact[side])
+        rises[side] = fraction * (ground_height + clearance - height)
     return rises
 
 
@@ -666,7 +669,7 @@ def compute_joint_turns(angle: Mapping[str, Tensor]) -> dict[str, Tensor]:
     Args:
         angle: degrees by parameter, such as "left_knee".
     """
-    # The back bends in three equal parts; neck and head have a half each.
+    # The back bends in three equal parts; neck and head bend by half of the angle each.
     spine, side, turn = (
         angle[name] / 3.0 for name in ("spine", "spine_side", "spine_turn")
     )

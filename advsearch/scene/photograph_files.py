@@ -1,8 +1,8 @@
 """Photographs with a camera file beside them, and folders of such photographs.
 
-``desk.yaml`` beside ``desk.jpg`` is a camera file of any kind that is read. It may also
-state what no lens has (`VIEW_KEYS`): the pose of the object, the part of the photograph
-to use, settings of the scene, and a mask of what is before the object.
+``desk.yaml`` beside ``desk.jpg`` is a camera file in any supported format. It may have
+further entries (`VIEW_KEYS`): the pose of the object, the part of the photograph to use,
+settings of the scene, and a mask of what is in front of the object.
 """
 
 from __future__ import annotations
@@ -33,25 +33,26 @@ from advsearch.trust.stored_files import (
 
 CAMERA_SUFFIXES = (".yaml", ".yml", ".json")
 PHOTOGRAPH_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff")
-MAX_PHOTOGRAPHS = 1000  # of a folder
-MAX_FILES = 100_000  # of all kinds in a folder
-MAX_FOLDER_PIXELS = 1 << 28  # of all photographs of a folder, three bytes each
+MAX_PHOTOGRAPHS = 1000  # limit of the photographs of a folder
+MAX_FILES = 100_000  # limit of the files of all kinds in a folder
+# Limit of the pixels of all photographs of a folder, which take three bytes each.
+MAX_FOLDER_PIXELS = 1 << 28
 VIEW_SETTINGS = ("camera.", "pose.", "ground.", "backdrop.")
-"""How names of settings begin that a camera file may state."""
+"""Prefixes of the settings that a camera file may state."""
 
 
 @dataclass(frozen=True, eq=False)
 class PhotographView:
-    """A photograph, and what the file beside it states.
+    """A photograph, and the entries of the camera file beside it.
 
     Attributes:
         spec: the photograph, and perhaps the part of it, ``desk.jpg#X,Y,WIDTH,HEIGHT``.
         file: its camera file; "" if there is none.
         camera: the camera file, if it has a lens; else None.
-        settings: settings of the scene.
+        settings: settings of the scene that the file states.
         object_to_camera: pose (4, 4) of the object; None if it is not stated.
-        up: direction (3,) in the camera's coordinates; None if it is not stated.
-        occluder: mask of what is before the object; None if there is none.
+        up: upwards direction (3,) in the camera's coordinates; None if not stated.
+        occluder: path of a mask of what is in front of the object, or None.
     """
 
     spec: str
@@ -64,18 +65,21 @@ class PhotographView:
 
     @property
     def stated_names(self) -> frozenset[str]:
-        """The kinds of statements that the file makes, and the settings by name."""
-        stated = {
+        """Names of the entries and of the settings that the file states.
+
+        They are used in messages: a lens, which may have any entries, is "a lens".
+        """
+        value_by_name = {
             "a lens": self.camera,
             "object_to_camera": self.object_to_camera,
             "up": self.up,
         }
-        names = {name for name, value in stated.items() if value is not None}
-        return frozenset(names | set(self.settings))
+        stated = {name for name, value in value_by_name.items() if value is not None}
+        return frozenset(stated | set(self.settings))
 
     @property
     def replaced_settings(self) -> tuple[str, ...]:
-        """How names of settings begin that are about another view than this one."""
+        """Prefixes of settings that the file replaces, such as "camera."."""
         groups = {name.partition(".")[0] for name in self.settings}
         if self.object_to_camera is not None:
             groups |= {"camera", "pose", "ground"}
@@ -91,32 +95,33 @@ def is_photograph_folder(spec: object) -> bool:
 
 
 def read_photograph_view(spec: str | Path) -> PhotographView:
-    """Read what the camera file beside a photograph states, if there is one.
+    """Read the camera file beside a photograph, if there is one.
 
     The photograph itself is not read.
 
     Args:
         spec: a picture file, perhaps with the part to use,
-            ``photo.jpg#X,Y,WIDTH,HEIGHT``, which replaces the part that the camera file
-            states.
+            ``photo.jpg#X,Y,WIDTH,HEIGHT``. This part replaces one in the camera file.
 
     Raises:
         FileFormatError: the file cannot be used.
     """
-    part = CROP.fullmatch(str(spec))
-    path = Path(part["path"] if part else spec)
+    part_match = CROP.fullmatch(str(spec))
+    path = Path(part_match["path"] if part_match else spec)
     file = find_camera_file(path)
     if file is None:
         return PhotographView(str(spec))
+    # The camera file is recorded as one of the photograph's files.
     with track_opened_files(path):
         record_opened(file)
         entries = read_camera_entries(str(file))
+    # Its `spec` has the part that the camera file states.
     view = _parse_view(file, path, entries)
-    return replace(view, spec=str(spec)) if part else view
+    return replace(view, spec=str(spec)) if part_match else view
 
 
 def find_camera_file(photograph: Path) -> Path | None:
-    """Return the camera file beside a photograph, which is called as it is; or None."""
+    """Return the camera file beside a photograph: ``desk.yaml`` for ``desk.jpg``."""
     for suffix in CAMERA_SUFFIXES:
         file = photograph.with_suffix(suffix)
         if file != photograph and file.is_file():
@@ -134,16 +139,15 @@ def read_photograph_folder(
     Args:
         folder: the folder.
         has_camera: whether the user names a camera, or one file with the cameras of all
-            photographs; then they need none beside them.
+            photographs. Then photographs need no camera files.
 
     Returns:
         The views by the name of the photograph's file, in alphabetical order.
 
     Raises:
         FileFormatError: there are no photographs or too many, or they have too many
-            pixels; a camera file is missing, or does not state the same kinds of
-            things as the first one; a link leads out of the folder; or a file cannot
-            be used.
+            pixels; a camera file is missing, or has other entries than the first one; a
+            link leads out of the folder; or a file cannot be used.
     """
     directory = Path(folder)
     views: dict[str, PhotographView] = {}
@@ -153,8 +157,8 @@ def read_photograph_folder(
         if file is None and not has_camera:
             raise FileFormatError(
                 f"{path}: expected its camera file beside it, such as "
-                f"{path.with_suffix('.yaml').name}, got none; add it, take the "
-                "photograph out of the folder, or give `camera` for all of them"
+                f"{path.with_suffix('.yaml').name}, got none; add it, remove the "
+                "photograph from the folder, or set `camera` for all of them"
             )
         _check_inside(path, directory)
         if file is not None:
@@ -197,25 +201,27 @@ def _check_inside(path: Path, folder: Path) -> None:
     """Raise FileFormatError if a file of a folder is a link that leads out of it."""
     if not is_inside(path, folder):
         raise FileFormatError(
-            f"{path}: leads out of its folder, which only files inside it may; copy it"
+            f"{path}: is a link out of its folder, which is not followed; copy the file"
         )
 
 
 def _check_same_statements(view: PhotographView, first: PhotographView) -> None:
-    """Raise FileFormatError if a camera file states other things than the first one.
+    """Raise FileFormatError unless two camera files state the same names.
 
-    What only some of the files state would be unknown for the other photographs.
+    Values that only one of the files states would be unknown for the other photograph.
     """
-    for file, other in ((view, first), (first, view)):
-        missing = sorted(other.stated_names - file.stated_names)
+    for checked_view, other_view in ((view, first), (first, view)):
+        missing = sorted(other_view.stated_names - checked_view.stated_names)
         if missing:
+            # A photograph without a camera file is named itself.
+            path = checked_view.file or checked_view.spec
             raise FileFormatError(
-                f"{file.file or file.spec}: expected {missing[0]}, which "
-                f"{Path(other.file).name} states; add it"
+                f"{path}: expected {missing[0]}, which {Path(other_view.file).name} "
+                "states; add it"
             )
 
 
-# ---- what a camera file states beside its lens
+# ---- entries of a camera file that are not about the lens
 
 
 def _parse_view(
@@ -229,13 +235,14 @@ def _parse_view(
         entries: entries of the camera file, by name.
     """
     stated = {name: entries[name] for name in VIEW_KEYS & entries.keys()}
-    has_lens = bool(entries.keys() - VIEW_KEYS)  # all else is about the lens
+    has_lens = bool(entries.keys() - VIEW_KEYS)  # all other entries are about the lens
     pose = None
     if "object_to_camera" in stated:
         numbers = _parse_numbers(file, "object_to_camera", stated, (12, 16))
-        # the last row may be left out: it stays that of a pose
+        # The last row of a pose is always 0 0 0 1, and may be left out.
         pose = np.eye(4)
-        pose[: len(numbers) // 4] = numbers.reshape(-1, 4)
+        n_rows = len(numbers) // 4
+        pose[:n_rows] = numbers.reshape(-1, 4)
     spec = str(photograph)
     if "part" in stated:
         part = _parse_numbers(file, "part", stated, (4,))
@@ -265,10 +272,11 @@ def _parse_numbers(
         file: path of the camera file, for messages.
         name: name of the entry.
         stated: entries of the file, by name.
-        counts: how many numbers it may have, such as (12, 16).
+        counts: the numbers of values that it may have, such as (12, 16).
 
     Raises:
-        FileFormatError: it has another number of numbers, or other values.
+        FileFormatError: it has another number of values, or values that are no finite
+            numbers.
     """
     value = stated[name]
     if isinstance(value, Mapping):  # a matrix as OpenCV writes it
@@ -294,8 +302,9 @@ def _parse_settings(file: Path, stated: object) -> dict[str, float]:
         file: path of the camera file, for messages.
         stated: the entry: settings by name, such as {"ground.level": 0.2}.
 
-    Raises FileFormatError: it has other settings than those of the view, or values out
-    of their range.
+    Raises:
+        FileFormatError: it has other settings than those of the view, or values out of
+            their range.
     """
     if not isinstance(stated, Mapping):
         raise FileFormatError(f"{file}: set: expected settings by name")
@@ -309,6 +318,7 @@ def _parse_settings(file: Path, stated: object) -> dict[str, float]:
         values = resolve_settings(stated)
     except InputError as error:
         raise FileFormatError(f"{file}: {error}") from None
+    # A stated value is never None; "or" is for the type.
     return {str(name): float(values[name] or 0.0) for name in stated}
 
 
@@ -336,41 +346,45 @@ def put_into_photograph(
 ) -> SceneDescription:
     """Return a scene as it is rendered into a photograph.
 
-    Settings that the user requested of the scene stay.
+    Settings of the scene that the user requested are not replaced.
 
     Args:
         description: the scene.
-        view: the photograph, and what its camera file states.
-        camera: replaces the camera of the camera file: a camera file or a name, or the
-            cameras of many photographs, of which that of this photograph is taken.
-        occluder: replaces the mask of what is before the object.
+        view: the photograph, and the entries of its camera file.
+        camera: replaces the camera of the camera file. It is a camera file, the name of
+            a camera, or the cameras of many photographs, which are looked up by the
+            photograph. Names of the latter's files are accepted, too.
+        occluder: replaces the mask of what is in front of the object.
 
     Raises:
         FileFormatError: a file cannot be used.
-        InputError: what is stated contradicts the scene.
+        InputError: the entries contradict the scene.
     """
     stated = {
         name: value
         for name, value in view.settings.items()
         if name not in description.requested
     }
-    # What the file states counts as requested by the user, so that a control may not
-    # vary the ground, for example. Camera and pose may be varied.
+    # Controls (the parameters that a search varies) must not vary settings that the
+    # user requested. Settings of the file are protected like these, except for those of
+    # camera and pose.
     fixed = {name for name in stated if not name.startswith(("camera.", "pose."))}
     scene = replace(
         description,
         values={**description.values, **stated},
         requested=description.requested | fixed,
     )
-    camera = camera or view.camera
-    photograph = find_photograph_file(view.spec)
-    if isinstance(camera, str):
-        with track_opened_files(photograph or camera):
-            camera = read_photograph_cameras(camera) or camera
-    if isinstance(camera, str):
-        scene = scene.with_camera(camera)
-    elif camera is not None and photograph is not None:
-        scene = scene.with_photograph_camera(camera, photograph)
+    requested_camera = camera or view.camera
+    photograph = find_photograph_file(view.spec)  # `spec` is a path: never None here
+    cameras = requested_camera
+    if isinstance(requested_camera, str):
+        # A file may have the cameras of many photographs; otherwise it is one camera.
+        with track_opened_files(photograph or requested_camera):
+            cameras = read_photograph_cameras(requested_camera) or requested_camera
+    if isinstance(cameras, str):
+        scene = scene.with_camera(cameras)
+    elif cameras is not None and photograph is not None:
+        scene = scene.with_photograph_camera(cameras, photograph)
     scene = scene.with_backdrop(view.spec, occluder or view.occluder)
     if view.object_to_camera is None:
         return scene

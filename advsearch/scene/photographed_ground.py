@@ -1,4 +1,4 @@
-"""The ground that shows the photograph of an environment's map."""
+"""A ground plane with the photographed floor of an environment map."""
 
 from __future__ import annotations
 
@@ -14,40 +14,35 @@ from advsearch.scene.assets import EnvironmentAsset, Float32Array, Mesh
 
 N_SECTORS = 128
 N_RINGS = 64
-MIN_RING_RADIUS = 0.01
+MIN_RING_RADIUS = 0.01  # radius of the innermost ring of vertices, in camera heights
+# Radius of the outermost ring, in camera heights. Beyond it the map itself is visible,
+# less than 0.06 degrees below the horizon.
 MAX_RING_RADIUS = 1000.0
-"""Radii of the innermost and the outermost ring of vertices, in heights of the camera.
-Beyond, the map itself is seen, less than 0.06 degrees below the horizon.
-"""
 
 
 class Photograph:
-    """The ground that shows the photograph of an equirectangular map.
+    """A ground plane with the photographed floor of an equirectangular map.
 
-    It catches what the scene does to the light of the map.
+    The object's shadow and reflected light change the plane, as they would change the
+    photographed floor.
 
-    A photographed environment shows the floor that its camera stood on. That part of
-    the map is projected from the height of the camera onto the plane z = 0, and the
-    plane gets the reflectance that shows the photograph where nothing is in the way of
-    the light:
+    A photographed environment includes the floor on which its camera stood. That part
+    of the map is projected from the height of the camera onto the plane z = 0. The
+    reflectance of the plane is such that it looks as photographed where the scene does
+    not change the light:
 
         reflectance(p) = pi map(from (0, 0, height) to p) / E
         E = irradiance of the map's upper half on the plane
 
-    A diffuse surface in the irradiance E' looks like `reflectance E' / pi = map E' /
-    E`: the photograph times what the scene leaves of the light, and adds to it. That is
-    the quotient form of differential rendering (Debevec, Rendering synthetic objects
-    into real scenes, SIGGRAPH 1998, section 5) in one render instead of two, and an
-    ordinary scene: every derivative, guide and mask is that of a plane with a texture.
+    The radiance of a diffuse surface with the irradiance E' is `reflectance E' / pi =
+    map E' / E`: the photograph times the ratio of the light in the scene to that of the
+    map. That is the quotient form of differential rendering (Debevec, Rendering
+    synthetic objects into real scenes, SIGGRAPH 1998, section 5) in one render instead
+    of two. Derivatives, guides and masks are those of an ordinary plane with a texture.
 
-    Where the photograph shows what is brighter than a white floor in this light, a
-    lamp, a window low down or its reflection, the reflectance is above 1. Such texels
-    still look as photographed.
-
-    Args:
-        radiance: (H, W, 3) linear radiance of the map, row 0 straight up.
-        height: height of the camera above the ground, object sizes.
-        rotation: rotation of the map about the vertical, degrees.
+    The reflectance is above 1 where the photograph is brighter than a white floor in
+    this light: at a lamp, a low window or its reflection. Such texels look as
+    photographed, too.
 
     Attributes:
         mesh: the plane.
@@ -55,7 +50,14 @@ class Photograph:
     """
 
     def __init__(self, radiance: Float32Array, height: float, rotation: float) -> None:
-        """Make the plane and its texture; arguments are those of the class."""
+        """Make the plane and its texture.
+
+        Args:
+            radiance: (H, W, 3) linear radiance of the map, row 0 straight up.
+            height: height of the camera above the ground, object sizes.
+            rotation: rotation of the map about the vertical, degrees.
+        """
+        # The methods below use these two rows.
         self._map_rows = radiance.shape[0]
         # the last row at or above the horizon, where the plane's texture begins
         self._horizon_row = (self._map_rows - 1) // 2
@@ -81,16 +83,18 @@ class Photograph:
         )
         map_columns = np.linspace(0.0, 1.0, N_SECTORS + 1)
         radius, map_column = np.meshgrid(radii, map_columns, indexing="ij")
+        # Columns of a map begin at +y, and continue over +x, -y and -x.
         azimuth = 0.5 * math.pi - 2.0 * math.pi * map_column + math.radians(rotation)
         vertices = height * np.stack(
             [radius * np.cos(azimuth), radius * np.sin(azimuth), np.zeros_like(radius)],
             axis=-1,
         )
-        # The map's first row is straight up, its last one straight down.
+        # The center of the map's first row is straight up, that of its last row
+        # straight down.
         angle_from_up = math.pi - np.arctan(radius)
         map_row = angle_from_up / math.pi * (self._map_rows - 1)
-        # The texture's rows begin at the horizon. v is 1 at its upper border, which is
-        # half a row above the center of row 0.
+        # The texture's rows begin at the horizon. Its rows have borders half a row from
+        # their centers: v is 1 at the upper border of row 0.
         texture_row = map_row - self._horizon_row
         n_texture_rows = self._map_rows - self._horizon_row
         v = 1.0 - (texture_row + 0.5) / n_texture_rows
@@ -115,7 +119,7 @@ class Photograph:
         from above. The result is differentiable.
         """
         rows = radiance.shape[0]
-        # where the rows of the plane's own map lie in this one
+        # the rows of the plane's map, as rows of this one
         map_row = torch.arange(
             self._horizon_row, self._map_rows, device=radiance.device
         ) * ((rows - 1) / (self._map_rows - 1))
@@ -134,9 +138,10 @@ class Photograph:
 def _make_ring_faces() -> npt.NDArray[np.uint32]:
     """Return the faces (F, 3) of the rings around the point below the camera.
 
-    Between two rings each sector is two triangles. Vertices lie ring by ring, each of
-    `N_SECTORS` + 1, the last at the position of the first. The first ring has a radius
-    of 0, so that its sectors are one triangle each: the other would have no area.
+    Between two rings each sector has two triangles. Vertices are stored ring by ring.
+    Each ring has `N_SECTORS` + 1, of which the last is at the position of the first.
+    The first ring has a radius of 0, so that its sectors have one triangle each: the
+    other one would have no area.
     """
     ring_starts = np.arange(N_RINGS)[:, None] * (N_SECTORS + 1)
     inner = (ring_starts + np.arange(N_SECTORS)).ravel()

@@ -1,15 +1,16 @@
-"""Rasterise triangles, for silhouettes, texture charts and baked textures.
+"""Rasterization of triangles, for silhouettes, texture charts and baked textures.
 
-Each triangle is cut into the spans of rows that it crosses, and each span into pixels.
+Each triangle is divided into its spans in the rows that it crosses, and each span into
+pixels.
 
 `Charts` has the position on a mesh of each texel of its texture: the UV charts
-rasterised at the texel centers. Row 0 is at v = 1, as in all our textures. A texel
-belongs to the triangle that its center lies in; one that no chart covers has the values
-of the nearest covered texel, so that bilinear look-ups at a chart's border find values
-that continue it.
+rasterized at the texel centers. Row 0 is at v = 1, as in all our textures. A texel
+belongs to the triangle that contains its center. A texel outside of all charts has the
+values of the nearest covered texel, so that bilinear look-ups at a chart's border read
+values that continue the chart.
 
-`MeshSurface` finds points on a mesh by rays and the connected region around them, for
-patches.
+`MeshSurface` finds points on a mesh by rays, and the connected region around a point,
+for patches.
 """
 
 from __future__ import annotations
@@ -31,12 +32,11 @@ from advsearch.scene.assets import (
 )
 from advsearch.scene.importing.geometry import find_components
 
-# barycentric weight by which a pixel's center may miss a triangle, so that shared edges
-# leave no gaps
+# Barycentric weight by which a pixel's center may miss a triangle, so that shared edges
+# leave no gaps.
 TOLERANCE = 1e-6
-PIXEL_TOLERANCE = (
-    1e-4  # pixels by which a center may miss a triangle and still be a candidate
-)
+# Pixels by which a center may miss a triangle and still be a candidate.
+PIXEL_TOLERANCE = 1e-4
 
 
 def rasterize_triangles(
@@ -67,10 +67,10 @@ def find_candidate_pixels(
 ) -> tuple[IntArray, IntArray, IntArray]:
     """List the pixels whose centers lie in triangles, or almost.
 
-    A triangle without area has pixels too: those along its line.
+    A triangle without area has pixels, too: those along its line.
 
     Args:
-        corners: (F, 3, 2) columns and rows of the triangles' corners, whole at pixel
+        corners: (F, 3, 2) columns and rows of the triangles' corners, integers at pixel
             centers.
         shape: height and width of the raster.
         tolerance: pixels along the row or column by which a center may miss a triangle.
@@ -91,35 +91,51 @@ def find_read_texels(corners: Float64Array, shape: tuple[int, int]) -> BoolArray
 
     A look-up at a point reads the four texels around it: those at its row and column
     rounded down, and the next ones. The square between the centers of these four is
-    called a cell here, and has the index of the first. First the cells that a triangle
-    touches are found, then the four texels of each. The texture repeats at its border.
+    called a cell here. First the cells that a triangle touches are found, then the four
+    texels of each. The texture repeats at its border.
 
     Args:
-        corners: (F, 3, 2) column and row of each corner, whole at texel centers, and at
-            most half a texel outside of the texture.
+        corners: (F, 3, 2) column and row of each corner, integers at texel centers, and
+            at most half a texel outside of the texture.
         shape: height and width of the texture.
     """
-    # The first cell begins at texel -1, which is the last texel again, since the
-    # texture repeats. A shift by 1 lets the indices of cells begin at 0.
-    shifted = corners + 1.0
-    lowest_row = np.floor(shifted[..., 1].min(axis=1) - PIXEL_TOLERANCE)
-    highest_row = np.floor(shifted[..., 1].max(axis=1) + PIXEL_TOLERANCE)
-    face, row = _list_integers_within(lowest_row, highest_row, shape[0] + 1, 0.0)
-    left, right = _find_column_span(shifted[face], row)
-    span, column = _list_integers_within(
-        np.floor(left - PIXEL_TOLERANCE),
-        np.floor(right + PIXEL_TOLERANCE),
-        shape[1] + 1,
-        0.0,
-    )
+    height, width = shape
+    cell_row, cell_column = _find_touched_cells(corners, shape)
     is_read = np.zeros(shape, np.bool_)
-    for row_offset in (0, 1):
-        for column_offset in (0, 1):
-            # back from the shifted index of the cell
-            read_row = (row[span] - 1 + row_offset) % shape[0]
-            read_column = (column - 1 + column_offset) % shape[1]
-            is_read[read_row, read_column] = True
+    for read_row in (cell_row - 1, cell_row):
+        for read_column in (cell_column - 1, cell_column):
+            is_read[read_row % height, read_column % width] = True
     return is_read
+
+
+def _find_touched_cells(
+    corners: Float64Array, shape: tuple[int, int]
+) -> tuple[IntArray, IntArray]:
+    """Return the row and the column of each cell that a triangle touches.
+
+    Cell i of a row is between the centers of the texels i - 1 and i. So the cells are 0
+    to the width of the texture. At both ends, one of the two texels is at the opposite
+    edge, since the texture repeats.
+
+    Args:
+        corners: (F, 3, 2) column and row of each corner, integers at texel centers.
+        shape: height and width of the texture.
+    """
+    height, width = shape
+    # In coordinates of cells, cell i is from i to i + 1.
+    cell_corners = corners + 1.0
+    # (F,) first and last row of cells that each triangle touches
+    first_row = np.floor(cell_corners[..., 1].min(axis=1) - PIXEL_TOLERANCE)
+    last_row = np.floor(cell_corners[..., 1].max(axis=1) + PIXEL_TOLERANCE)
+    face, row = _list_integers_within(first_row, last_row, height + 1, tolerance=0.0)
+    # Each entry is a triangle in one row of cells. It touches a range of columns.
+    left, right = _find_column_span(cell_corners[face], row)
+    first_column = np.floor(left - PIXEL_TOLERANCE)
+    last_column = np.floor(right + PIXEL_TOLERANCE)
+    entry, column = _list_integers_within(
+        first_column, last_column, width + 1, tolerance=0.0
+    )
+    return row[entry], column
 
 
 def _find_column_span(
@@ -158,8 +174,8 @@ def compute_barycentric(
     """Return the barycentric weights (N, 3) of points in triangles (N, 3, 2).
 
     A corner's weight is the area between the point and the opposite side, as a fraction
-    of the triangle's. Inside all three are in [0, 1]; outside at least one is negative.
-    The weights in a triangle without area are NaN or infinite.
+    of the triangle's. Inside the triangle all three weights are in [0, 1]; outside at
+    least one is negative. The weights in a triangle without area are NaN or infinite.
 
     Args:
         corners: (N, 3, 2) columns and rows of the corners.
@@ -189,11 +205,11 @@ def _list_integers_within(
     """List the integers in each of N intervals, one interval after the other.
 
     Args:
-        lower: (N,) lower ends of the intervals.
-        upper: (N,) upper ends. An interval whose upper end is below its lower end is
-            empty.
+        lower: (N,) lower bounds of the intervals.
+        upper: (N,) upper bounds. An interval whose upper bound is below its lower bound
+            is empty.
         size: integers outside of [0, size - 1] are left out.
-        tolerance: by how much each interval is wider on both sides.
+        tolerance: distance by which each interval is widened on both sides.
 
     Returns:
         For each integer the index of its interval (K,), and the integer (K,).
@@ -213,10 +229,10 @@ def _cross_rows(
 ) -> tuple[Float64Array, Float64Array]:
     """Return the first and last column (N,) of triangles (N, 3, 2) on rows (N,).
 
-    They are where the triangle's edges cross its row. An edge that ends less than
-    `tolerance` before the row counts as crossing it at that end. Level edges are left
-    out, since the other two edges end where they do. If no edge crosses the row, the
-    range is empty: the first column is 0 and the last -1.
+    These are the columns at which the triangle's edges cross its row. An edge that ends
+    less than `tolerance` before the row is regarded as crossing it at that end. Level
+    edges are left out, since the other two edges have the same ends. If no edge crosses
+    the row, the range is empty: the first column is 0 and the last -1.
     """
     left = np.full(len(row), np.inf)
     right = np.full(len(row), -np.inf)
@@ -224,7 +240,7 @@ def _cross_rows(
         x0, y0 = corners[:, start_corner].T
         x1, y1 = corners[:, end_corner].T
         rise = y1 - y0
-        # how far along the edge the row is; any number for a level edge
+        # fraction of the edge at which the row is; any number for a level edge
         fraction = np.clip((row - y0) / np.where(rise == 0.0, 1.0, rise), 0.0, 1.0)
         crosses = (
             (np.minimum(y0, y1) - tolerance <= row)
@@ -238,32 +254,30 @@ def _cross_rows(
     return np.where(is_empty, 0.0, left), np.where(is_empty, -1.0, right)
 
 
-# texels around a chart that belong to it: a bilinear look-up inside reads one texel
-# beyond it
+# Distance from a chart, in texels, up to which texels belong to it: a bilinear look-up
+# inside of the chart reads one texel beyond it.
 BORDER_TEXELS = 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class Charts:
-    """The rasterised charts of a mesh."""
+    """The rasterized charts of a mesh."""
 
     mesh: Mesh
-    # (h, w) of the face that each texel lies in; uncovered texels have that of the
-    # nearest covered one
+    # (h, w) index of the face that contains each texel's center. A texel outside of all
+    # charts has the face of the nearest covered texel.
     face: IntArray
     # (h, w, 3) barycentric weights of the face's three corners, at least 0, adding up
     # to 1
     weights: Float64Array
-    is_covered: BoolArray  # (h, w) the texel's center lies in a chart
-    distance: (
-        Float64Array  # (h, w) texels to the nearest covered texel; 0 where covered
-    )
+    is_covered: BoolArray  # (h, w) whether the texel's center is in a chart
+    distance: Float64Array  # (h, w) texels to the nearest covered texel, which have 0
 
     @property
     def is_readable(self) -> BoolArray:
         """(h, w) whether a look-up on the surface can read the texel.
 
-        It is in a chart or `BORDER_TEXELS` texels around one.
+        Such a texel is in a chart, or at most `BORDER_TEXELS` texels from one.
         """
         return np.asarray(self.distance <= BORDER_TEXELS)
 
@@ -275,9 +289,7 @@ class Charts:
         )
 
     def compute_normals(self) -> Float32Array:
-        """Return (h, w, 3) unit shading normals; those of faces where normals cancel
-        out.
-        """
+        """Return unit shading normals (h, w, 3), or face normals where these cancel."""
         corners = self.mesh.normals[self.mesh.faces[self.face]]
         normals = np.einsum("hwk,hwkc->hwc", self.weights, corners)
         lengths = np.linalg.norm(normals, axis=-1, keepdims=True)
@@ -292,24 +304,21 @@ class Charts:
         face covers in the texture. It is 0 outside of all charts.
         """
         corners = self.mesh.vertices[self.mesh.faces].astype(np.float64)
-        face_areas = np.linalg.norm(compute_area_vectors(corners), axis=1)
-        texels_per_face = np.abs(
-            compute_doubled_areas(
-                _to_texel_coordinates(self.mesh, self.is_covered.shape)
-            )
-        )
+        texel_corners = _to_texel_coordinates(self.mesh, self.is_covered.shape)
+        # Both are twice an area, on the surface and in texels. Only their ratio is used.
+        doubled_areas = np.linalg.norm(compute_area_vectors(corners), axis=1)
+        doubled_texels = np.abs(compute_doubled_areas(texel_corners))
         area_per_texel = np.where(
-            texels_per_face > 0.0, face_areas / np.maximum(texels_per_face, 1e-12), 0.0
+            doubled_texels > 0.0, doubled_areas / np.maximum(doubled_texels, 1e-12), 0.0
         )
-        return np.where(self.is_covered, area_per_texel[self.face], 0.0).astype(
-            np.float32
-        )
+        areas = np.where(self.is_covered, area_per_texel[self.face], 0.0)
+        return areas.astype(np.float32)
 
 
 def find_exclusive_texels(
     mesh: Mesh, faces: IntArray, shape: tuple[int, int]
 ) -> tuple[BoolArray, float]:
-    """Return the texels that bilinear look-ups read on some faces and on no others.
+    """Return the texels that bilinear look-ups read on the given faces and no others.
 
     Args:
         mesh: the mesh.
@@ -317,8 +326,8 @@ def find_exclusive_texels(
         shape: height and width of the texture.
 
     Returns:
-        (h, w) texels that look-ups on these faces read and none on other faces does,
-        and their fraction of those that look-ups on these faces read.
+        (h, w) texels that look-ups on these faces read, but look-ups on other faces do
+        not; and their fraction of all texels that look-ups on these faces read.
     """
     corners = _to_texel_coordinates(mesh, shape)
     is_selected = np.isin(np.arange(len(mesh.faces)), faces)
@@ -330,8 +339,8 @@ def find_exclusive_texels(
 def rasterize_charts(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
     """Find the face and the barycentric weights of every texel of a texture.
 
-    Where charts overlap, the last of their faces wins. A texel outside of all charts
-    has the values of the nearest texel inside one.
+    Where charts overlap, a texel has the last of the faces. A texel outside of all
+    charts has the values of the nearest texel inside one.
 
     Args:
         mesh: mesh with texture coordinates.
@@ -392,14 +401,14 @@ def look_up_texture(
 
     Args:
         texels: (H, W, C) the texture.
-        x: columns (...), whole at texel centers; outside of the texture it repeats.
+        x: columns (...), integers at texel centers. Outside of it the texture repeats.
         y: rows (...), likewise.
 
     Returns:
         (..., C) float32.
     """
     height, width = texels.shape[:2]
-    # The four texels around each point, and how far (0 to 1) it is from the first.
+    # The first of the four texels around each point, and the offset (0 to 1) from it.
     left = np.floor(x)
     top = np.floor(y)
     column_fraction = (x - left).astype(np.float32)[..., None]
@@ -423,16 +432,16 @@ def look_up_texture(
 
 
 class MeshSurface:
-    """The faces of a mesh, prepared for rays and for neighbourhoods.
+    """The faces of a mesh, prepared for intersections with rays and for neighborhoods.
 
     Attributes:
         normals: (F, 3) unit normals of the faces.
     """
 
     def __init__(self, mesh: Mesh) -> None:
-        """Compute boxes and normals of the faces, and which faces are neighbours.
+        """Compute boxes and normals of the faces, and which faces are neighbors.
 
-        Faces are neighbours if they share an edge. Edges are compared by the positions
+        Faces are neighbors if they share an edge. Edges are compared by the positions
         of their ends: at a UV seam the faces on both sides have different vertices at
         the same positions.
         """
@@ -447,7 +456,7 @@ class MeshSurface:
             [corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]
         )
         # Sorted by their ends, equal edges follow one another: their faces are
-        # neighbours.
+        # neighbors.
         edges = np.sort(edges, axis=1)
         order = np.lexsort((edges[:, 1], edges[:, 0]))
         is_same = (edges[order][1:] == edges[order][:-1]).all(axis=1)
@@ -465,8 +474,9 @@ class MeshSurface:
             direction: (3,) unit vector.
 
         Returns:
-            The face, and the point (3,) where the ray meets it. If the ray meets no
-            face, they are that corner which is nearest to the ray's line, and its face.
+            The face, and the point (3,) at which the ray meets it. If the ray meets no
+            face, the point is the corner nearest to the ray's line, and the face is one
+            with this corner.
         """
         distance = self._intersect(origin, direction)
         if np.isfinite(distance).any():
@@ -484,7 +494,7 @@ class MeshSurface:
         The method is that of Moeller and Trumbore 1997, for all faces at once. As in
         the paper t goes from the face's corner a to the origin, and u and v are the
         barycentric weights of b and c where the ray meets the plane of the face. A ray
-        in that plane does not meet the face. Faces behind the origin do not count.
+        in that plane does not meet the face. Faces behind the origin are ignored.
 
         Args:
             origin: (3,) start of the ray.
@@ -495,7 +505,7 @@ class MeshSurface:
         c = self._corners[:, 2]
         p = np.cross(direction, c - a)
         determinant = ((b - a) * p).sum(axis=1)
-        # 0 stands for a ray in the plane of the face
+        # 0 means that the ray is in the plane of the face
         inverse = np.where(
             np.abs(determinant) > 1e-15,
             1.0 / np.where(determinant == 0.0, 1.0, determinant),
@@ -506,7 +516,7 @@ class MeshSurface:
         q = np.cross(t, b - a)
         v = (q @ direction) * inverse
         distance = ((c - a) * q).sum(axis=1) * inverse
-        # With some slack, no ray goes between two neighbouring faces by rounding.
+        # The slack prevents rounding from letting a ray pass between two neighbors.
         slack = 1e-9
         is_hit = (inverse != 0.0) & (u >= -slack) & (v >= -slack)
         is_hit &= (u + v <= 1.0 + slack) & (distance > 0.0)
@@ -517,12 +527,13 @@ class MeshSurface:
     ) -> BoolArray:
         """Return the faces around a point that are connected to a face.
 
-        A face is one of them if its bounding box is within the radius, it faces the
-        direction `normal`, and a chain of such faces, neighbour by neighbour, leads to
-        it. So the opposite wall of a cup is left out, and the next slat of a chair.
+        Faces are returned if their bounding boxes are within the radius, if they face
+        the direction `normal`, and if a chain of such faces, neighbor by neighbor,
+        connects them to the face. So the opposite wall of a cup is left out, and the
+        next slat of a chair.
 
         Args:
-            face: index of the face from which the chains begin; it always counts.
+            face: index of the face at which the chains begin. It is always returned.
             point: (3,) center.
             normal: (3,) direction.
             radius: radius in the unit of the mesh.
@@ -540,10 +551,10 @@ class MeshSurface:
 
 
 def weld_vertices(mesh: Mesh) -> tuple[IntArray, int]:
-    """Return the index of the position of each vertex (V,), and how many there are.
+    """Return the index of the position of each vertex (V,), and the number of positions.
 
-    Vertices that UV seams and creases split share a position: 1e-5 of the mesh's
-    largest extent apart or less.
+    Vertices that UV seams and creases split share a position. Positions are rounded to
+    1e-5 of the mesh's largest extent.
     """
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     rounded = np.round(mesh.vertices.astype(np.float64) / max(extent, 1e-12) * 1e5)
@@ -556,8 +567,8 @@ def _to_texel_coordinates(mesh: Mesh, shape: tuple[int, int]) -> Float64Array:
     """Return texture coordinates of the faces' corners (F, 3, 2) in texels.
 
     They are column and row, integers at texel centers (hence the half), with row 0 at
-    v = 1. Where a texture repeats, each face is moved by full textures, so that its
-    center lies in the first one.
+    v = 1. If the texture repeats, each face is moved by integers, so that its center is
+    in the unit square.
     """
     uvs = mesh.uvs[mesh.faces].astype(np.float64)
     if mesh.repeats:

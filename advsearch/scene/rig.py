@@ -1,9 +1,10 @@
 """Rigs: several cameras of one scene, simultaneous or one after the other (a clip).
 
-The first camera is the scene's own, which controls and paths move; the others are
-mounted on it, or stand around the object at the same height and distance. Files are a
-plain list of ours, Kalibr's camchain with its extrinsics, frames of nerfstudio's
-transforms.json, or COLMAP's images.txt with the cameras.txt beside it.
+The first camera is that of the scene, which controls and paths move. The others are
+mounted on it, or stand around the object at the same height and distance. Supported
+files are a list of cameras in our own format, Kalibr's camchain with its extrinsics,
+frames of nerfstudio's transforms.json, and COLMAP's images.txt with the cameras.txt
+beside it.
 """
 
 from __future__ import annotations
@@ -39,40 +40,40 @@ from advsearch.trust.stored_files import (
 from advsearch.trust.yaml_text import MAX_YAML_BYTES, parse_yaml
 
 MAX_CAMERAS = 32
-MAX_DISTANCE = 1e4  # limit of the distance to the first camera, metres or object sizes
+MAX_DISTANCE = 1e4  # limit of the distance to the first camera, meters or object sizes
 ENTRY_KEYS = ("name", "place", "turn", "around", "fov", "later")
 MAX_DELAY = 60.0  # limit of the seconds after the first image
 MAX_TURN = 3600.0  # limit of the angles of an entry, degrees
 MIN_FOV = 1.0  # limits of the field of view of an entry, degrees
 MAX_FOV = 170.0
-# From x to the right, y down, z ahead to Mitsuba's axes: left, up, ahead.
+# Rotation from a camera's axes in files (x to the right, y down, z ahead) to Mitsuba's
+# (x to the left, y up, z ahead).
 AXES = np.diag([-1.0, -1.0, 1.0, 1.0])
+# Rotation from nerfstudio's axes of a camera (x to the right, y up, z back) to x to the
+# right, y down, z ahead.
 FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-"""From nerfstudio's axes of a camera, x to the right, y up, z back, to x to the right,
-y down, z ahead.
-"""
 # Lower limit of the scale of positions in a file; its inverse is the upper limit.
 MIN_SCALE = 1e-6
 COLMAP_IMAGES = "images.txt"
 MAX_IMAGES_SIZE = 1 << 26  # limit of COLMAP's images; their lines of points are skipped
-KALIBR_TRANSFORM = (
-    "T_cn_cnm1"  # Kalibr's transform from the previous camera to this one
-)
+KALIBR_TRANSFORM = "T_cn_cnm1"  # transform from the previous camera to this one
 
 
 @dataclass(frozen=True, eq=False)
 class Mount:
-    """One camera of a rig."""
+    """A camera of a rig, relative to the first camera of the rig."""
 
     name: str
-    # (4, 4) from its axes, x to the right, y down, z ahead, to those of the first
-    # camera; metres, or object sizes.
+    # (4, 4) from its axes (x to the right, y down, z ahead) to those of the first
+    # camera; meters, or object sizes.
     pose: Float64Array
     # Azimuth around the object relative to the first camera, degrees
     # counter-clockwise from above.
     azimuth: float = 0.0
-    fov: float | None = None  # degrees along the larger side; None for the first's
-    model: CameraModel | None = None  # intrinsics and distortion; None for the first's
+    # Field of view along the larger side, degrees; None for that of the first camera.
+    fov: float | None = None
+    # Intrinsics and distortion; None for those of the first camera.
+    model: CameraModel | None = None
     # Seconds after the first image, along the path of a control.
     delay: float = 0.0
 
@@ -85,15 +86,15 @@ class Mount:
     ) -> dict[str, Tensor]:
         """Return the scene inputs of this camera, given those of the first camera.
 
-        The mount's pose is relative to the first camera's. The result is turned about
+        The mount's pose is relative to the first camera's. The result is rotated about
         the vertical through the object's center by the mount's azimuth. If the mount
-        has a field of view or a lens, it replaces the first camera's.
+        has a field of view or a lens, it replaces that of the first camera.
 
         Args:
             inputs: scene inputs of the first camera.
             first_pose: (4, 4) pose of the first camera, used if the inputs have none.
             center: (3,) center of the object.
-            unit_metres: length of a unit of the scene, in metres.
+            unit_metres: length of a unit of the scene, in meters.
         """
         # The mount's axes are OpenCV's (x right, y down), the scene's are Mitsuba's (x
         # left, y up): `AXES` converts both sides.
@@ -101,7 +102,7 @@ class Mount:
         mount_pose[:3, 3] /= unit_metres
         orbit_rotation = torch.eye(4)
         orbit_rotation[:3, :3] = torch.from_numpy(make_rotation(self.azimuth, 0.0, 0.0))
-        # The shift by which the rotation leaves the center where it is: c - R c.
+        # With the shift c - R c, the rotation leaves the center c where it is.
         orbit_rotation[:3, 3] = center - orbit_rotation[:3, :3] @ center
         camera_inputs = {
             **inputs,
@@ -128,52 +129,55 @@ def read_rig(spec: str) -> tuple[Mount, ...]:
             ``images.txt#3,7``.
 
     Returns:
-        The cameras. It is empty if this is no rig: the file has one camera, or one of
-        its cameras is named (``#cam1``).
+        The cameras. The tuple is empty if this is no rig: if the file has one camera,
+        or if one of its cameras is named (``#cam1``).
 
     Raises:
-        FileFormatError: there are more than `MAX_CAMERAS`, numbers that no camera has,
+        FileFormatError: there are more than `MAX_CAMERAS`, numbers out of their range,
             or models of different kinds.
     """
     path, _, camera_names = spec.partition("#")
     if Path(path).name == COLMAP_IMAGES:
         return _read_colmap(path, camera_names)
+    # The frames of a transforms.json are usually photographs of a single camera, and
+    # only a rig if several are named.
     if Path(path).suffix.lower() == ".json" and "," in camera_names:
         return _read_transforms(path, camera_names)
-    # a single camera is named, or the format has no rigs
-    if camera_names or Path(spec).suffix.lower() not in (".yaml", ".yml"):
+    # A single camera is named, or the format has no rigs.
+    if "#" in spec or Path(path).suffix.lower() not in (".yaml", ".yml"):
         return ()
     try:
-        data = parse_yaml(read_text(Path(spec), "a camera file", MAX_YAML_BYTES))
+        data = parse_yaml(read_text(Path(path), "a camera file", MAX_YAML_BYTES))
     except (OSError, ValueError):
-        return ()  # `read_camera` reports what is wrong with it
+        return ()  # `read_camera` reports the error
     if not isinstance(data, dict):
         return ()
     entries = data.get("cameras")
-    if isinstance(entries, list):  # our own format
+    if isinstance(entries, list):  # our own format, which has no other entries
         if set(data) != {"cameras"}:
             raise FileFormatError(
-                f"{spec}: expected `cameras` alone, got "
+                f"{path}: expected `cameras` alone, got "
                 f"{', '.join(map(str, data))[:80]}"
             )
         mounts = tuple(
-            _read_entry(spec, index, entry) for index, entry in enumerate(entries)
+            _read_entry(path, index, entry) for index, entry in enumerate(entries)
         )
     else:
-        mounts = _read_camchain(spec, data)
+        mounts = _read_camchain(path, data)
     if mounts:
-        _check_mounts(spec, mounts)
+        _check_mounts(path, mounts)
     return mounts
 
 
 @dataclass(frozen=True, eq=False)
 class PhotographCameras:
-    """The cameras of many photographs, which one file states.
+    """The cameras of many photographs, which are in one file.
 
     Attributes:
         path: COLMAP's images.txt with the cameras.txt beside it, or a transforms.json.
         files: files of the photographs, by the names of their entries.
-        read_entry: returns pose and model of an entry, as `find` does.
+        read_entry: function of the name of an entry that returns its pose and model, as
+            `find` does.
     """
 
     path: str
@@ -183,15 +187,15 @@ class PhotographCameras:
     def find(self, photograph: Path) -> tuple[Float64Array, CameraModel]:
         """Return pose and model of the camera that took a photograph, by its file name.
 
-        Where files of several folders have that name, the folders decide.
+        If files in several folders have that name, the folders are compared, too.
 
         Returns:
-            The pose (4, 4) leads from the camera's axes (x to the right, y down, z
-            ahead) to the file's world.
+            The pose (4, 4), from the camera's axes (x to the right, y down, z ahead) to
+            the file's world; and the model.
 
         Raises:
-            FileFormatError: an entry cannot be used, or the photograph is named never
-                or several times.
+            FileFormatError: an entry cannot be used, or none or several entries are for
+                the photograph.
         """
         return self.read_entry(_find_photograph(self.path, self.files, photograph))
 
@@ -215,7 +219,7 @@ def read_photograph_cameras(path: str) -> PhotographCameras | None:
     try:
         data = parse_json(read_text(Path(path), "a camera file", MAX_JSON_SIZE))
     except (OSError, ValueError):
-        return None  # `read_camera` reports what is wrong with it
+        return None  # `read_camera` reports the error
     if not isinstance(data, dict) or "frames" not in data:
         return None
     frames = _check_frames(path, data)["frames"]
@@ -248,8 +252,8 @@ def _read_image_cameras(path: str) -> PhotographCameras:
 def _find_photograph(path: str, files: Mapping[str, str], photograph: Path) -> str:
     """Return the name of the entry of a camera file that is for a photograph.
 
-    The paths in a camera file are often those of another computer. So the entry is
-    taken whose path has most parts in common with the photograph's, from the end.
+    The paths in a camera file are often those of another computer. So the result is the
+    entry whose path has the most parts in common with the photograph's, from the end.
 
     Args:
         path: path of the camera file, for messages.
@@ -264,7 +268,7 @@ def _find_photograph(path: str, files: Mapping[str, str], photograph: Path) -> s
         name: _count_shared_parts(file, photograph) for name, file in files.items()
     }
     largest = max(counts.values(), default=0)
-    # a count of 0 is another file
+    # a count of 0 means another file
     names = [name for name, count in counts.items() if count == largest > 0]
     if len(names) == 1:
         return names[0]
@@ -304,29 +308,30 @@ def _check_mounts(spec: str, mounts: Sequence[Mount]) -> None:
             f"{spec}: expected 2 to {MAX_CAMERAS} cameras, got {len(mounts)}"
         )
     if len({mount.name for mount in mounts}) < len(mounts):
-        raise FileFormatError(f"{spec}: expected a name of its own for each camera")
+        raise FileFormatError(f"{spec}: expected a different name for each camera")
     first_mount = mounts[0]
     is_moved = not np.allclose(first_mount.pose, np.eye(4))
     if is_moved or first_mount.azimuth or first_mount.delay:
+        # keys of an entry: `around` is the azimuth, and `later` the delay
         raise FileFormatError(
-            f"{spec}: the first camera is the scene's own; it takes no place, turn, "
-            "around or later"
+            f"{spec}: the first camera is that of the scene; it must have no place, "
+            "turn, around or later"
         )
 
 
 def _read_entry(spec: str, index: int, entry: Any) -> Mount:
     """Return the camera of an entry of our own format.
 
-    Any of `ENTRY_KEYS` may be missing. A camera without a pose stands where the first
-    camera does and looks the same way; one without a lens has that of the first.
+    Any of `ENTRY_KEYS` may be missing. A camera without a pose has the pose of the
+    first camera, and one without a lens has its lens.
 
     Args:
         spec: the file, for messages.
         index: index of the camera from 0, for messages and a default name.
-        entry: the entry, a dictionary if the file is right.
+        entry: the entry, which has to be a dictionary.
 
     Raises:
-        FileFormatError: the entry has other keys, or values that no camera has.
+        FileFormatError: the entry has other keys, or values out of their range.
     """
     where = f"{spec}: camera {index + 1}"
     if not isinstance(entry, dict) or not set(entry) <= set(ENTRY_KEYS):
@@ -364,7 +369,7 @@ def _read_entry_pose(where: str, entry: Mapping[str, Any]) -> Float64Array:
 
     It maps coordinates of the camera to those of the first one. In both x is to the
     right, y down, z ahead. `turn` has yaw, pitch and roll in degrees, and `place` the
-    position in metres.
+    position in meters.
 
     Args:
         where: file and camera, for messages.
@@ -372,12 +377,12 @@ def _read_entry_pose(where: str, entry: Mapping[str, Any]) -> Float64Array:
     """
     angles = entry.get("turn", [0.0] * 3)
     yaw, pitch, roll = _parse_numbers(where, "turn", angles, 3, MAX_TURN)
-    # in these axes the yaw turns about y, the pitch about x, the roll about z
-    rotation = (
-        make_rotation(0.0, yaw, 0.0)
-        @ make_rotation(0.0, 0.0, pitch)
-        @ make_rotation(roll, 0.0, 0.0)
-    )
+    # The arguments of `make_rotation` are angles about z, y and x. In the axes of a
+    # camera, the yaw is about y, the pitch about x, and the roll about z.
+    yaw_rotation = make_rotation(0.0, yaw, 0.0)
+    pitch_rotation = make_rotation(0.0, 0.0, pitch)
+    roll_rotation = make_rotation(roll, 0.0, 0.0)
+    rotation = yaw_rotation @ pitch_rotation @ roll_rotation
     position = _parse_numbers(
         where, "place", entry.get("place", [0.0] * 3), 3, MAX_DISTANCE
     )
@@ -393,7 +398,7 @@ def _parse_numbers(
         where: file and camera, for messages.
         key: name of the entry, for messages.
         value: the entry.
-        count: how many numbers it has to have.
+        count: number of values that it must have.
         limit: largest absolute value of each number.
 
     Raises:
@@ -536,18 +541,23 @@ def _read_applied_scale(path: str, data: Mapping[str, Any]) -> float:
     """Return the factor by which the positions of a transforms.json are scaled already.
 
     It is nerfstudio's `applied_scale`, times the scale within its `applied_transform`.
-    The rotation and the shift of that transform move all cameras alike, and so do not
-    count. Instant NGP's `scale` and `offset` do not count either: the program that
-    reads the file applies them, so that the positions in the file are without them.
+    The rotation and the shift of that transform are ignored: they move all cameras
+    alike, and only poses relative to each other are used. Instant NGP's `scale` and
+    `offset` are ignored, too, since the program that reads the file would apply them:
+    the positions in the file are without them.
 
     Raises:
-        FileFormatError: the transform is none of rotation, shift and scale, or the
-            scale is out of range.
+        FileFormatError: the transform is not composed of rotation, shift and scale, or
+            the scale is out of range.
     """
     scale = 1.0
     if data.get("applied_scale") is not None:
         (scale,) = _parse_numbers(
-            path, "applied_scale", [data["applied_scale"]], 1, 1.0 / MIN_SCALE
+            path,
+            "applied_scale",
+            [data["applied_scale"]],
+            count=1,
+            limit=1.0 / MIN_SCALE,
         )
     if data.get("applied_transform") is not None:
         scale *= _measure_scale(path, data["applied_transform"])
@@ -561,38 +571,50 @@ def _read_applied_scale(path: str, data: Mapping[str, Any]) -> float:
 
 
 def _read_colmap(path: str, image_ids: str) -> tuple[Mount, ...]:
-    """Return the images of COLMAP's images.txt as cameras."""
+    """Return the images of COLMAP's images.txt as cameras.
+
+    Args:
+        path: the file.
+        image_ids: ids of the images, with commas; "" for all images.
+    """
+    # (image id: the ten words of its line)
     words_by_id = _parse_images(path)
-    names = _parse_names(path, image_ids or ",".join(words_by_id), list(words_by_id))
+    all_ids = list(words_by_id)
+    selected_ids = _parse_names(
+        path, image_ids or ",".join(all_ids), known_names=all_ids
+    )
     poses = [
-        _parse_image(f"{path}: image {name[:40]}", words_by_id[name]) for name in names
+        _parse_image(f"{path}: image {image_id[:40]}", words_by_id[image_id])
+        for image_id in selected_ids
     ]
-    models = [_read_image_model(path, words_by_id[name]) for name in names]
-    return _make_mounts(path, names, poses, models)
+    models = [
+        _read_image_model(path, words_by_id[image_id]) for image_id in selected_ids
+    ]
+    return _make_mounts(path, selected_ids, poses, models)
 
 
 def _read_image_model(path: str, words: Sequence[str]) -> CameraModel:
     """Return the model of an image of COLMAP, from the cameras.txt beside it.
 
-    `words` are the image's line, of 10 words, of which the ninth is the camera's id.
+    `words` are the ten words of the image's line. The ninth is the camera's id.
     """
     return read_camera(_name_image_camera(path, words))
 
 
 def _name_image_camera(path: str, words: Sequence[str]) -> str:
-    """Return how `read_camera` is asked for the camera of an image's line."""
+    """Return the argument of `read_camera` for the camera of an image's line."""
     return f"{Path(path).with_name('cameras.txt')}#{words[8]}"
 
 
 def _parse_images(path: str) -> dict[str, list[str]]:
-    """Return the ten words that COLMAP's images.txt has of each image, by its id.
+    """Return the ten words of each image's line in COLMAP's images.txt, by image id.
 
     They are the id, a quaternion with the real part first, a shift, the id of the
-    camera, and the file. Quaternion and shift lead from the world to the camera.
+    camera, and the file. Quaternion and shift map the world to the camera.
     """
     text = read_existing_text(path, "COLMAP's images", MAX_IMAGES_SIZE)
     lines = [line for line in text.splitlines() if not line.startswith("#")]
-    # Each image has two lines: its own, and one of its points, which are not needed.
+    # Each image has two lines: its pose, and its points, which are not needed.
     image_lines = [line for line in lines[::2] if line.strip()]
     # the last of ten words is the file, whose name may have blanks
     words_of_images = [line.split(maxsplit=9) for line in image_lines]
@@ -622,8 +644,8 @@ def _parse_image(where: str, words: Sequence[str]) -> Float64Array:
     if len(words) != 10:
         raise FileFormatError(
             f"{where}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, got "
-            f"{len(words)} words; a line of points, perhaps an empty one, stands "
-            "between two images"
+            f"{len(words)} words; between two images there must be a line of points, "
+            "which may be empty"
         )
     try:
         numbers = list(map(float, words[1:8]))
@@ -638,7 +660,7 @@ def _parse_image(where: str, words: Sequence[str]) -> Float64Array:
     rotation = np.reshape(
         compute_rotation_entries(x / length, y / length, z / length, w / length), (3, 3)
     )
-    # inverted, as the file has the map from the world to the camera
+    # inverted, since the file has the map from the world to the camera
     return np.asarray(np.linalg.inv(make_pose(rotation, shift)), np.float64)
 
 

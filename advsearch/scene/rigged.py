@@ -7,9 +7,9 @@ As glTF 2.0 (Khronos) defines nodes (section 3.5), skins and morph targets (sect
     moved   = sum_j w_j world_j inverse_bind_j (p + sum_t m_t d_t)
 
 A clip sets T, R, S or m at a time by steps, by linear interpolation (of rotations on
-the sphere) or by cubic Hermite splines (section 3.11 and appendix C). Turns of joints
-are applied in addition: about the axes of the object as it stands at rest (z up), first
-x, then y, then z, carried along by the joints above it.
+the sphere) or by cubic Hermite splines (section 3.11 and appendix C). Rotations of
+joints that the user sets are applied in addition: about the axes of the object at rest
+(z up), first x, then y, then z. Ancestors of a joint rotate these axes.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ TIME = _make_rig_parameter(
     low=0.0,
     high=1.0,
     default=0.0,
-    text="Of the clip of a rigged file: 0 is its beginning, 1 its end.",
+    text="Time in the clip of a rigged file: 0 is its beginning, 1 its end.",
     search=(0.0, 1.0),
 )
-# Cosine of the angle between rotations beyond which arc and chord are the same.
+# Cosine of the angle between two rotations above which the chord replaces the arc.
 MAX_ARC_COSINE = 1.0 - 1e-9
 
 
@@ -69,7 +69,7 @@ def find_rig_parameter(name: str) -> Parameter | None:
             low=0.0,
             high=1.0,
             default=0.0,
-            text=f"How much of the morph target {owner} there is.",
+            text=f"Weight of the morph target {owner}.",
         )
     return _make_rig_parameter(
         name,
@@ -101,21 +101,15 @@ class _MeshTarget(NamedTuple):
     """A morph target of one node, for those vertices of the mesh that it moves."""
 
     name: str
-    node: int
-    index_in_node: int  # among the targets of the node
-    rest_weight: float
-    rows: Tensor  # (K,) of the mesh's vertices
-    offsets: Tensor  # (K, 3) at weight 1
+    node: int  # index of its node
+    index_in_node: int  # index among the targets of the node
+    rest_weight: float  # weight at rest
+    rows: Tensor  # (K,) indices of the mesh's vertices that it moves
+    offsets: Tensor  # (K, 3) offsets of these at weight 1
 
 
 class SkeletonRig:
     """Moves the mesh of a glTF file.
-
-    Args:
-        parts: the parts of the file that the mesh is made of.
-        vertices: (V,) for each vertex of the mesh its index in the concatenated
-            vertices of all parts.
-        to_mesh: (3, 3) from the file's axes and unit to those of the mesh.
 
     Attributes:
         skeleton: the nodes and clips of the file.
@@ -126,8 +120,9 @@ class SkeletonRig:
     ) -> None:
         """Bring the arrays of all parts into the order of the mesh's vertices.
 
-        The arrays become tensors. A part numbers its joints by the rows of its own
-        nodes; here they are rows of the concatenated nodes of all parts.
+        The arrays become tensors. A joint of a part is an index into the part's list of
+        nodes. Here the lists of all parts are concatenated, and a joint becomes an
+        index into the result, `_nodes`, which has indices of the file's nodes.
 
         Args:
             parts: parts of the file that move with the skeleton; all share it.
@@ -137,7 +132,9 @@ class SkeletonRig:
         """
         self.skeleton = parts[0].skeleton
         self._to_mesh = torch.from_numpy(to_mesh)
-        # The map is a rotation times a scale, whose cube is the determinant.
+        # Rotations that the user sets are about the mesh's axes. To convert them to the
+        # file's, `to_mesh` is needed without its scale, the cube root of its
+        # determinant.
         self._rotation_to_mesh = torch.from_numpy(
             to_mesh / np.cbrt(np.linalg.det(to_mesh))
         )
@@ -150,7 +147,8 @@ class SkeletonRig:
             return np.pad(values, ((0, 0), (0, max_joints - values.shape[1])))
 
         points = np.concatenate([part.vertices for part in parts])
-        # `start` is the number of nodes of all parts before this one.
+        # `start` is the number of nodes of all parts before this one. `node_starts` has
+        # one more entry than there are parts, the number of all nodes.
         joints = np.concatenate(
             [
                 pad_joints(part.joints + start)
@@ -174,8 +172,8 @@ class SkeletonRig:
             torch.cat([nodes for nodes, _ in self._nodes_by_depth])
         )
         self._local_matrices = torch.from_numpy(self.skeleton.local_matrices)
-        # The axes of each node at rest: the rotation nearest to its matrix, without its
-        # scale and shear (polar decomposition).
+        # The axes of each node at rest: the orthogonal matrix nearest to its matrix,
+        # without scale and shear (polar decomposition). It mirrors if the node does.
         world = self._compute_world(self._local_matrices)[:, :3, :3].numpy()
         left, _, right = np.linalg.svd(world)
         self._axes = torch.from_numpy(left @ right)
@@ -241,7 +239,8 @@ class SkeletonRig:
         """Values of all parameters at rest, by name."""
         time = {TIME.name: 0.0} if self.clips else {}
         angles = {f"{name}.{axis}": 0.0 for name in self.joints for axis in AXES}
-        # Of targets with the same name, the first counts: it is written last.
+        # If targets have the same name, the weight of the first is used: it is written
+        # last.
         weights = {
             f"{target.name}.{WEIGHT}": target.rest_weight
             for target in reversed(self._targets)
@@ -255,6 +254,7 @@ class SkeletonRig:
             TIME if name == TIME.name else find_rig_parameter(name)
             for name in self.defaults
         )
+        # All of these names have a parameter; the condition is for the type.
         return tuple(parameter for parameter in parameters if parameter is not None)
 
     def get_measurements(
@@ -274,8 +274,8 @@ class SkeletonRig:
         The result is in the unit of the mesh, and differentiable.
 
         Args:
-            values: scalar tensors by the names of `parameters`, such as "Head.z". Those
-                that are missing have the values of the clip, or those at rest.
+            values: scalar tensors by the names of `parameters`, such as "Head.z".
+                Missing ones have the values of the clip, or those at rest.
             clip: name of an animation of the file; None for the pose at rest.
 
         Raises:
@@ -286,22 +286,22 @@ class SkeletonRig:
         # `_to_mesh` is the linear map from the file's coordinates to the mesh's
         offsets = (posed - self._rest.to(device)) @ self._to_mesh.to(device).T
         if not bool(torch.isfinite(offsets.detach()).all()):
-            cause = f"the clip {clip}" if clip else "such turns"
+            cause = f"the clip {clip}" if clip else "such angles"
             raise InputError(
-                f"{self.skeleton.source}: {cause} would put vertices "
-                "infinitely far away; take another"
+                f"{self.skeleton.source}: {cause} would move vertices infinitely far "
+                "away; choose others"
             )
         return offsets.float()
 
     def pose(self, values: Mapping[str, Tensor], clip: str | None = None) -> Tensor:
         """Return the vertices (V, 3) float64 in the file's axes and unit.
 
-        First the clip poses the nodes, then the joints are turned. The vertices are
+        First the clip poses the nodes, then the joints are rotated. The vertices are
         morphed, and then moved with their joints (linear blend skinning).
 
         Args:
-            values: numbers by parameter, such as "Head.z": turns of joints in degrees,
-                weights of morph targets, and the time in the clip.
+            values: numbers by parameter, such as "Head.z": rotations of joints in
+                degrees, weights of morph targets, and the time in the clip.
             clip: name of the clip of the animation; None for the pose at rest.
         """
         device = next(iter(values.values()), torch.zeros(())).device
@@ -375,18 +375,18 @@ class SkeletonRig:
     def _play_clip(
         self, clip: Clip, seconds: Tensor
     ) -> tuple[Tensor, dict[int, Tensor]]:
-        """Return what a clip sets at a time.
+        """Return the poses of nodes and the weights of morph targets in a clip.
 
-        What the clip does not set has its value at rest. A node whose pose is a matrix
-        in the file can't be animated, and stays as it is.
+        Properties that the clip does not set have their values at rest. A node whose
+        pose is a matrix in the file cannot be animated.
 
         Args:
             clip: the clip.
             seconds: () time since the clip's start.
 
         Returns:
-            The matrices (N, 4, 4) of all nodes to their parents; and the weights (T,)
-            of morph targets, by node, for nodes of which the clip sets them.
+            The matrices (N, 4, 4) of all nodes to their parents; and for each node
+            whose weights the clip sets, the weights (T,) of its morph targets.
         """
         skeleton = self.skeleton
         device = seconds.device
@@ -420,10 +420,9 @@ class SkeletonRig:
     def _turn_joints(
         self, local_matrices: Tensor, number_by_name: Mapping[str, Tensor]
     ) -> Tensor:
-        """Return local matrices (N, 4, 4) with the turns of joints applied.
+        """Return local matrices (N, 4, 4) with the user's rotations of joints applied.
 
-        Turns are about the axes of the object as it stands at rest: first x, then y,
-        then z.
+        Rotations are about the axes of the object at rest: first x, then y, then z.
 
         Args:
             local_matrices: (N, 4, 4) from each node to its parent.
@@ -431,7 +430,7 @@ class SkeletonRig:
         """
         device = local_matrices.device
         rotation_to_mesh = self._rotation_to_mesh.to(device)
-        # the joints that have a turn about any axis, each once and in order
+        # the joints that have a rotation about any axis, each once and in order
         joints = dict.fromkeys(
             name.rpartition(".")[0]
             for name in number_by_name
@@ -446,9 +445,11 @@ class SkeletonRig:
                         make_axis_rotation(axis, number_by_name[f"{joint}.{axis}"])
                         @ rotation
                     )
-            # The turn is in the object's axes, but local matrices are in those of the
-            # parent node. So it is converted, first to the file's axes, then to those
-            # of the parent at rest.
+            # The rotation is about the axes of the mesh, but local matrices are in the
+            # axes of the parent node. In other axes a rotation R becomes A^T R A, where
+            # A maps the other axes to the present ones: first the file's axes, then
+            # those of the parent. The latter are those at rest, also if a clip has
+            # moved the parent: so the parent carries the axes of the rotation along.
             rotation = rotation_to_mesh.T @ rotation @ rotation_to_mesh
             parent = int(self.skeleton.parents[node])
             if parent >= 0:

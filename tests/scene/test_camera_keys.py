@@ -112,7 +112,7 @@ def test_a_roi_is_the_whole_picture_or_refused(roi: dict[str, int], whole: bool,
     [
         ({"camera_angle_x": 0.7, "frames": [FRAME]}, "expected w"),
         (KINDS["nerfstudio"] | {"camera_model": "FISHEYE624"}, "got 'FISHEYE624'"),
-        (KINDS["scalars"] | {"camera_model": "fisheye", "distortion_model": "plumb_bob"}, "beside another"),
+        (KINDS["scalars"] | {"camera_model": "fisheye", "distortion_model": "plumb_bob"}, "contradicts the dist"),
         (KINDS["opencv"] | {"distortion_model": "none"}, "its distortion_model is none"),
         (KINDS["opencv"] | {"flip_horizontal": True}, "flip_horizontal"),
         (KINDS["vins"] | {"mirror_parameters": {"xi": 1.6}}, "xi"),

@@ -84,7 +84,7 @@ def test_opacity_is_alpha_as_the_mode_says(mode: str, factor: float, wanted: set
     asset = import_object(file)
     if wanted is None:
         assert asset.opacity is None
-        assert ("it is transparent all over" in " ".join(asset.warnings)) == (mode == "MASK")
+        assert ("it is fully transparent" in " ".join(asset.warnings)) == (mode == "MASK")
     else:
         assert asset.opacity is not None and {round(float(one), 2) for one in np.unique(asset.opacity)} == wanted
         assert asset.opacity.shape == (32, 32) and asset.opacity.mean() == pytest.approx(0.75 * max(wanted), abs=0.01)

@@ -94,7 +94,7 @@ def test_a_thing_faces_as_its_file_or_its_facing_says(tmp_path: Path) -> None:
         top = world[world[:, 2] > world[:, 2].max() - 1e-4].mean(axis=0)
         middle = (world.max(axis=0) + world.min(axis=0)) / 2.0
         assert np.sign(top[0] - middle[0]) == ahead
-    assert [note.split(":")[0] for note in scene.notes if "its front is taken" in note] == ["right.glb", "wrong.glb"]
+    assert [note.split(":")[0] for note in scene.notes if "its front is assumed" in note] == ["right.glb", "wrong.glb"]
 
 
 def test_a_scene_file_is_turned_as_a_whole(tmp_path: Path) -> None:

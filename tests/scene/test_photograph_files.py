@@ -200,7 +200,7 @@ def link_out(folder: Path) -> None:
         (lambda folder: (folder / "000005.json").unlink(), r"000005.jpg: expected its camera file beside it, such as"),
         (write_text("000005.jpg", "no picture"), r"000005.jpg: expected a picture file"),
         (write_text("000005.json", "["), r"000005.json"),
-        (link_out, r"000005.jpg: leads out of its folder"),
+        (link_out, r"000005.jpg: is a link out of its folder"),
         (state(object_to_camera=None), r"000005.json: expected object_to_camera, which 000001.json states"),
         (state(object_to_camera=[1.0] * 11), r"object_to_camera: expected 12 or 16 finite numbers"),
         (state(object_to_camera=[float("nan")] * 12), r"000005.json"),

@@ -63,7 +63,7 @@ def test_a_car_stands_in_its_lane_at_its_size(tmp_path: Path, longest: float, sa
     assert np.ptp(own.base_vertices, axis=0) / np.ptp(road, axis=0)[0] * 120.0 == pytest.approx(
         [4.9, 1.96, 1.47], rel=1e-4
     )
-    assert [note.split(" to face")[0] for note in own.notes] == ["sedan.obj: its front is taken"]
+    assert [note.split(" to face")[0] for note in own.notes] == ["sedan.obj: its front is assumed"]
     assert {name: scene_to_settings(scene)[name] for name in said} == said
 
 

@@ -52,17 +52,18 @@ def convert_blend(path: Path, data: bytes) -> bytes:
     if not data.startswith(MAGIC_BYTES):
         raise reading.damaged(path, "a Blender scene", reading.describe_content(data))
     program = reading.find_blender(
-        f"{path}: Blender has to read it",
-        "export glTF (.glb) from Blender and name that",
+        who=f"{path}: Blender has to read it",
+        otherwise="export glTF (.glb) from Blender and name that",
     )
     with tempfile.TemporaryDirectory(prefix="advsearch-blender-") as folder:
         target = Path(folder) / "scene.glb"
         process = _run_blender(program, path, target)
         if process.returncode or not target.is_file():
-            last_line = reading.get_last_line(process.stdout + process.stderr)
+            # It begins with a colon, or is "" if Blender printed nothing.
+            reason = reading.get_last_line(process.stdout + process.stderr)
             raise errors.FileFormatError(
-                f"{path}: Blender could not read it{last_line}; export glTF (.glb) from it "
-                "yourself"
+                f"{path}: Blender could not read it{reason}; export glTF (.glb) from "
+                "Blender yourself"
             )
         return reading.read_bytes(target, "object", (".glb",))
 
@@ -70,12 +71,13 @@ def convert_blend(path: Path, data: bytes) -> bytes:
 def _run_blender(
     program: Sequence[str], path: Path, target: Path
 ) -> subprocess.CompletedProcess[str]:
-    """Let Blender convert a file, in the folder of the result.
+    """Run Blender to convert a file, in the folder of the result.
 
     Args:
         program: Blender, with the arguments that it always has.
         path: the file.
-        target: path of the result, which is not there if Blender cannot read the file.
+        target: path of the result. Blender does not write it if it cannot read the
+            file.
 
     Raises:
         FileFormatError: Blender cannot be started, or takes too long.

@@ -27,12 +27,12 @@ BLENDER_IMPORTERS = {
     "an Alembic scene": ("bpy.ops.wm.alembic_import", (".abc",)),
 }
 SPLATS_ADVICE = (
-    "has no surface; train one that yields a mesh (2D Gaussian Splatting's render.py "
-    "writes fuse_post.ply), name that"
+    "they have no surface; train a model that yields a mesh (2D Gaussian Splatting's "
+    "render.py writes fuse_post.ply), and name that mesh"
 )
 POINT_CLOUD_ADVICE = (
-    "has no surface; make one (in Python "
-    "open3d.geometry.TriangleMesh.create_from_point_cloud_poisson), name its .ply"
+    "it has no surface; make one (in Python "
+    "open3d.geometry.TriangleMesh.create_from_point_cloud_poisson), and name its .ply"
 )
 UNPACK_ADVICE = "unpack it, and name the mesh in it"
 EXPORT_ADVICE = "open it in that program and export glTF (.glb)"
@@ -56,7 +56,7 @@ FORMAT_ADVICE = {
         "take its glTF out: npx 3d-tiles-tools b3dmToGlb -i {file} -o {glb}",
         (".b3dm",),
     ),
-    "a model of Gaussian splats": (
+    "Gaussian splats": (
         SPLATS_ADVICE,
         (".splat", ".ksplat", ".spz", ".sog"),
     ),
@@ -121,7 +121,7 @@ def find_advice(path: Path) -> str | None:
 
 
 def _make_buffer_advice(path: Path) -> str:
-    """Return advice on a buffer of glTF: to name the .gltf file beside it."""
+    """Return advice on a buffer of glTF: the user should name its .gltf file instead."""
     example = ""
     if path.parent.is_dir():
         names = sorted(other.name for other in path.parent.glob("*.gltf"))
@@ -180,8 +180,9 @@ def read_bytes(path: Path, what: str, suffixes: Sequence[str]) -> bytes:
 
     Args:
         path: the file.
-        what: what it should hold, such as "object" or "environment", for messages.
-        suffixes: those that it may have, lower case with dot.
+        what: expected content, for messages: a word that follows "an", such as "object"
+            or "environment".
+        suffixes: suffixes that it may have, in lower case with the dot.
 
     Raises:
         FileFormatError: the file has another suffix, or is missing, not an ordinary
@@ -210,12 +211,13 @@ def read_bytes(path: Path, what: str, suffixes: Sequence[str]) -> bytes:
 def _check_suffix(path: Path, what: str, suffixes: Sequence[str]) -> None:
     """Raise FileFormatError for a directory, or a file with another suffix.
 
-    The message has advice: to leave out a `#part` that this kind of file cannot have,
-    or how to convert the file.
+    The message advises to leave out a `#part` that this kind of file cannot have, or to
+    convert the file.
 
     Args:
-        path: the file.
-        what: what it should hold, such as "object", for messages.
+        path: the file, perhaps with a part of it behind a #.
+        what: expected content, for messages: a word that follows "an", such as "object"
+            or "environment".
         suffixes: suffixes that it may have, in lower case with the dot.
     """
     if path.is_dir():
@@ -225,19 +227,20 @@ def _check_suffix(path: Path, what: str, suffixes: Sequence[str]) -> None:
         )
     if path.suffix.lower() in suffixes:
         return
-    file_part, _, part_name = str(path).rpartition("#")
-    if part_name and Path(file_part).suffix.lower() in suffixes:
+    file, _, part_name = str(path).rpartition("#")
+    if not file:  # no part is named
+        file = str(path)
+        part_name = ""
+    if part_name and Path(file).suffix.lower() in suffixes:
         raise FileFormatError(
-            f"{file_part}: has no parts by name, got "
+            f"{file}: has no parts by name, got "
             f"#{format_name(part_name, quoted=False)}; leave it out"
         )
-    conversion = None
-    if what != "environment":  # the advice is on programs that export meshes
-        # Without a # in the path, `file_part` is empty.
-        conversion = find_advice(Path(file_part) if file_part else path)
-    if conversion is not None:
-        raise FileFormatError(f"{path}: {conversion} (read are {either(suffixes)})")
-    got = f"got {path.suffix!r}" if path.suffix else "got a name without ending"
+    # The advice is about programs that export meshes.
+    advice = None if what == "environment" else find_advice(Path(file))
+    if advice is not None:
+        raise FileFormatError(f"{path}: {advice} (supported are {either(suffixes)})")
+    got = f"got {path.suffix!r}" if path.suffix else "got a name without a suffix"
     raise FileFormatError(
         f"{path}: expected an {what} file ending in {either(suffixes)}, {got}; "
         "convert it to one of these"
@@ -275,7 +278,10 @@ def damaged(path: Path | str, expected: str, got: str) -> FileFormatError:
 
 
 def find_kind(data: bytes) -> str | None:
-    """Return the kind of file that begins with some bytes, to follow "got", or None."""
+    """Return the kind of file that begins with these bytes, None if it is unknown.
+
+    It follows "got" in a message: "a PNG picture".
+    """
     for magic, kind in _MAGIC_BYTES:
         if data.startswith(magic):
             return kind
@@ -322,12 +328,13 @@ def format_name(
 ) -> str:
     """Format a name out of a file for a message.
 
-    Control characters are escaped, and a name that is longer than `max_length` is cut
-    to half of that.
+    Control characters are escaped. If a name is longer than `max_length`, its first
+    `max_length // 2` characters and its length are returned.
     """
-    cut = name if len(name) <= max_length else name[: max_length // 2]
-    text = repr(cut) if quoted else repr(cut)[1:-1]
-    return text if cut == name else f"{text}... ({len(name):,} characters)"
+    is_too_long = len(name) > max_length
+    start = name[: max_length // 2] if is_too_long else name
+    text = repr(start) if quoted else repr(start)[1:-1]  # without quotation marks
+    return f"{text}... ({len(name):,} characters)" if is_too_long else text
 
 
 def make_safe_name(path: Path) -> str:
@@ -339,19 +346,14 @@ def make_safe_name(path: Path) -> str:
 
 
 class UniqueNames:
-    """Makes names unique, and valid in a setting; names in `reserved` are not given
-    out.
-    """
+    """Makes names unique, and valid in a setting; those in `reserved` are never used."""
 
     def __init__(self, reserved: Iterable[str] = ()) -> None:
         self._used = set(reserved)
         self._last: dict[str, int] = {}
 
     def make_unique(self, requested: str) -> str:
-        """Return a name, with the first free number behind it if it is used already.
-
-        A second "wheel" becomes "wheel-2".
-        """
+        """Return a name with a number added if it is used already: "wheel-2"."""
         base = sanitize_name(requested)
         name = base
         suffix_number = self._last.get(base, 1)
@@ -369,7 +371,9 @@ def sanitize_name(name: str) -> str:
 
 
 LARGEST_FACES = 2_000_000
-"""Limit of the triangles of a mesh, before `scaled`; each takes over 1 KB of memory."""
+"""Limit of the triangles of a mesh, before `scale_limit`; each takes over 1 KB of
+memory.
+"""
 MAX_CORNERS = 10_000  # limit of the corners of a face
 
 
@@ -379,7 +383,7 @@ def check_faces(path: Path | str, count: int, got: str | None = None) -> None:
 
 
 class Notes:
-    """Warnings about one file, the things in it that were not read, and its errors.
+    """Warnings about one file, and a record of its entries that were not read.
 
         notes = Notes("chair.ply")
         notes.warn("the alpha of 'wood.png' is left out")
@@ -387,12 +391,12 @@ class Notes:
         notes.mark_read("property", "x")
         list(notes)   # [..., "chair.ply: property 'confidence' is left out"]
 
-    A thing in a file is a kind (a word of the format: ``"property"``, ``"keyword"``)
-    and its name. Each warning is given once.
+    An entry of a file has a kind (a word of the format: ``"property"``, ``"keyword"``)
+    and a name. Equal warnings are listed once.
 
     Attributes:
         path: path of the file, for errors.
-        source: what it is called in warnings: its name without the folder.
+        source: name of the file in warnings, without the folder.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -412,6 +416,13 @@ class Notes:
         separator = "" if clause.startswith(" ") else ": "
         self._warnings[f"{self.source}{separator}{clause}"] = None
 
+    def warn_that_file(self, predicate: str) -> None:
+        """Add a warning whose subject is the file, if it is new.
+
+        The predicate follows the name of the file: "chair.ply has Gaussian splats".
+        """
+        self._warnings[f"{self.source} {predicate}"] = None
+
     def damaged(self, expected: str, got: str | bytes) -> FileFormatError:
         """Return the error of `damaged`; content, as bytes, is described."""
         text = got if isinstance(got, str) else describe_content(got)
@@ -426,15 +437,15 @@ class Notes:
         check_faces(self.path, count)
 
     def record(self, kind: str, name: str) -> None:
-        """Record that the file has something."""
+        """Record that the file has an entry."""
         self._recorded[kind, name] += 1
 
     def mark_read(self, kind: str, name: str) -> None:
-        """Record that something is read; the file need not have it."""
+        """Record that an entry is read; the file need not have it."""
         self._read.add((kind, name))
 
     def __iter__(self) -> Iterator[str]:
-        """Yield all warnings, then what the file has and was not read."""
+        """Yield all warnings, then one about each entry that was not read."""
         yield from self._warnings
         for (kind, name), count in self._recorded.items():
             if (kind, name) not in self._read:
@@ -443,6 +454,9 @@ class Notes:
 
 
 def get_last_line(output: str) -> str:
-    """Return the last line of a program's output after a colon, "" if there is none."""
+    """Return a colon and the last line of a program's output, to end a message.
+
+    The result is "" if there is no output.
+    """
     lines = [line for line in output.splitlines() if line.strip()]
     return f": {format_name(lines[-1].strip(), quoted=False)}" if lines else ""

@@ -1,8 +1,8 @@
 """Repair of imported geometry: welding, faces without area, winding, normals.
 
-Everything works on a `TriangleSoup`: welded points, and attributes of the corners of faces, so
-that no step depends on how a file splits its vertices. Vertices are split again, where
-normals or UVs differ, when the mesh is assembled.
+All steps work on a `TriangleSoup`: welded points, and attributes of the corners of
+faces. So no step depends on how a file splits its vertices. Vertices are split again,
+where normals or UVs differ, when the mesh is assembled.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from advsearch.scene.importing.files import Notes
 from advsearch.scene.importing.parts import ImportedPart
 
 WELD_DISTANCE = 1e-6
-"""Points closer than this fraction of the largest extent are one point; text and 32-bit
-files round to about that.
+"""Points closer than this fraction of the largest extent become one point; text and
+32-bit files round to about that.
 """
-# Twice the area, in squared extents, up to which a face counts as having none.
+# Faces up to this doubled area, in squared extents, are treated as having no area.
 MIN_DOUBLED_AREA = 1e-12
 CREASE_DEGREES = 40.0
-"""Where the normals of two neighbouring faces differ by more, a computed normal is not
-smoothed across their edge.
+"""Largest angle between two neighboring faces at which normals are smoothed across
+their edge.
 """
 MIN_NORMAL_AGREEMENT = 0.98
 """Fraction of the surface on which a file's normals must agree with the faces for the
@@ -55,7 +55,7 @@ class TriangleSoup:
     uvs: Float64Array  # (F, 3, 2); NaN if unknown
     # (F, 3, 3) linear factors of the base color; 1 if the file has none.
     colors: Float64Array
-    # (F,) whether a face is shaded flat if it has no normals; None: none is.
+    # (F,) whether a face is shaded flat if it has no normals; None if no face is.
     is_flat: BoolArray | None = None
     # (F, 3) for each corner its vertex in the concatenated parts; None if unknown.
     stored_vertices: IntArray | None = None
@@ -74,7 +74,7 @@ class TriangleSoup:
 
         Normals stay as they are.
         """
-        # Two corners of a turned face change places, with all that belongs to them.
+        # Two corners of a flipped face are swapped, with all their attributes.
         order = np.where(mask[:, None], [0, 2, 1], [0, 1, 2])
         rows = np.arange(len(order))[:, None]
         names = ["faces", "normals", "uvs", "colors"]
@@ -130,7 +130,7 @@ def join_parts(
     Args:
         parts: at least one.
         source: name of the file, for messages.
-        turn: rotation (3, 3) that is applied to all of them.
+        turn: rotation (3, 3) that is applied to all parts.
 
     Raises:
         InputError: vertices are NaN or infinite, or the object has no extent.
@@ -141,8 +141,9 @@ def join_parts(
     lower_corner = vertices[find_used(faces, len(vertices))].min(axis=0)
     extent = compute_extent(parts)
     _check_extent(extent, source)
+    scaled_vertices = (vertices - lower_corner) / extent
     # Adding 0 turns -0.0 into 0.0, so that both are one point.
-    points, point_of_vertex = _weld((vertices - lower_corner) / extent @ turn.T + 0.0)
+    points, point_of_vertex = _weld(scaled_vertices @ turn.T + 0.0)
     n_faces = [len(part.faces) for part in parts]
     normals = np.concatenate(
         [_gather_at_corners(part.normals, part.faces, 3) for part in parts]
@@ -152,6 +153,8 @@ def join_parts(
         np.ones((len(part.faces), 3, 3)) if part.colors is None else part.colors
         for part in parts
     ]
+    # Joints and morph targets move vertices as the file stores them: `faces` has the
+    # stored vertex of each corner.
     has_movable = any(part.movable is not None for part in parts)
     return TriangleSoup(
         points=points,
@@ -197,7 +200,7 @@ def _weld(vertices: Float64Array) -> tuple[Float64Array, IntArray]:
     Returns:
         The points (P, 3), and the point of each vertex (V,).
     """
-    # Imported late, as in `parts`.
+    # Imported here, since the reader of USD, a separate process, needs no scipy.
     from scipy.spatial import cKDTree
 
     # Equal vertices are merged first, which leaves fewer points for the search of near
@@ -221,10 +224,10 @@ def find_unique_rows(rows: npt.NDArray[Any]) -> tuple[IntArray, IntArray]:
     It is `numpy.unique(rows, axis=0)` in a third of the time. Rows must have no NaN.
 
     Returns:
-        The index of the first row of each distinct one (U,), and which of these each
-        row is (N,).
+        The first index of each distinct row (U,); and for each row (N,) the index of
+        the distinct row that it equals.
     """
-    order = np.lexsort(rows.T[::-1])  # its last key, here the first column, counts most
+    order = np.lexsort(rows.T[::-1])  # sorted by the first column, then the second, ...
     is_new = np.ones(len(rows), np.bool_)
     is_new[1:] = (rows[order[1:]] != rows[order[:-1]]).any(axis=1)
     unique_of_row = np.empty(len(rows), np.int64)
@@ -233,22 +236,25 @@ def find_unique_rows(rows: npt.NDArray[Any]) -> tuple[IntArray, IntArray]:
 
 
 def find_used(faces: IntArray, count: int) -> IntArray:
-    """Return the rising indices (U,) of those of `count` vertices that faces have."""
+    """Return the indices (U,), in rising order, of the vertices that faces use.
+
+    `count` is the number of all vertices.
+    """
     is_used = np.zeros(count, np.bool_)
     is_used[faces] = True
     return np.flatnonzero(is_used)
 
 
 def list_used_vertices(parts: Sequence[ImportedPart]) -> list[Float64Array]:
-    """Return for each part those of its vertices (U, 3) that it has in a face."""
+    """Return for each part the vertices (U, 3) that its faces use."""
     return [part.vertices[find_used(part.faces, len(part.vertices))] for part in parts]
 
 
 def compute_extent(parts: Sequence[ImportedPart]) -> float:
     """Return the largest extent of all faces along an axis, in the file's unit.
 
-    It is infinite beyond float64. Halves are subtracted, so that the difference itself
-    does not overflow.
+    It is infinite if it is too large for float64. Halves are subtracted, so that the
+    difference itself does not overflow.
     """
     used_vertices = list_used_vertices(parts)
     lower = np.min([points.min(axis=0) for points in used_vertices], axis=0)
@@ -317,7 +323,7 @@ def assemble(soup: TriangleSoup) -> tuple[Mesh, IntArray | None]:
 def _fix_winding(soup: TriangleSoup, notes: Notes) -> TriangleSoup:
     """Return the soup with consistent and outward winding, and note the changes.
 
-    Faces wound against their neighbours are turned over first. Then shells that are
+    Faces wound against their neighbors are turned over first. Then shells that are
     inside out are turned over. A shell is a set of faces that are connected by edges.
     """
     is_turned, shell, has_moebius_strip = _find_turned_faces(soup)
@@ -328,7 +334,8 @@ def _fix_winding(soup: TriangleSoup, notes: Notes) -> TriangleSoup:
         )
     if has_moebius_strip:
         notes.warn(
-            "has a one-sided surface (a Moebius strip), so some faces show their backs"
+            "has a one-sided surface (a Moebius strip), so the backs of some faces are "
+            "visible"
         )
     soup = soup.flip_faces(is_turned)
     is_inside_out = _find_inside_out_shells(soup, shell)[shell]
@@ -344,9 +351,10 @@ def find_shared_edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
     """Find the edges that belong to exactly two faces (F, 3).
 
     Returns:
-        For each edge (E,) two corners: the one of each face at which the edge starts.
-        Corner k of face f has the number 3 f + k. And whether both faces run along the
-        edge in the same direction; then they disagree in winding.
+        For each edge (E,) a corner of its left and of its right face: the corner at
+        which the edge starts, if one goes around that face. Corner k of face f has the
+        index 3 f + k. And (E,) whether both faces run along the edge in the same
+        direction: then they disagree in winding.
     """
     # The side k of a face runs from its corner k to the next one.
     start = faces.reshape(-1)
@@ -370,11 +378,10 @@ def find_shared_edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
 def _link_windings(
     left_face: IntArray, right_face: IntArray, same_direction: BoolArray
 ) -> tuple[IntArray, IntArray]:
-    """Return the links (2 E) of the graph that `_find_turned_faces` uses.
+    """Return the two ends (2 E,) of each link of the graph in `_find_turned_faces`.
 
     Each face f has two nodes, 2 f for "as it is" and 2 f + 1 for "turned". Each shared
-    edge makes two links. A link joins the states of its two faces that agree in
-    winding.
+    edge makes two links. A link joins two nodes of its faces that agree in winding.
 
     Args:
         left_face: one face of each shared edge.
@@ -382,35 +389,40 @@ def _link_windings(
         same_direction: whether both run through the edge in the same direction, so that
             one of them must be turned.
     """
-    starts = np.concatenate([2 * left_face, 2 * left_face + 1])
-    # `same_direction` is 1 where the "as it is" of one agrees with the other "turned".
-    ends = np.concatenate(
-        [2 * right_face + same_direction, 2 * right_face + 1 - same_direction]
-    )
+    left_as_is = 2 * left_face
+    left_turned = 2 * left_face + 1
+    # `same_direction` is 1 where a left face as it is agrees with the right one turned.
+    right_for_as_is = 2 * right_face + same_direction
+    right_for_turned = 2 * right_face + 1 - same_direction
+    starts = np.concatenate([left_as_is, left_turned])
+    ends = np.concatenate([right_for_as_is, right_for_turned])
     return starts, ends
 
 
 def _select_larger_choice(
-    as_is: IntArray, turned: IntArray, area: Float64Array
+    choice_as_is: IntArray, choice_turned: IntArray, area: Float64Array
 ) -> BoolArray:
     """Return which faces (F,) to turn over, so that most area of each shell stays.
 
-    A shell has two consistent windings, its choices, which are numbered. One leaves a
-    face as it is, and the other turns it over.
+    A shell has two consistent windings, its choices. Choices of all shells are numbered
+    from 0. One choice of a shell leaves a face as it is, and the other turns it over.
 
     Args:
-        as_is: (F,) for each face the choice that leaves it as it is.
-        turned: (F,) the choice that turns it over.
+        choice_as_is: (F,) index of the choice that leaves the face as it is.
+        choice_turned: (F,) index of the choice that turns the face over.
         area: (F,) twice the area of each face.
     """
-    n_choices = int(max(as_is.max(), turned.max())) + 1
-    # the area that each choice leaves as it is
-    unturned_area = np.bincount(as_is, weights=area, minlength=n_choices)
-    reverse_keeps_more = unturned_area[turned] > unturned_area[as_is]
-    areas_are_equal = unturned_area[turned] == unturned_area[as_is]
-    # Of equal areas the first face's winding is kept: choices are numbered by their
-    # first face, which the lower one of two leaves as it is.
-    is_turned: BoolArray = reverse_keeps_more | (areas_are_equal & (turned < as_is))
+    n_choices = int(max(choice_as_is.max(), choice_turned.max())) + 1
+    # (choices,) the area that each choice leaves as it is
+    unturned_area = np.bincount(choice_as_is, weights=area, minlength=n_choices)
+    area_if_as_is = unturned_area[choice_as_is]
+    area_if_turned = unturned_area[choice_turned]
+    # If both areas are equal, the choice with the lower index is taken. It leaves the
+    # first face of the shell as it is, since that face's node "as it is" comes first.
+    is_lower_choice = choice_turned < choice_as_is
+    is_turned: BoolArray = (area_if_turned > area_if_as_is) | (
+        (area_if_turned == area_if_as_is) & is_lower_choice
+    )
     return is_turned
 
 
@@ -421,7 +433,7 @@ def _find_turned_faces(soup: TriangleSoup) -> tuple[BoolArray, IntArray, bool]:
     If two neighbours agree, their equal nodes are linked; otherwise the opposite ones.
     So a connected component is a consistent choice for all faces of a shell, and the
     shell's other component is the reverse choice. If both are the same component, the
-    shell is one-sided. Of both choices, the one that turns less area over is taken.
+    shell is one-sided. The choice that turns less area over is made.
 
     Returns:
         Which faces (F,) to turn over; the shell of each face (F,); and whether some
@@ -432,12 +444,15 @@ def _find_turned_faces(soup: TriangleSoup) -> tuple[BoolArray, IntArray, bool]:
     # Corner c is a corner of face c // 3.
     starts, ends = _link_windings(left_corner // 3, right_corner // 3, same_direction)
     component = find_components(2 * len(area), starts, ends)
-    as_is = component[0::2]
-    turned = component[1::2]
-    is_turned = _select_larger_choice(as_is, turned, area)
-    # A shell is one component, or two that are each other's reverse.
-    _, shell = np.unique(np.minimum(as_is, turned), return_inverse=True)
-    return is_turned, shell.astype(np.int64), bool((as_is == turned).any())
+    component_as_is = component[0::2]
+    component_turned = component[1::2]
+    is_turned = _select_larger_choice(component_as_is, component_turned, area)
+    # A shell has two components, which are each other's reverse, or is one-sided.
+    _, shell = np.unique(
+        np.minimum(component_as_is, component_turned), return_inverse=True
+    )
+    has_moebius_strip = bool((component_as_is == component_turned).any())
+    return is_turned, shell.astype(np.int64), has_moebius_strip
 
 
 def _compute_shell_bounds(
@@ -476,11 +491,11 @@ def _find_inside_out_shells(soup: TriangleSoup, shell: IntArray) -> BoolArray:
 
     A closed shell, all of whose edges belong to exactly two of its faces, is turned
     over if its signed volume is negative. An exception is a shell inside another closed
-    shell: it is taken for the wall of a hollow space, and stays as it is, unless the
-    file's normals point the other way. If the signed volume of all closed shells
-    together is negative, the full object counts as inside out: all of it is turned
-    over, and then the same rule is applied to the result. An open sheet is turned over
-    if the file's normals point away from its front.
+    shell: it may be the wall of a hollow space, and stays as it is, unless the file's
+    normals point the other way. If the signed volume of all closed shells
+    together is negative, all closed shells are turned over first, and then the same
+    rule is applied to the result. An open sheet is turned over if the file's normals
+    point away from its front.
 
     Args:
         soup: a soup whose neighbours agree in winding.
@@ -491,31 +506,60 @@ def _find_inside_out_shells(soup: TriangleSoup, shell: IntArray) -> BoolArray:
     n_shells = len(face_counts)
     is_closed = _find_closed_shells(soup, shell, face_counts)
     volume = _compute_signed_volumes(soup, shell, vectors, face_counts)
-    # Agreement with the file's normals; 0 if it has none.
+    agreement = _compute_normal_agreement(soup, shell, vectors, n_shells)
+    bounds = _compute_shell_bounds(soup, shell, n_shells)
+    # First step: all closed shells are turned over if most of the volume is negative.
+    # That reverses the signs of volumes and agreements.
+    is_object_turned = volume[is_closed].sum() < 0.0
+    is_negative = (volume < 0.0) ^ is_object_turned
+    step_agreement = -agreement if is_object_turned else agreement
+    # Second step: single shells are turned over.
+    is_shell_turned = is_negative.copy()
+    for index in np.flatnonzero(is_closed & is_negative):
+        if _is_enclosed(index, is_closed, bounds):
+            # The wall of a hollow space, which stays if the normals agree with it.
+            is_shell_turned[index] = step_agreement[index] < 0.0
+    # A closed shell that is turned over in both steps is as before.
+    is_closed_turned = is_shell_turned ^ is_object_turned
+    is_sheet_turned = agreement < 0.0
+    return np.where(is_closed, is_closed_turned, is_sheet_turned)
+
+
+def _is_enclosed(
+    index: int, is_closed: BoolArray, bounds: tuple[Float64Array, Float64Array]
+) -> bool:
+    """Return whether a closed shell has a bounding box around that of shell `index`.
+
+    Args:
+        index: index of the shell.
+        is_closed: (S,) which shells are closed.
+        bounds: lower and upper corners (S, 3) of the boxes of all shells.
+    """
+    lower, upper = bounds
+    is_enclosing = (
+        is_closed
+        & (lower < lower[index]).all(axis=1)
+        & (upper > upper[index]).all(axis=1)
+    )
+    return bool(is_enclosing.any())
+
+
+def _compute_normal_agreement(
+    soup: TriangleSoup, shell: IntArray, vectors: Float64Array, n_shells: int
+) -> Float64Array:
+    """Return how far the file's normals agree with the faces of each shell, (S,).
+
+    It is positive if normals are on the fronts of faces, and 0 without normals.
+
+    Args:
+        soup: the faces.
+        shell: (F,) the shell of each face.
+        vectors: (F, 3) normals of the faces, as long as twice the areas.
+        n_shells: number of shells.
+    """
     corner_agreement = (soup.normals * vectors[:, None]).sum(axis=2)
     face_agreement = np.nan_to_num(corner_agreement).sum(axis=1)
-    agreement = np.bincount(shell, weights=face_agreement, minlength=n_shells)
-    lower, upper = _compute_shell_bounds(soup, shell, n_shells)
-    # If most of the volume is negative, the full object is turned over first. Then
-    # `is_inverted` tells which shells are inside out after that.
-    mostly_negative = volume[is_closed].sum() < 0.0
-    is_inverted = (volume < 0.0) ^ mostly_negative
-    for index in np.flatnonzero(is_closed & is_inverted):
-        is_enclosing = (
-            is_closed
-            & (lower < lower[index]).all(axis=1)
-            & (upper > upper[index]).all(axis=1)
-        )
-        if not is_enclosing.any():
-            continue  # it stays inverted
-        # The wall of a hollow space stays unless the file's normals point the other
-        # way. If the full object was turned over, agreement before is disagreement now.
-        if mostly_negative:
-            is_inverted[index] = agreement[index] > 0.0
-        else:
-            is_inverted[index] = agreement[index] < 0.0
-    # Turned over twice, as part of the full object and by itself, a shell is as before.
-    return np.where(is_closed, is_inverted ^ mostly_negative, agreement < 0.0)
+    return np.asarray(np.bincount(shell, weights=face_agreement, minlength=n_shells))
 
 
 def _compute_signed_volumes(
@@ -523,8 +567,8 @@ def _compute_signed_volumes(
 ) -> Float64Array:
     """Return six times the signed volume of each shell, (S,).
 
-    It is the sum of tetrahedra from the shell's center to its faces, which is accurate
-    far from the origin too; positive if the faces' fronts are outside.
+    It is the sum of tetrahedra from the shell's center to its faces, which is also
+    accurate far from the origin. It is positive if the fronts of faces are outside.
 
     Args:
         soup: the faces.
@@ -570,7 +614,7 @@ def _fix_normals(soup: TriangleSoup, notes: Notes) -> TriangleSoup:
             is_front = is_known & ~is_front
         elif front_fraction < MIN_NORMAL_AGREEMENT:
             notes.warn("its normals contradict its faces and were computed anew")
-            is_front = np.zeros_like(is_front)  # none is used
+            is_front = np.zeros_like(is_front)  # no normal of the file is used
     if not is_front.all():
         computed = compute_smooth_normals(soup)
         if soup.is_flat is not None:
@@ -595,22 +639,16 @@ def compute_smooth_normals(soup: TriangleSoup) -> Float64Array:
 
     At each point, faces share one normal if they are connected by edges whose angle is
     below the crease angle. It is the mean of their normals, weighted by their angles at
-    that point (Thuermer and Wuethrich 1998). To find these faces, corners are the nodes
-    of a graph, in which a smooth edge links the two corners at each of its ends.
+    that point (Thuermer and Wuethrich 1998).
     """
     face_normals = normalize_vectors(soup.compute_face_vectors())
-    left_corner, right_corner, same_direction = find_shared_edges(soup.faces)
-    cosine = _compute_cosines(face_normals, left_corner, right_corner)
-    is_smooth = cosine >= np.cos(np.radians(CREASE_DEGREES))
-    left_corner = left_corner[is_smooth & ~same_direction]
-    right_corner = right_corner[is_smooth & ~same_direction]
-    # At either end of the edge, a corner of one face meets a corner of the other.
-    starts = np.concatenate([left_corner, _get_next_corner(left_corner)])
-    ends = np.concatenate([_get_next_corner(right_corner), right_corner])
-    smoothing_group = find_components(soup.faces.size, starts, ends)
+    smoothing_group = _find_smoothing_groups(soup, face_normals)
     weighted = face_normals[:, None] * _compute_corner_angles(soup)[:, :, None]
     normal_sums: Float64Array = np.stack(
-        [np.bincount(smoothing_group, weighted[:, :, k].ravel()) for k in range(3)],
+        [
+            np.bincount(smoothing_group, weights=weighted[:, :, axis].ravel())
+            for axis in range(3)
+        ],
         axis=1,
     )
     smooth_normals = normalize_vectors(normal_sums)[smoothing_group].reshape(-1, 3, 3)
@@ -620,8 +658,26 @@ def compute_smooth_normals(soup: TriangleSoup) -> Float64Array:
     return np.where(is_valid, smooth_normals, face_normals[:, None])
 
 
+def _find_smoothing_groups(soup: TriangleSoup, face_normals: Float64Array) -> IntArray:
+    """Return for each corner (3 F,) the group of corners with which it shares a normal.
+
+    Corners are the nodes of a graph, in which an edge without a crease links the two
+    corners at each of its ends. Faces that disagree in winding are not linked.
+    """
+    left_corner, right_corner, same_direction = find_shared_edges(soup.faces)
+    cosine = _compute_cosines(face_normals, left_corner, right_corner)
+    is_smooth = cosine >= np.cos(np.radians(CREASE_DEGREES))
+    left_corner = left_corner[is_smooth & ~same_direction]
+    right_corner = right_corner[is_smooth & ~same_direction]
+    # The two faces run along the edge in opposite directions. So the corner at which it
+    # starts in one face meets the corner at which it ends in the other.
+    starts = np.concatenate([left_corner, _get_next_corner(left_corner)])
+    ends = np.concatenate([_get_next_corner(right_corner), right_corner])
+    return find_components(soup.faces.size, starts, ends)
+
+
 def _get_next_corner(corner: IntArray) -> IntArray:
-    """Return the corners (3 face + k) that follow corners in their faces."""
+    """Return the corner that follows each corner in its face, as 3 face + k."""
     return corner - corner % 3 + (corner + 1) % 3
 
 
@@ -670,31 +726,28 @@ def find_components(count: int, edge_starts: IntArray, edge_ends: IntArray) -> I
         count: number of nodes.
         edge_starts, edge_ends: (E,) the two nodes of each edge, in either order.
     """
-    # Imported late, as in `parts`.
+    # Imported here, since the reader of USD, a separate process, needs no scipy.
     from scipy.sparse import coo_array, csgraph
 
-    graph = coo_array(
-        (np.ones(len(edge_starts), np.int8), (edge_starts, edge_ends)),
-        shape=(count, count),
-    )
+    # Only which entries are stored matters, and not their values.
+    values = np.ones(len(edge_starts), np.int8)
+    graph = coo_array((values, (edge_starts, edge_ends)), shape=(count, count))
     _, component = csgraph.connected_components(graph, directed=False)
     return np.asarray(component, dtype=np.int64)
 
 
 # ---- Triangulation of many polygons at a time: fans if those are right, else ears ----
 
-# Limit of the comparisons of points with ears; beyond it, polygons are cut up untested.
+# Limit of the comparisons of points with ears; beyond it, ears are cut off untested.
 MOST_WORK = 50_000_000
-# Twice the area of a triangle, as a fraction of that of its polygon, up to which it
-# counts as having none.
-_MIN_AREA = 1e-9
+# Triangles up to this fraction of their polygon's area are treated as having no area.
+_MIN_AREA_FRACTION = 1e-9
 
 
 def triangulate_and_note(
     points: Float64Array, counts: IntArray, notes: Notes
 ) -> tuple[IntArray, IntArray]:
-    """Triangulate polygons, and note those that may be wrong or have fewer than 3
-    corners.
+    """Triangulate polygons, and note those that are degenerate or may be wrong.
 
     Args:
         points: (C, 3) the corners of all polygons, concatenated; may be NaN.
@@ -712,8 +765,8 @@ def triangulate_and_note(
     triangles, polygon, n_wrong = triangulate(points, counts)
     if n_wrong:
         notes.warn(
-            f"{n_wrong:,} faces cross themselves, or are too much work, and may be "
-            "cut up wrongly"
+            f"{n_wrong:,} faces cross themselves, or are too complex, and may be "
+            "divided wrongly"
         )
     return triangles, polygon
 
@@ -729,8 +782,8 @@ def triangulate(
 
     Args:
         points: (C, 3) the corners of all polygons, concatenated; may be NaN.
-        counts: (P,) the number of corners of each polygon; those of fewer than 3 become
-            no triangle.
+        counts: (P,) the number of corners of each polygon. Polygons with fewer than 3
+            corners have no triangle.
 
     Returns:
         The corners of the triangles (T, 3), as indices into `points`, in the order of
@@ -757,7 +810,7 @@ def triangulate(
     if not owners:
         return np.zeros((0, 3), np.int64), np.zeros(0, np.int64), n_wrong
     owner = np.concatenate(owners)
-    # Polygons were taken by their number of corners; back to their own order.
+    # Polygons were grouped by their number of corners; this restores their order.
     order = np.argsort(owner, kind="stable")
     return np.concatenate(triangles)[order], owner[order], n_wrong
 
@@ -788,7 +841,7 @@ def _triangulate_equal(
     areas = _compute_doubled_areas(
         projected[:, :1], projected[:, 1:-1], projected[:, 2:]
     )
-    min_area = _MIN_AREA * np.abs(areas.sum(axis=1))[:, None]
+    min_area = _MIN_AREA_FRACTION * np.abs(areas.sum(axis=1))[:, None]
     concave = np.flatnonzero((areas <= min_area).any(axis=1))
     if not len(concave):
         return fans, 0, 0
@@ -833,19 +886,20 @@ class _EarCutter:
 
     Attributes:
         flat: (P, n, 2) the corners.
-        dent: (P, d) the corners that are not convex, and could lie in an ear.
-        is_present: (P, d) which of these are dents, and are not cut off.
-        dent_points: (P, d, 2) where they are.
-        triangles: (P, n - 2, 3), the corners of the ears that were cut off.
-        n_cut: (P,) how many of them each polygon has so far.
-        next_corner: (P, n), a linked list of the corners that are left.
-        previous_corner: (P, n), the same list backwards.
+        dent: (P, d) indices of the corners that are not convex, and may lie in an ear;
+            padded with convex ones.
+        is_present: (P, d) whether the corner in `dent` is not convex and not cut off.
+        dent_points: (P, d, 2) coordinates of these corners.
+        triangles: (P, n - 2, 3) the corners of the ears that were cut off.
+        n_cut: (P,) number of ears that were cut off so far.
+        next_corner: (P, n) a linked list of the remaining corners.
+        previous_corner: (P, n) the same list backwards.
         tip: (P,) the corner that is tried next.
-        n_tries: (P,) corners tried since the last ear.
+        n_tries: (P,) number of corners tried since the last ear.
         is_failed: (P,) whether a polygon lacked an ear, or was over the budget.
-        area: (P,) doubled.
-        active: the polygons that are not triangulated yet.
-        n_compared: comparisons of a corner with a triangle.
+        area: (P,) twice the area of each polygon.
+        active: indices of the polygons that are not triangulated yet.
+        n_compared: number of comparisons of a corner with a triangle so far.
     """
 
     def __init__(self, flat: Float64Array) -> None:
@@ -896,7 +950,7 @@ class _EarCutter:
         """Return which active polygons lose their corner b, between a and c.
 
         A polygon loses it if b is the tip of an ear, or if only three corners are left.
-        It also loses it, and counts as failed, if all corners were tried without
+        It also loses it, and is marked as failed, if all corners were tried without
         finding an ear, or once the budget is spent.
 
         Args:
@@ -911,9 +965,9 @@ class _EarCutter:
             dent_points = self.dent_points[active]
             self.n_compared += dent_points.size // 2  # points have two coordinates
             corners = [self.flat[active, corner] for corner in (a, b, c)]
-            min_area = _MIN_AREA * self.area[active]
+            min_area = _MIN_AREA_FRACTION * self.area[active]
             is_cut |= _is_ear(corners, dent_points, self.is_present[active], min_area)
-        else:  # the budget is spent: all others are cut unseen
+        else:  # the budget is spent: all others are cut off untested
             is_hopeless[:] = True
         self.is_failed[active] |= is_hopeless & ~is_cut
         return np.asarray(is_cut | is_hopeless)
@@ -954,25 +1008,32 @@ def _cut_ears(flat: Float64Array, budget: int) -> tuple[IntArray, int, int]:
     cutter = _EarCutter(flat)
     while len(cutter.active):
         cutter.step(budget)
-    is_wrong = cutter.is_failed & (cutter.area > _MIN_AREA)
+    is_wrong = cutter.is_failed & (cutter.area > _MIN_AREA_FRACTION)
     return cutter.triangles, int(is_wrong.sum()), cutter.n_compared
 
 
-def _find_dents(flat: Float64Array, area: Float64Array) -> tuple[IntArray, BoolArray]:
-    """Find the corners of polygons (P, n, 2) that are not convex.
+def _find_dents(
+    flat: Float64Array, doubled_area: Float64Array
+) -> tuple[IntArray, BoolArray]:
+    """Find the dents of polygons: their corners that are not convex.
 
-    Only these can lie in an ear. `area` is twice the area of each polygon.
+    If a triangle of three successive corners contains any corner, it contains a dent.
+    So only dents have to be tested.
+
+    Args:
+        flat: (P, n, 2) the corners of the polygons.
+        doubled_area: (P,) twice the area of each polygon.
 
     Returns:
-        The corners (P, d), where d is the largest number of such corners in a polygon,
-        padded with convex corners; and which of these are not convex.
+        The indices of the dents (P, d), where d is the largest number of dents in a
+        polygon; polygons with fewer are padded with other corners. And (P, d) which
+        corners are dents, and no padding.
     """
     previous = np.roll(flat, 1, axis=1)
     following = np.roll(flat, -1, axis=1)
-    is_dent = (
-        _compute_doubled_areas(previous, flat, following) <= _MIN_AREA * area[:, None]
-    )
-    # False (a dent) is sorted before True; what is no dent fills up the rows
+    corner_area = _compute_doubled_areas(previous, flat, following)
+    is_dent = corner_area <= _MIN_AREA_FRACTION * doubled_area[:, None]
+    # Sorting by `~is_dent` puts dents (False) first, and other corners behind them.
     max_dents = int(is_dent.sum(axis=1).max())
     dent = np.argsort(~is_dent, axis=1, kind="stable")[:, :max_dents]
     return dent, np.take_along_axis(is_dent, dent, axis=1)
@@ -987,13 +1048,13 @@ def _is_ear(
     """Return which triangles have an area and contain no present point, (P,).
 
     A point is inside if it is on the left of all three sides, which run
-    counter-clockwise. A point on a side counts as inside, one at a corner does not.
+    counter-clockwise. A point on a side is inside, but one at a corner is not.
 
     Args:
         corners: the three corners of each triangle, (P, 2) each.
         points: (P, n, 2) points that may lie in them.
-        is_present: (P, n) which of the points count.
-        min_area: (P,) twice the area up to which a triangle has none.
+        is_present: (P, n) which of the points are tested.
+        min_area: (P,) doubled area up to which a triangle is treated as having none.
     """
     is_ear: BoolArray = _compute_doubled_areas(*corners) > min_area
     x = points[is_ear, :, 0]

@@ -38,12 +38,12 @@ from advsearch.trust.named_files import References, normalize_name
 from advsearch.trust.stored_files import JsonBoundsError, check_most, parse_json
 
 MOST_VALUES = 1_000_000
-"""Limit of the lists, objects and values in a header; each may take two bytes of the
-file, and takes hundreds of bytes of memory.
+"""Limit of the lists, objects and values in a header. Each needs only two bytes of the
+file, but hundreds of bytes of memory.
 """
 
 
-# bytes in a .glb file
+# sizes in a .glb file, bytes
 _FILE_HEADER_SIZE = 12
 _CHUNK_HEADER_SIZE = 8
 
@@ -52,13 +52,14 @@ def read_header(path: Path, data: bytes) -> Header:
     """Read and check the header of a .gltf or .glb file.
 
     Raises:
-        FileFormatError: the file is not glTF, is shorter than it states, has other
-            types in its header than glTF has, refers to what is not there, is over a
-            limit, or needs what is not supported.
+        FileFormatError: the file is not glTF, is shorter than it states, has a header
+            with wrong types or with references to missing entries, is over a limit, or
+            needs an extension that is not supported.
     """
-    chunk, _ = _split_chunks(path, data)
-    content = _parse_content(path, chunk)
+    json_chunk, _ = _split_chunks(path, data)
+    content = _parse_content(path, json_chunk)
     try:
+        # `_parse_content` has checked that there is an asset.
         version = Asset.model_validate(content["asset"]).version
         if version.split(".")[0] != "2":
             raise damaged(path, "glTF of version 2", f"version {format_name(version)}")
@@ -67,7 +68,8 @@ def read_header(path: Path, data: bytes) -> Header:
         raise _make_entry_error(path, error) from None
     present_extensions = _find_extensions(path, content)
     _check_node_lights(path, header, content)
-    # Some files use extensions without listing them.
+    # Some files use extensions without listing them. The notes about extensions need
+    # the complete list.
     all_used = sorted({*header.extensionsUsed, *present_extensions})
     header = header.model_copy(update={"extensionsUsed": all_used})
     check_header(path, header)
@@ -132,7 +134,6 @@ def _make_entry_error(path: Path, error: ValidationError) -> FileFormatError:
     It names the entry, as in "meshes[0].primitives[1].mode".
     """
     first_error = error.errors(include_url=False)[0]
-    # As in "meshes[0].primitives[1].mode".
     keys = (
         f"[{key}]" if isinstance(key, int) else f".{key}" for key in first_error["loc"]
     )
@@ -206,7 +207,7 @@ def _split_chunks(path: Path, data: bytes) -> tuple[bytes, bytes | None]:
     if length > len(data):
         raise damaged(
             path,
-            f"{length} bytes, as its header says",
+            f"{length} bytes, as its header states",
             f"{len(data)}; the file is cut short",
         )
     json_end = json_start + json_size
@@ -241,8 +242,8 @@ def _read_binary_chunk(data: bytes, chunk_start: int, file_end: int) -> bytes | 
 
 
 MAX_DATA_SIZE = 1 << 28
-"""Limit of the bytes of all views, and of all accessors, of a file; they may overlap,
-so the size of the file is no bound.
+"""Limit of the bytes of all views, and of all accessors, of a file. They may overlap, so
+that the size of the file does not limit them.
 """
 LARGEST_TREE = 20_000  # limit of the nodes, and of the drawn primitives, of a file
 DEEPEST_TREE = 500  # limit of the nodes from the root to a leaf
@@ -251,10 +252,10 @@ SUPPORTED_EXTENSIONS = tuple(
     "KHR_materials_pbrSpecularGlossiness "
     "KHR_mesh_quantization KHR_texture_transform VRM VRMC_vrm".split()
 )
-"""Extensions that are understood."""
+"""Extensions that are read, at least in part."""
 _APPEARANCE_PREFIXES = ("KHR_materials_", "KHR_xmp")
-"""Prefixes of extensions without which a file looks different but has the same
-geometry: warnings name them.
+"""Prefixes of extensions that change how a file looks, but not its geometry. If they are
+not supported, a warning names them.
 """
 
 
@@ -267,10 +268,10 @@ def is_splat_name(name: str) -> bool:
 
 
 def _check_references(path: Path, header: Header) -> None:
-    """Check that everything that a header refers to is in the header.
+    """Check that every entry to which a header refers is in the header.
 
     Raises:
-        FileFormatError: it is not.
+        FileFormatError: an entry is missing.
     """
     for entry in header.iterate_entries():
         for kind, index in entry.iterate_references():
@@ -280,7 +281,8 @@ def _check_references(path: Path, header: Header) -> None:
                     path, f"glTF with {index + 1} {kind}, as it refers to", f"{count}"
                 )
     for animation in header.animations:
-        max_index = max((channel.curve for channel in animation.channels), default=-1)
+        sampler_indices = [channel.sampler_index for channel in animation.channels]
+        max_index = max(sampler_indices, default=-1)
         n_samplers = len(animation.samplers)
         if max_index >= n_samplers:
             raise damaged(
@@ -291,12 +293,13 @@ def _check_references(path: Path, header: Header) -> None:
 
 
 def check_header(path: Path, header: Header) -> None:
-    """Check what the types of a header leave open.
+    """Check a header whose entries have the right types.
 
     Raises:
         FileFormatError: the header needs an extension that is not supported, refers to
-            what is not there, or is over a limit.
+            a missing entry, or is over a limit.
     """
+    # A file that requires an extension of its appearance is read without it.
     unsupported = sorted(
         name
         for name in header.extensionsRequired
@@ -331,9 +334,7 @@ def _make_unsupported_error(path: Path, names: Iterable[str]) -> FileFormatError
     """Return the error for a file that needs extensions that are not supported."""
     names = list(names)
     if any(map(is_splat_name, names)):
-        return FileFormatError(
-            f"{path}: needs Gaussian splats, a model that {SPLATS_ADVICE}"
-        )
+        return FileFormatError(f"{path}: needs Gaussian splats: {SPLATS_ADVICE}")
     text = format_name(", ".join(names), quoted=False)
     return FileFormatError(
         f"{path}: needs {text}, which is not supported; export it without that option"
@@ -341,7 +342,7 @@ def _make_unsupported_error(path: Path, names: Iterable[str]) -> FileFormatError
 
 
 def find_unread_extensions(entry: Entry) -> list[str]:
-    """Return the names of an entry's extensions that are not understood."""
+    """Return the names of an entry's extensions that are not read."""
     if not isinstance(entry.extensions, dict):
         return []
     return sorted(name for name in entry.extensions if name not in SUPPORTED_EXTENSIONS)
@@ -352,7 +353,8 @@ def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
 
     Types have to be those of the format, attributes need as many values as positions,
     and indices have to be unsigned integers. An accessor without data is an error if
-    the primitive has an unsupported extension: that may hold the data, compressed.
+    the primitive has an unsupported extension, which may hold the data in compressed
+    form.
 
     Raises:
         FileFormatError: an accessor is wrong, or an extension is needed.
@@ -395,8 +397,8 @@ def _check_attributes(
         attributes: accessors of its attributes, by name.
 
     Raises:
-        FileFormatError: one has a type that the format excludes, or not as many values
-            as there are positions.
+        FileFormatError: an attribute has a type that the format excludes, or its number
+            of values is not that of the positions.
     """
     uv_name = "TEXCOORD_0"
     if primitive.material is not None:
@@ -422,8 +424,8 @@ def _check_attributes(
 def _check_tree(path: Path, header: Header) -> None:
     """Check the number of triangles and primitives, and that nodes form trees.
 
-    A mesh counts as often as nodes draw it, and once if none does. Nodes must have one
-    parent at most, form no cycles, and be at most `DEEPEST_TREE` deep.
+    A mesh counts once for each node that draws it, and once if none does. Nodes must
+    have one parent at most, form no cycles, and be at most `DEEPEST_TREE` deep.
 
     Raises:
         FileFormatError: nodes are no trees, or a limit is exceeded.
@@ -459,7 +461,7 @@ def _find_children(path: Path, header: Header) -> set[int]:
 def _check_tree_sizes(path: Path, header: Header) -> None:
     """Raise FileFormatError if there are too many triangles, primitives or nodes.
 
-    A mesh counts as often as nodes draw it; all meshes count once at least.
+    A mesh counts once for each node that draws it, and at least once.
     """
     triangles_of_mesh = [
         sum(_count_max_triangles(header, primitive) for primitive in mesh.primitives)
@@ -474,7 +476,7 @@ def _check_tree_sizes(path: Path, header: Header) -> None:
         path,
         max(n_instanced, sum(primitives_of_mesh), len(header.nodes)),
         LARGEST_TREE,
-        "glTF of at most {} nodes and pieces",
+        "glTF of at most {} nodes and primitives",
     )
 
 
@@ -512,13 +514,13 @@ class GltfFile:
         path: the file.
         header: its checked header.
         references: finds files beside it.
-
-    Raises:
-        FileFormatError: as `read_header`.
     """
 
     def __init__(self, path: Path, data: bytes) -> None:
-        """Read the header; buffers are loaded when they are first used."""
+        """Read the header; buffers are loaded when they are first used.
+
+        Raises FileFormatError as `read_header`.
+        """
         self.path = path
         self.header = read_header(path, data)
         self.references = References(path)
@@ -527,11 +529,11 @@ class GltfFile:
         self._sparse_filled: dict[int, npt.NDArray[Any]] = {}
 
     def load_uri(self, uri: str) -> bytes:
-        """Return the content of a data URI, or of the file in the folder that it names.
+        """Return the content of a data URI, or of the file that the URI names.
 
         Raises:
-            FileNotFoundError: there is no such file, or it must not be read; the
-                references state which.
+            FileNotFoundError: there is no such file, or it must not be read. The reason
+                is in `references.refused`.
             ValueError: the data is not valid base64.
         """
         if not uri.startswith("data:"):
@@ -544,7 +546,7 @@ class GltfFile:
         """Return the bytes of a buffer view.
 
         Raises:
-            FileFormatError: they are not there.
+            FileFormatError: the buffer is too short, or cannot be loaded.
         """
         view = self.header.bufferViews[index]
         data = self._load_buffer(view.buffer)
@@ -637,16 +639,16 @@ class GltfFile:
     def _replace_rows(
         self, dense_values: npt.NDArray[Any], accessor: Accessor, sparse: Sparse
     ) -> npt.NDArray[Any]:
-        """Return a copy of values with the rows replaced that sparse values replace.
+        """Return a copy of an accessor's values in which sparse values replace rows.
 
         Args:
             dense_values: (count, width) the values without the sparse ones.
-            accessor: the accessor that has them.
+            accessor: the accessor.
             sparse: its sparse values, and the rows that they replace.
 
         Raises:
-            FileFormatError: there are too many, or they are for rows that are not
-                there.
+            FileFormatError: there are too many sparse values, or they are for rows that
+                do not exist.
         """
         sparse_indices = sparse.indices
         sparse_values = sparse.values
@@ -664,10 +666,10 @@ class GltfFile:
         if sparse_rows.max() >= accessor.count:
             raise damaged(
                 self.path,
-                f"sparse values at places under {accessor.count:,}",
+                f"sparse values at rows under {accessor.count:,}",
                 f"{int(sparse_rows.max()):,}",
             )
-        # a copy, because these may be a view of the file's bytes
+        # a copy, because `dense_values` may be a view of the file's bytes
         values = np.array(dense_values)
         values[sparse_rows] = self._make_array(
             sparse_values.bufferView,
@@ -689,10 +691,11 @@ class GltfFile:
 
         Args:
             view: index of the buffer view.
-            offset: its first byte in the view.
+            offset: first byte of the array in the view.
             shape: rows and columns.
             kind: type of its numbers.
-            stride: bytes from one row to the next; None: rows follow without a gap.
+            stride: bytes from one row to the next; None if there is no gap between
+                rows.
 
         Raises:
             FileFormatError: the view is too short.
@@ -713,8 +716,8 @@ class GltfFile:
     def read_numbers(self, index: int, rows: IntArray) -> Float64Array:
         """Return rows (N,) of an accessor as float64 (N, width).
 
-        Normalised integers become numbers in [-1, 1]: they are divided by the largest
-        value of their type. The smallest signed one would be below -1, and is clipped.
+        Normalized integers are divided by the largest value of their type. The results
+        are in [-1, 1]: the smallest signed integer would be below -1, and is clipped.
         """
         values = self.read_values(index)[rows]
         numbers: Float64Array = values.astype(np.float64)

@@ -19,15 +19,16 @@ from pydantic import (
     JsonValue,
 )
 
-# Generator of glTF that was converted from USD; its notes are in the asset's extras.
+# Generator of glTF files that were converted from USD. Notes of the converter are in the
+# extras of their asset.
 GENERATOR = "advsearch, of OpenUSD"
 T = TypeVar("T")
 List = Annotated[list[T], FailFast()]
-"""A list of which only the first wrong entry is reported, since a million reports take
+"""A list whose validation stops at the first wrong entry, since a million errors take
 gigabytes.
 """
 Unread = Annotated[JsonValue, Field(exclude=True)]
-"""A value that is never read: it has a warning of its own, or changes nothing."""
+"""A value that is not read as an entry: it is handled elsewhere, or changes nothing."""
 Index = Annotated[int, Field(ge=0, lt=1 << 32)]
 Size = Annotated[int, Field(ge=0, lt=1 << 40)]
 _WIDTH_OF_TYPE = {
@@ -82,6 +83,7 @@ class Entry(BaseModel):
                 yield item
                 queue.extend(vars(item).values())
             elif isinstance(item, (list, dict)):
+                # Fields have entries in a list or dictionary, but not in nested ones.
                 children = item.values() if isinstance(item, dict) else item
                 queue.extend(child for child in children if isinstance(child, Entry))
 
@@ -89,9 +91,9 @@ class Entry(BaseModel):
     def list_extension_keys(cls) -> dict[str, set[str]]:
         """Return, for each extension of this type of entry, the keys that are read.
 
-        They are those to which fields are aliased: for a node
-        `{"KHR_lights_punctual": {"light"}}`. The set is empty if a field is the
-        extension itself, as an entry of its own.
+        These are the keys to which fields are aliased: for a node
+        `{"KHR_lights_punctual": {"light"}}`. The set is empty if a field has the
+        extension itself as an entry.
         """
         keys_of_extension: dict[str, set[str]] = {}
         for info in cls.model_fields.values():
@@ -102,10 +104,10 @@ class Entry(BaseModel):
         return keys_of_extension
 
     def iterate_references(self) -> Iterator[tuple[str, int]]:
-        """Yield a list of the header, and an index in it, for each reference.
+        """Yield each reference: the name of a list of the header, and an index in it.
 
-        References are fields named in `REFERENCED_LISTS`. Their values are an index, or
-        lists or dictionaries of indices.
+        References are fields named in `REFERENCED_LISTS`. A value is an index, or a
+        list or dictionary of indices.
         """
         for name, value in vars(self).items():
             queue: list[Any] = [value] if name in REFERENCED_LISTS else []
@@ -167,7 +169,7 @@ class Accessor(Entry):
 
     @property
     def width(self) -> int:
-        """How many numbers one of its values has."""
+        """Number of components of each value, such as 3 for "VEC3"."""
         return _WIDTH_OF_TYPE[self.type]
 
 
@@ -176,7 +178,7 @@ class Primitive(Entry):
     indices: Index | None = None
     material: Index | None = None
     mode: Annotated[int, Field(ge=0, le=6)] = 4
-    # Morph targets: what is added to each attribute at weight 1.
+    # Morph targets: accessors of the offsets of each attribute at weight 1.
     targets: List[dict[str, Index]] = []
 
 
@@ -211,15 +213,16 @@ class Skin(Entry):
 
 
 class ChannelTarget(Entry):
-    """What a channel moves; without a node, something of an extension."""
+    """The property that a channel moves; without a node, it is of an extension."""
 
     path: str
     node: Index | None = None
 
 
 class Channel(Entry):
-    # Curve of the samplers of its animation.
-    curve: Index = Field(validation_alias="sampler")
+    # Index in the samplers of its animation. It is not named `sampler`, since such a
+    # field refers to the samplers of textures (`REFERENCED_LISTS`).
+    sampler_index: Index = Field(validation_alias="sampler")
     target: ChannelTarget
 
 
@@ -238,7 +241,7 @@ class Animation(Entry):
 
 
 class HumanBone(Entry):
-    """The node of a bone of a person in VRM; only VRM 0 has the name here."""
+    """The node of a person's bone in VRM; `bone` is its name, which only VRM 0 has."""
 
     node: Index
     bone: str = ""
@@ -341,10 +344,8 @@ class SpecularGlossiness(Entry):
     glossinessFactor: float = 1.0
 
 
-TRANSPARENT_MODES = (
-    "MASK",
-    "BLEND",
-)  # modes in which the alpha of the base color counts
+# Alpha modes in which the alpha of the base color is used.
+TRANSPARENT_MODES = ("MASK", "BLEND")
 # Default alpha below which a masked surface is cut out.
 DEFAULT_ALPHA_CUTOFF = 0.5
 
@@ -372,8 +373,8 @@ class MaterialEntry(Entry):
     def surface(self) -> MetallicRoughness:
         """Base color, roughness and metallic.
 
-        A material of KHR_materials_pbrSpecularGlossiness is read as one without metal:
-        the base color is its diffuse color, and roughness is 1 - glossiness.
+        A material of KHR_materials_pbrSpecularGlossiness is read as not metallic. Its
+        base color is the diffuse color, and its roughness is 1 - glossiness.
         """
         glossy = self.glossiness
         if glossy is None:
@@ -387,9 +388,10 @@ class MaterialEntry(Entry):
 
     @property
     def layout_texture(self) -> TextureUse | None:
-        """The texture whose coordinates the mesh gets.
+        """The texture whose coordinates become those of the mesh.
 
-        It is that of the base color, or else the normal map, or that of the emission.
+        It is the texture of the base color, or else the normal map, or else the texture
+        of the emission.
         """
         return (
             self.surface.baseColorTexture or self.normalTexture or self.emissiveTexture
@@ -405,7 +407,7 @@ class MaterialEntry(Entry):
     def can_read(self, use: TextureUse | None) -> bool:
         """Return whether a texture has the coordinates of `layout_texture`, or is None.
 
-        Others are left out.
+        Textures with other coordinates are left out.
         """
         return (
             use is None
@@ -423,8 +425,8 @@ class MaterialEntry(Entry):
 REPEAT = 10497
 MIRRORED = 33648
 CLAMPED = 33071
-BORDER = 33069  # nothing beyond the edges: OpenGL's and USD's, not glTF's
-NEAREST = 9728  # the filter that leaves texels sharp
+BORDER = 33069  # black beyond the edges; a mode of OpenGL and USD, not of glTF
+NEAREST = 9728  # filter that does not interpolate between texels
 FLOAT32 = 5126  # the component type of 32-bit floats
 
 
@@ -442,7 +444,7 @@ class Texture(Entry):
 
     @property
     def image(self) -> int | None:
-        """Index of its image; None if only an unknown extension has one."""
+        """Index of its image; None if only an unsupported extension has one."""
         return self.source if self.webp is None else self.webp
 
 
@@ -473,19 +475,19 @@ class Header(Entry):
     vrm: dict[str, HumanBone] = _make_extension_field(
         "VRMC_vrm", "humanoid", "humanBones", default={}
     )
-    """The bones of a person by the names of VRM 1."""
+    """The bones of a person in VRM 1, by name."""
     vrm_0: List[HumanBone] = _make_extension_field(
         "VRM", "humanoid", "humanBones", default=[]
     )
     lights: List[LightEntry] = _make_extension_field(
         "KHR_lights_punctual", "lights", default=[]
     )
-    """The lights that nodes may carry."""
+    """The lights to which nodes refer."""
     extensionsUsed: List[str] = []
     extensionsRequired: List[str] = []
 
     def find_descendants(self, nodes: Iterable[int]) -> set[int]:
-        """Return nodes and all their descendants."""
+        """Return the given nodes and all their descendants."""
         reached = set[int]()
         level = set(nodes)
         while level:

@@ -61,34 +61,33 @@ from advsearch.scene.importing.texture import average_over_faces
 from advsearch.scene.importing.unread import TrackedKeys
 from advsearch.scene.skeleton import MorphTarget, Movable, Skeleton
 
-# ---- Notes on what a glTF file has and our scenes do not have ----
+# ---- Notes on entries of a glTF file that our scenes cannot represent ----
 #
-# Nothing is dropped silently. The caller prepends the name of the file.
+# Nothing is dropped silently. The name of the file is the subject of each sentence.
 
-_OPAQUE = " lets light pass through surfaces with {name}; here they are opaque"
+_OPAQUE = "lets light pass through surfaces with {name}; here they are opaque"
 EXTENSION_NOTES = {
-    "EXT_mesh_gpu_instancing": " repeats meshes with {name}; each is there once",
+    "EXT_mesh_gpu_instancing": "repeats meshes with {name}; each is imported once",
     "KHR_materials_diffuse_transmission": _OPAQUE,
-    "KHR_materials_pbrSpecularGlossiness": " has {name}, of which only diffuse colour "
+    "KHR_materials_pbrSpecularGlossiness": "has {name}, of which only diffuse colour "
     "and glossiness are read",
     "KHR_materials_transmission": _OPAQUE,
-    "KHR_materials_unlit": " has surfaces that keep their colour in any light "
+    "KHR_materials_unlit": "has surfaces that keep their colour in any light "
     "({name}); here they are lit as others",
-    "KHR_materials_variants": " has variants of its materials ({name}); those that it "
-    "shows by itself are taken",
+    "KHR_materials_variants": "has variants of its materials ({name}); the default "
+    "ones are used",
 }
-"""Sentence about each extension; `UNKNOWN_EXTENSION_NOTE` is that of all others not
-understood.
-"""
-UNKNOWN_EXTENSION_NOTE = " uses {name}, which is not understood and left out"
-MAX_SENTENCE_LENGTH = 500  # characters of what the reader of OpenUSD says
+"""Predicates of notes about extensions, whose subject is the file."""
+UNKNOWN_EXTENSION_NOTE = "uses {name}, which is not supported and left out"
+"""Predicate of the note about an extension that has none in `EXTENSION_NOTES`."""
+MAX_SENTENCE_LENGTH = 500  # limit of the characters of a note of the USD converter
 DIRECTIONAL_LIGHT_DISTANCE = 1000.0  # distance of a directional light, in object sizes
 
 
 def note_left_out(header: Header, notes: Notes) -> None:
-    """Note what a file has that is not imported.
+    """Note the contents of a file that are not imported.
 
-    These are sentences of the converter from OpenUSD, extensions, and then maps,
+    First come notes of the converter from OpenUSD, then extensions, and then maps,
     materials, scenes, nodes and keys that are not read. The notes do not depend on
     whether the object is one node of the file or the full file.
 
@@ -112,25 +111,26 @@ def _note_converter_sentences(header: Header, notes: Notes) -> None:
     if not isinstance(sentences, list):
         return
     for sentence in sentences:
-        text = format_name(str(sentence), quoted=False, max_length=MAX_SENTENCE_LENGTH)
-        notes.warn(f" {text}")
+        predicate = format_name(
+            str(sentence), quoted=False, max_length=MAX_SENTENCE_LENGTH
+        )
+        notes.warn_that_file(predicate)
 
 
 def _note_extensions(header: Header, notes: Notes) -> None:
     """Note the extensions of a file that are read in part only, or not at all."""
     used_extensions = {*header.extensionsUsed, *header.extensionsRequired}
     if any(map(is_splat_name, used_extensions)):
-        notes.warn(
-            f" has Gaussian splats, which are left out: a model that {SPLATS_ADVICE}"
+        notes.warn_that_file(
+            f"has Gaussian splats, which are left out: {SPLATS_ADVICE}"
         )
-    # Some supported extensions are read only in part; `EXTENSION_NOTES` has a sentence
-    # about each of these.
+    # Some supported extensions are read only in part. They have a note, too.
     partly_read = used_extensions & set(EXTENSION_NOTES)
     unread = used_extensions - set(SUPPORTED_EXTENSIONS)
     for name in sorted(partly_read | unread):
         if not is_splat_name(name):
-            sentence = EXTENSION_NOTES.get(name, UNKNOWN_EXTENSION_NOTE)
-            notes.warn(sentence.format(name=format_name(name, quoted=False)))
+            template = EXTENSION_NOTES.get(name, UNKNOWN_EXTENSION_NOTE)
+            notes.warn_that_file(template.format(name=format_name(name, quoted=False)))
 
 
 def _find_left_out_entries(header: Header) -> dict[str, Iterable[bool]]:
@@ -142,9 +142,11 @@ def _find_left_out_entries(header: Header) -> dict[str, Iterable[bool]]:
     """
     roots: Iterable[int] = range(len(header.nodes))
     if header.scenes:
-        roots = header.scenes[header.scene or 0].nodes
-    scene_nodes = header.find_descendants(roots)
+        default_scene = header.scene or 0
+        roots = header.scenes[default_scene].nodes
+    scene_nodes = header.find_descendants(roots)  # with the roots themselves
     materials = header.materials
+    # `can_read` is also True for a material without the texture.
     return {
         "occlusion map{s}: left out": (
             material.occlusionTexture is not None for material in materials
@@ -185,9 +187,9 @@ ENTRY_KINDS = {
     },
     **{"TextureTransform": "entry of KHR_texture_transform"},
 }
-"""Kind, for notes, of the keys left out of each type of entry."""
+"""Kind, for notes, of the keys of each type of entry that are left out."""
 IGNORED_KEYS = frozenset(("name", "weights", "extensions"))
-"""Keys without a field that need no note: they change nothing, or another note covers
+"""Keys without a field that need no note: they change nothing, or another note reports
 them.
 """
 
@@ -200,14 +202,18 @@ def _note_unread(header: Header, notes: Notes) -> None:
     """
     for entry in header.iterate_entries():
         kind = ENTRY_KINDS.get(type(entry).__name__)
+        # Entries of other types, such as accessors, have no keys that change the image.
         if kind is not None:
             for key in _find_unread_keys(entry):
                 notes.record(kind, key)
+    # Keys that are marked as read are not noted, although they were recorded above.
     for kind in set(ENTRY_KINDS.values()):
-        is_of_material = "material" in kind or "texture" in kind
-        # In a material or a texture, extras may change how it looks. Elsewhere they are
+        ignored_keys = set(IGNORED_KEYS)
+        # Extras of a material or a texture may change how it looks. Elsewhere they are
         # private data of applications, which need no note.
-        for key in IGNORED_KEYS if is_of_material else {*IGNORED_KEYS, "extras"}:
+        if "material" not in kind and "texture" not in kind:
+            ignored_keys.add("extras")
+        for key in ignored_keys:
             notes.mark_read(kind, key)
     for mesh in header.meshes:
         for primitive in mesh.primitives:
@@ -216,15 +222,18 @@ def _note_unread(header: Header, notes: Notes) -> None:
 
 def _find_unread_keys(entry: Entry) -> list[str]:
     """Return the keys of an entry that have no field, also within its extensions."""
+    # The model has no extras for keys with a field, such as `extensions`.
     keys = TrackedKeys({**(entry.model_extra or {}), "extensions": entry.extensions})
     extensions = keys.get_nested("extensions")
     for name, read_keys in entry.list_extension_keys().items():
         extension = extensions.get_nested(name)
-        # Without a list of keys the extension is an `Entry` itself, whose unread keys
-        # are noted when it is iterated over. Here all of its keys count as read.
-        all_keys = {key for key, _ in extension.items()}
-        extension.mark_read(*(read_keys or all_keys))
-    # Extensions that are not understood are noted once for the file.
+        is_entry = not read_keys
+        if is_entry:
+            # `iterate_entries` yields this extension as an entry, and then its unread
+            # keys are found. Here all of its keys are marked as read.
+            read_keys = {key for key, _ in extension.items()}
+        extension.mark_read(*read_keys)
+    # Extensions that are not supported are noted once for the file.
     extensions.mark_read(*(name for name, _ in extensions.items()))
     return keys.find_unread()
 
@@ -232,12 +241,13 @@ def _find_unread_keys(entry: Entry) -> list[str]:
 def _note_unread_attributes(header: Header, primitive: Primitive, notes: Notes) -> None:
     """Note the vertex attributes of a primitive that are not read.
 
-    Attributes of skins and Gaussian splats are left out here: the former are read, and
-    the latter have a note of their own.
+    Attributes of skins are read if the file has skins. Gaussian splats are noted by
+    `_note_extensions`.
     """
     read_names = {"POSITION", "NORMAL", "COLOR_0", "TEXCOORD_0"}
     if primitive.material is not None:
         material = header.materials[primitive.material]
+        # Normal maps and emission are read only with the coordinates of the base color.
         read_names.add(material.uv_attribute)
         roughness_texture = material.surface.metallicRoughnessTexture
         if roughness_texture is not None:
@@ -260,7 +270,7 @@ def describe_left_out(header: Header, file: str) -> list[str]:
     if not phrases:
         return []
     verb = "is" if sum(has_light) + sum(has_camera) == 1 else "are"
-    advice = "name one node as the object, FILE#NODE, to keep the rest around it"
+    advice = "name one node as the object, FILE#NODE, to import the rest around it"
     return [f"{file}: {' and '.join(phrases)} {verb} left out of the object; {advice}"]
 
 
@@ -286,8 +296,8 @@ def _count_phrases(kinds: Mapping[str, Iterable[bool]]) -> list[str]:
     """Return a phrase with a count, such as "2 cameras", for each kind that occurs.
 
     Args:
-        kinds: for each phrase whether each thing is of that kind; {s} and {es} in it
-            become plural endings.
+        kinds: for each phrase, whether each entry of the file is of that kind. {s} and
+            {es} in the phrase become plural endings.
     """
     phrases = []
     for phrase, is_of_kind in kinds.items():
@@ -304,19 +314,17 @@ def _format_count(count: int, phrase: str) -> str:
     return f"{count} {phrase.format(s='s', es='es')}"
 
 
-# How far texture coordinates may lie outside [0, 1] before the wrap mode matters.
+# Texture coordinates may be outside [0, 1] by this much before the wrap mode matters.
 WRAP_TOLERANCE = 1e-4
-SMALL_IMAGE_SIZE = (
-    256  # texels of a side up to which half a texel at an edge is visible
-)
+SMALL_IMAGE_SIZE = 256  # texels of a side up to which half a texel is visible
+# Predicates of notes, whose subject is the file.
 EDGES_NOTE = (
-    " has textures that do not repeat beyond their edges; where they differ, or "
-    "reach far, they do here"
+    "has textures that do not repeat beyond their edges; where they differ, or reach "
+    "far, they do here"
 )
 BLURRED_NOTE = (
-    " has textures with sharp texels (filter NEAREST); those above {most} "
-    "texels "
-    "a side are filtered"
+    "has textures with sharp texels (filter NEAREST); those above {most} texels a "
+    "side are filtered"
 )
 
 
@@ -326,14 +334,14 @@ class GltfSurfaces:
 
     file: GltfFile
     notes: Notes  # notes about the file
-    # Longest side of a texture; None: as `FileImages` limits those of an object.
+    # Longest side of a texture; None for the limit that `FileImages` computes.
     texture_limit: int | None = None
 
     def __post_init__(self) -> None:
         """Prepare to decode images, whose size depends on the number of materials."""
-        materials = len(self.file.header.materials)
+        n_materials = len(self.file.header.materials)
         self._images = FileImages(
-            materials, self.file.references, self.notes, self.texture_limit
+            n_materials, self.file.references, self.notes, self.texture_limit
         )
 
     def make_surface(
@@ -344,11 +352,11 @@ class GltfSurfaces:
         Args:
             material_index: index of the material; None is the format's default.
             pieces: all primitives with the material, with texture coordinates as the
-                format has them.
+                file stores them.
 
         Returns:
-            The surface; and the scale (2,) and the shift (2,), added after scaling,
-            that fit texture coordinates to its images.
+            The surface; and the scale (2,) and shift (2,) by which a texture coordinate
+            t of the file becomes scale * t + shift.
         """
         material = MaterialEntry()
         name = ""
@@ -374,8 +382,8 @@ class GltfSurfaces:
     ) -> tuple[Float32Array | None, Float32Array | None]:
         """Return the base color (3 or 4,) and its texture (H, W, 3 or 4), in sRGB.
 
-        The base color factor multiplies the texture. Opacity, the fourth channel, is
-        there only for the alpha modes "MASK" and "BLEND". The color is None if it is
+        The base color factor multiplies the texture. There is a fourth channel, the
+        opacity, only for the alpha modes "MASK" and "BLEND". The color is None if it is
         plain white and the material names a texture, even if its file is missing.
         """
         entry = material.surface
@@ -393,6 +401,7 @@ class GltfSurfaces:
         texture = self._load_image(
             entry.baseColorTexture,
             image_kind,
+            # The blank makes the file the subject: "chair.glb names the texture ...".
             f" names the texture {{name}}, which {{why}}; {describe_substitute(color)} "
             "is used instead",
         )
@@ -433,7 +442,8 @@ class GltfSurfaces:
         image = self._load_image(
             use, "colours", "the texture {name} of the emission {why}; it is left out"
         )
-        # A texture that cannot be read leaves no emission: without it all would shine.
+        # If the texture cannot be read, there is no emission: without the texture, all
+        # of the surface would emit light.
         if use is not None and image is None:
             return None
         return compute_radiance(factor, image, self.notes)
@@ -443,8 +453,8 @@ class GltfSurfaces:
     ) -> tuple[float, float]:
         """Return roughness and metallic: the factors times the mean of their texture.
 
-        The mean is taken over the faces that show the texture, or over all of it if
-        they have no texture coordinates.
+        The mean is that over the faces with the texture, or over all texels if faces
+        have no texture coordinates.
 
         Args:
             material: the material.
@@ -471,12 +481,13 @@ class GltfSurfaces:
     ) -> Float32Array | None:
         """Return the texels (H, W, C) of a texture for a renderer that filters.
 
-        If the file wants sharp texels (filter NEAREST), each texel is repeated, so that
-        filtering is not visible. A texture too large for that is filtered, with a note.
+        If the file requests sharp texels (filter NEAREST), each texel is repeated, so
+        that filtering is not visible. A texture too large for that is filtered, with a
+        note.
 
         Args:
             use: the texture; None returns None.
-            kind: what it holds.
+            kind: content of the image, such as "colours".
             note_template: the note if it has no texels, with `{name}` for the image and
                 `{why}` for the reason; then None is returned.
         """
@@ -487,12 +498,14 @@ class GltfSurfaces:
         is_single_texel = texels is not None and texels.shape[:2] == (1, 1)
         if texels is None or not is_unfiltered or is_single_texel:
             return texels
-        # Texels are repeated until the image has up to this size. Then the texels of
-        # the result are so small that filtering is not visible.
+        # Texels are repeated until the longer side has up to this size. Then the texels
+        # of the result are so small that filtering is not visible.
         max_sharp_size = min(self._images.max_side, TEXTURE_LIMIT) // 2
         repeats = max_sharp_size // max(texels.shape[:2])
-        if repeats < 2:
-            self.notes.warn(BLURRED_NOTE.format(most=max_sharp_size // 2))
+        min_repeats = 2
+        if repeats < min_repeats:
+            largest_side = max_sharp_size // min_repeats
+            self.notes.warn_that_file(BLURRED_NOTE.format(most=largest_side))
             return texels
         return texels.repeat(repeats, axis=0).repeat(repeats, axis=1)
 
@@ -503,7 +516,7 @@ class GltfSurfaces:
 
         Args:
             use: the texture.
-            kind: what it holds, such as "colours".
+            kind: content of the image, such as "colours".
             note_template: the note if it has no texels, with `{name}` for the image and
                 `{why}` for the reason; then None is returned.
         """
@@ -511,7 +524,7 @@ class GltfSurfaces:
         if image_index is None:
             self._images.note_missing(
                 "(embedded)",
-                "has a picture of a kind that is not understood",
+                "has a picture in an unsupported format",
                 note_template,
             )
             return None
@@ -546,8 +559,8 @@ class GltfSurfaces:
     ) -> tuple[ImportedSurface, Float64Array, Float64Array]:
         """Change a surface's images so that repeating them looks like their wrap modes.
 
-        The renderer repeats all textures. Mirrored images are doubled. Clamped images
-        and those with a border are padded, as far as texture coordinates reach.
+        The renderer repeats all textures, so that other wrap modes are a part of the
+        images: see `_fit_axis`.
 
         Args:
             surface: the surface.
@@ -564,7 +577,8 @@ class GltfSurfaces:
         images = list(surface.images)
         if not images or not len(all_uvs) or not np.isfinite(all_uvs).all():
             return surface, scale, shift
-        # `images` has the texture first, if there is one, and then the normal map.
+        # `images` has the texture first, if there is one, then the normal map, then the
+        # emission.
         normals_index = None
         if surface.normal_map is not None:
             normals_index = 0 if surface.texture is None else 1
@@ -586,10 +600,10 @@ class GltfSurfaces:
         return surface.with_images(images), scale, shift
 
     def _list_samplers(self, material: MaterialEntry) -> list[Sampler]:
-        """Return the samplers of a material's textures that the mesh has coordinates
-        for.
+        """Return the samplers of a material's textures that are read.
 
-        The first is that of the texture whose coordinates the mesh has.
+        The first is that of the texture whose coordinates the mesh has. Textures whose
+        images are missing have a sampler, too.
         """
         uses = (
             material.surface.baseColorTexture,
@@ -612,17 +626,18 @@ class GltfSurfaces:
     ) -> tuple[list[Float32Array], float, float]:
         """Fit images (H, W, C) along one axis to the wrap mode of the first of them.
 
-        Repeated images stay. Mirrored ones are doubled if texture coordinates reach
-        outside [0, 1]. Clamped ones and those with a border are padded, and so are
-        mirrored ones inside [0, 1], if coordinates reach outside or opposite edges
-        would blend visibly.
+        If texture coordinates reach outside [0, 1], mirrored images are doubled, and
+        images that are clamped or have a border are padded. If coordinates are inside
+        [0, 1], images of all three modes are padded by their edges only where opposite
+        edges would blend visibly. Repeated images are not changed.
 
         Args:
             images: the images of a surface.
             axis: axis of their arrays, 0 for rows.
-            wraps: wrap mode of each.
+            wraps: wrap modes of the material's textures. The first is applied to all
+                images; if others differ, and it matters, there is a note.
             bounds: smallest and largest texture coordinate along the axis.
-            normals_index: which of the images is a normal map.
+            normals_index: index of the normal map in `images`; None if there is none.
 
         Returns:
             The images, and scale and shift of texture coordinates.
@@ -631,27 +646,28 @@ class GltfSurfaces:
         edges_differ = any(_edges_differ(image, axis) for image in images)
         first_wrap = wraps[0]
         if reaches_out and len(set(wraps)) > 1:
-            self.notes.warn(EDGES_NOTE)
-        if first_wrap == gltf_entries.BORDER and reaches_out:
+            self.notes.warn_that_file(EDGES_NOTE)
+        # Inside [0, 1] the border is not visible.
+        has_border = first_wrap == gltf_entries.BORDER and reaches_out
+        if has_border:
             # Filtering blends the border into half a texel of the image. With smaller
             # texels that is not visible.
             images = [_enlarge(image, axis) for image in images]
         if first_wrap == gltf_entries.MIRRORED and reaches_out:
-            # An image of twice the size, of which old coordinates cover a half.
+            # The image and its mirror image: old coordinates cover the first half.
             mirrored = [
                 np.concatenate([image, np.flip(image, axis)], axis=axis)
                 for image in images
             ]
             return mirrored, 0.5, 0.0
-        is_padded = first_wrap in (
+        is_not_repeated = first_wrap in (
             gltf_entries.CLAMPED,
             gltf_entries.BORDER,
             gltf_entries.MIRRORED,
         )
-        if not is_padded or not (reaches_out or edges_differ):
-            return images, 1.0, 0.0
-        has_border = first_wrap == gltf_entries.BORDER and reaches_out
-        return self._pad_images(images, axis, bounds, normals_index, has_border)
+        if is_not_repeated and (reaches_out or edges_differ):
+            return self._pad_images(images, axis, bounds, normals_index, has_border)
+        return images, 1.0, 0.0
 
     def _pad_images(
         self,
@@ -663,32 +679,33 @@ class GltfSurfaces:
     ) -> tuple[list[Float32Array], float, float]:
         """Pad images along an axis as far as texture coordinates reach.
 
-        Then the renderer, which repeats textures, finds in the pad what the wrap mode
-        asks for. Images that would become larger than twice the limit of a texture stay
-        as they are, with a note.
+        The pads have the texels that the wrap mode requires beyond the image. Images
+        that would become larger than twice the limit of a texture stay as they are,
+        with a note.
 
         Args:
             images: images of one surface, perhaps of different sizes.
             axis: axis of their arrays, 0 for rows.
             bounds: smallest and largest texture coordinate along the axis.
-            normals_index: which of the images is a normal map.
+            normals_index: index of the normal map in `images`; None if there is none.
             has_border: whether pads are black (flat in a normal map); otherwise they
                 repeat the edge.
 
         Returns:
-            The images; and the scale and shift by which a coordinate of an old image
-            becomes that of the padded one, t -> scale t + shift.
+            The images; and the scale and shift by which a coordinate t of an old image
+            becomes that of the padded one, scale * t + shift.
         """
         sizes = [image.shape[axis] for image in images]
-        # All images need pads of the same width in texture coordinates, and whole
-        # texels. So each is divided into as many units as the greatest common divisor
-        # of the sizes: a unit is a whole number of texels in each, and pads are whole
-        # units.
+        # Pads must have the same width in texture coordinates in all images, and an
+        # integer number of texels. So each image is divided into the same number of
+        # units, the greatest common divisor of the sizes, and pads consist of units.
+        # A unit is an integer number of texels in each image.
         n_units = int(np.gcd.reduce(sizes))
         units_before, units_after = _count_pad_units(n_units, bounds)
         padded_units = n_units + units_before + units_after
-        if padded_units * (max(sizes) // n_units) > 2 * self._images.max_side:
-            self.notes.warn(EDGES_NOTE)
+        largest_padded_size = padded_units * (max(sizes) // n_units)
+        if largest_padded_size > 2 * self._images.max_side:
+            self.notes.warn_that_file(EDGES_NOTE)
             return images, 1.0, 0.0
         padded = []
         for index, image in enumerate(images):
@@ -716,13 +733,14 @@ def _multiply_colors(texture: Float32Array, factor: Float32Array) -> Float32Arra
 
 
 def _count_pad_units(n_units: int, bounds: tuple[float, float]) -> tuple[int, int]:
-    """Return how many units the pads before and behind an image need.
+    """Return how many units the pads before and after an image need.
 
-    They reach as far as texture coordinates, and one unit farther, so that filtering
-    does not reach beyond them.
+    An image covers the texture coordinates from 0 to 1, and is divided into units of
+    equal length. Pads reach as far as texture coordinates, and one unit farther, so
+    that filtering does not reach beyond them.
 
     Args:
-        n_units: number of units of the image itself, which is from 0 to 1.
+        n_units: number of units of the image.
         bounds: smallest and largest texture coordinate.
     """
     min_uv, max_uv = bounds
@@ -743,9 +761,9 @@ def _average_where_visible(
         pieces: the primitives with the material.
     """
     mapped_parts = [
-        (piece.part, piece.packed_uvs)
+        (piece.part, piece.roughness_uvs)
         for piece in pieces
-        if piece.packed_uvs is not None
+        if piece.roughness_uvs is not None
     ]
     if not mapped_parts:
         return np.asarray(image.mean(axis=(0, 1), dtype=np.float64), np.float32)
@@ -795,11 +813,11 @@ def _pad(
 def _enlarge(picture: Float32Array, axis: int) -> Float32Array:
     """Enlarge an image to at least `SMALL_IMAGE_SIZE` texels along an axis.
 
-    It is interpolated linearly, by a whole factor. At that size a border of one texel
-    is not visible.
+    It is interpolated linearly, by an integer factor. At that size a border of one
+    texel is not visible.
     """
     size = picture.shape[axis]
-    # twice negated, so that the quotient is rounded up
+    # negated twice, so that the quotient is rounded up
     factor = -(-SMALL_IMAGE_SIZE // size)
     if factor == 1:
         return picture
@@ -827,7 +845,8 @@ TRANSPARENT_COLORS_NOTE = (
     "mesh{es} with an opacity in vertex colours, which is left out"
 )
 DEFAULT_MATERIAL_NOTE = (
-    "mesh{es} without material: of white metal with roughness 1, the default of glTF"
+    "mesh{es} without material: the default of glTF, white metal with roughness 1, is "
+    "used"
 )
 
 
@@ -843,7 +862,7 @@ class _Instance(NamedTuple):
 
 
 def _list_instances(header: Header) -> list[_Instance]:
-    """Return everything that is drawn, in order of the nodes."""
+    """Return every mesh that a node of the scene draws, in order of the nodes."""
     poses = sorted(gltf_skeleton.iterate_poses(header), key=lambda item: item[0])
     instances = []
     for node, pose in poses:
@@ -864,6 +883,7 @@ def _select_with_faces(
     }
 
 
+# NaN and infinite coordinates are reported by `join_parts`, not by NumPy's warnings.
 @np.errstate(all="ignore")
 def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     """Read the primitives of a glTF file that its nodes draw, as one part each.
@@ -884,9 +904,9 @@ def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     pieces = _read_pieces(file, mesh_nodes)
     with_faces = _select_with_faces(pieces)
     if not with_faces:
-        raise _make_no_faces_error(path, header, bool(pieces))
+        raise _make_no_faces_error(path, header, has_primitives=bool(pieces))
     note_left_out(header, notes)
-    _note_pieces(header, list(pieces), with_faces, notes)
+    _note_pieces(header, keys=list(pieces), with_faces=with_faces, notes=notes)
     parts_by_key = _make_parts(GltfSurfaces(file, notes), with_faces)
     skins = _read_skins(file, mesh_nodes)
     skeleton = gltf_skeleton.read_skeleton(file, target_counts)
@@ -894,7 +914,7 @@ def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
         _note_skeleton(skeleton, notes)
 
     parts = _pose_parts(file, instances, parts_by_key, with_faces, skins, skeleton)
-    # The faces of a mesh count as often as nodes draw it.
+    # The faces of a mesh count once for each node that draws it.
     check_faces(path, sum(len(part.faces) for part in parts))
     return parts
 
@@ -910,7 +930,7 @@ class SkinPose(NamedTuple):
 def _read_pieces(
     file: GltfFile, mesh_nodes: Sequence[int]
 ) -> dict[PrimitiveKey, PrimitiveData | None]:
-    """Read the primitives that some nodes draw.
+    """Read the primitives that nodes draw, each once.
 
     Args:
         file: the glTF file.
@@ -933,7 +953,10 @@ def _read_pieces(
         entry = header.meshes[mesh]
         for index, primitive in enumerate(entry.primitives):
             pieces[mesh, index] = read_primitive(
-                file, primitive, entry.extras, mesh in skinned_meshes
+                file,
+                primitive,
+                mesh_extras=entry.extras,
+                is_skinned=mesh in skinned_meshes,
             )
     return pieces
 
@@ -944,8 +967,7 @@ def _make_no_faces_error(
     """Return the error for a file without any face."""
     if any(map(is_splat_name, header.extensionsUsed)):
         return FileFormatError(
-            f"{path}: expected a mesh with faces, got Gaussian "
-            f"splats, a model that {SPLATS_ADVICE}"
+            f"{path}: expected a mesh with faces, got Gaussian splats: {SPLATS_ADVICE}"
         )
     got = "points or lines only" if has_primitives else "none"
     return FileFormatError(
@@ -963,8 +985,8 @@ def _note_pieces(
 
     Args:
         header: the parsed JSON of the file.
-        keys: all primitives, by the indices of the mesh and of the primitive in it.
-        with_faces: those of them with faces.
+        keys: indices of all primitives: of the mesh, and of the primitive in it.
+        with_faces: the primitives with faces, by these indices.
         notes: notes about the file, to which sentences are added.
     """
     primitives = [header.meshes[mesh].primitives[index] for mesh, index in keys]
@@ -1018,7 +1040,7 @@ def _make_parts(
 
 
 def _read_skins(file: GltfFile, mesh_nodes: Sequence[int]) -> dict[int, SkinPose]:
-    """Return the skins of some nodes, in the pose of the scene, by index.
+    """Return the skins of nodes, in the pose of the scene, by index.
 
     A skin's matrices are the poses of its joints times its inverse bind matrices, so
     that they lead from the mesh to the scene (section 3.7.3).
@@ -1041,13 +1063,16 @@ def _read_skins(file: GltfFile, mesh_nodes: Sequence[int]) -> dict[int, SkinPose
 
 
 def _note_skeleton(skeleton: Skeleton, notes: Notes) -> None:
-    """Note that a skeleton is shown at rest, and the first five clips that move it."""
+    """Note that a skeleton is at rest, and which clips the control `body` can play.
+
+    At most five clips are named.
+    """
     names = [clip.name for clip in skeleton.clips]
     clips = ""
     if names:
         more = ", ..." if len(names) > 5 else ""
         clips = f", and plays {', '.join(names[:5])}{more}"
-    notes.warn(f" is shown at rest: the control body moves it{clips}")
+    notes.warn_that_file(f"is shown at rest: the control `body` moves it{clips}")
 
 
 def _pose_parts(
@@ -1060,14 +1085,14 @@ def _pose_parts(
 ) -> list[ImportedPart]:
     """Return the primitives that nodes draw, in the pose of each node.
 
-    A primitive with a skin is posed by its joints alone, as glTF wants it; others are
+    A primitive with a skin is posed only by its joints, as glTF requires; others are
     posed by their node. A mesh that several nodes draw becomes several parts.
 
     Args:
         file: the glTF file.
-        instances: everything that is drawn.
+        instances: the meshes that nodes draw.
         parts_by_key: the primitives as parts, by the indices of mesh and primitive.
-        with_faces: what the file stores of these primitives, by the same indices.
+        with_faces: these primitives as the file stores them, by the same indices.
         skins: the skins of the nodes, by index.
         skeleton: skeleton of the file, None if nothing in it moves.
     """
@@ -1101,7 +1126,7 @@ def _make_movable(
     skin: SkinPose | None,
     skeleton: Skeleton,
 ) -> ImportedPart:
-    """Return a part with its morph targets at rest, and with what moves it.
+    """Return a part with its morph targets at rest, and with the data that moves it.
 
     Args:
         file: the glTF file.
@@ -1145,14 +1170,15 @@ class PrimitiveData(NamedTuple):
     """
 
     part: ImportedPart  # its geometry
-    material: int | None  # index
-    has_transparent_colors: bool  # whether it has vertex colors whose alpha would count
+    material: int | None  # index of its material
+    # Whether it has vertex colors with an alpha below 1, and a transparent material.
+    has_transparent_colors: bool
     vertex_joints: gltf_skeleton.VertexJoints | None  # joints and weights
     targets: tuple[MorphTarget, ...]  # morph targets
-    normal_offsets: tuple[
-        Float64Array | None, ...
-    ]  # what each target adds to its normals
-    packed_uvs: Float64Array | None  # (V, 2) of its texture of roughness and metallic
+    # (V, 3) offsets that each target adds to the normals; None if it changes none.
+    normal_offsets: tuple[Float64Array | None, ...]
+    # (V, 2) coordinates of its texture of roughness and metallic.
+    roughness_uvs: Float64Array | None
 
 
 def _read_vertex_colors(
@@ -1176,7 +1202,7 @@ def _read_vertex_colors(
     return rgba[:, :3][faces], has_alpha
 
 
-def _read_packed_coordinates(
+def _read_roughness_coordinates(
     file: GltfFile,
     attributes: Mapping[str, int],
     material: MaterialEntry,
@@ -1199,18 +1225,18 @@ def _read_packed_coordinates(
 
 
 def read_primitive(
-    file: GltfFile, primitive: Primitive, extras: object, is_skinned: bool
+    file: GltfFile, primitive: Primitive, mesh_extras: object, is_skinned: bool
 ) -> PrimitiveData | None:
     """Read one primitive; None if it is points or lines, or has no positions.
 
     Args:
         file: the glTF file.
         primitive: its entry in the header.
-        extras: extras of its mesh, which may have the names of morph targets.
-        is_skinned: whether a node with a skin draws it.
+        mesh_extras: extras of its mesh, which may have the names of morph targets.
+        is_skinned: whether a node with a skin draws it; otherwise joints are not read.
 
     Raises:
-        FileFormatError: a face refers to a vertex that is not there.
+        FileFormatError: a face refers to a vertex that does not exist.
     """
     attributes = primitive.attributes
     if primitive.mode < TRIANGLES or "POSITION" not in attributes:
@@ -1221,7 +1247,7 @@ def read_primitive(
     if primitive.material is not None:
         material = file.header.materials[primitive.material]
     uvs = _read_texture_coordinates(file, attributes, material.layout_texture, used)
-    packed_uvs = _read_packed_coordinates(file, attributes, material, used)
+    roughness_uvs = _read_roughness_coordinates(file, attributes, material, used)
     colors, has_alpha = _read_vertex_colors(file, attributes, used, faces)
     normals = None
     if "NORMAL" in attributes:
@@ -1229,7 +1255,10 @@ def read_primitive(
     vertex_joints = None
     if is_skinned:
         vertex_joints = gltf_skeleton.read_vertex_joints(file, primitive, used)
-    targets, normal_offsets = gltf_skeleton.read_targets(file, primitive, used, extras)
+    targets, normal_offsets = gltf_skeleton.read_targets(
+        file, primitive, used, mesh_extras
+    )
+    # Primitives with the same material share a surface, which `_make_parts` adds.
     part = ImportedPart(
         vertices=positions,
         faces=faces,
@@ -1246,7 +1275,7 @@ def read_primitive(
         vertex_joints=vertex_joints,
         targets=targets,
         normal_offsets=normal_offsets,
-        packed_uvs=packed_uvs,
+        roughness_uvs=roughness_uvs,
     )
 
 
@@ -1263,7 +1292,7 @@ def _find_used_vertices(
         primitive: entry of the primitive.
 
     Raises:
-        FileFormatError: a face refers to a vertex that is not there.
+        FileFormatError: a face refers to a vertex that does not exist.
     """
     count = file.header.accessors[primitive.attributes["POSITION"]].count
     order = np.arange(count)
@@ -1273,7 +1302,7 @@ def _find_used_vertices(
         raise damaged(
             file.path,
             "faces of its own vertices",
-            "a face that refers to a vertex that is not there",
+            "a face that refers to a vertex that does not exist",
         )
     used_vertices, corners = np.unique(
         _make_triangles(order, primitive.mode), return_inverse=True
@@ -1295,9 +1324,8 @@ def _read_texture_coordinates(
     Args:
         file: the glTF file.
         attributes: indices of the primitive's accessors, by name.
-        use: the texture that they are for; None returns the first coordinates as they
-            are.
-        used: (N,) the vertices that are used.
+        use: the texture; None returns the first coordinates without a transform.
+        used: (N,) the vertices that faces use.
     """
     name = "TEXCOORD_0" if use is None else use.uv_attribute
     if name not in attributes:
@@ -1305,8 +1333,8 @@ def _read_texture_coordinates(
     accessor = file.header.accessors[attributes[name]]
     vertex_count = file.header.accessors[attributes["POSITION"]].count
     if accessor.type != "VEC2" or accessor.count != vertex_count:
-        # No error: the coordinates of the base color were checked with the header, and
-        # these are of a texture that can be left out.
+        # This is no error: the coordinates of the base color were checked with the
+        # header, and other textures can be left out.
         return None
     uvs = file.read_numbers(attributes[name], used)
     if use is None:
@@ -1322,9 +1350,9 @@ def _read_texture_coordinates(
 def _make_triangles(order: IntArray, mode: int) -> IntArray:
     """Return the faces (F, 3) of a primitive of a mode (section 3.7.2.1).
 
-    A list has three vertices for each face; a strip or a fan one for each face after
-    the first two. Of a strip every second face has its last two corners swapped, so
-    that all have the same winding.
+    A list has three vertices for each face. A strip or a fan has one vertex for each
+    face, after the first two vertices. Every second face of a strip has its last two
+    corners swapped, so that all have the same winding.
 
     Args:
         order: the vertices in the order in which the primitive lists them.

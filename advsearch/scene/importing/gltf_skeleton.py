@@ -37,16 +37,16 @@ from advsearch.trust.stored_files import check_most
 
 MAX_JOINT_SETS = 8  # limit of the sets of four joints of a vertex
 MAX_KEY_NUMBERS = 1 << 24
-"""Limit of the numbers in the keys of all clips, before `scaled`; many keys may share
-one accessor.
+"""Limit of the numbers in the keys of all clips, before `scale_limit`. Many keys may
+share one accessor, so that the size of the file does not limit them.
 """
 MAX_MOVES = 1 << 25
-"""Limit of the vertices that all morph targets move, plus the inverse bind matrices;
-before `scaled`.
+"""Limit of the vertices that morph targets move, added up over all targets, plus the
+joints of all primitives; before `scale_limit`.
 """
 VALUE_WIDTHS = {"translation": 3, "rotation": 4, "scale": 3, "weights": 1}
-"""Numbers in a value of each property that a channel may set; of `weights`, for each
-morph target.
+"""Numbers in a value of each property that a channel may set. `weights` has one number
+for each morph target.
 """
 MIN_QUATERNION_LENGTH = 1e-6  # minimum length of a quaternion; the format requires 1
 
@@ -54,8 +54,9 @@ MIN_QUATERNION_LENGTH = 1e-6  # minimum length of a quaternion; the format requi
 def iterate_poses(header: Header) -> Iterator[tuple[int, Float64Array]]:
     """Yield the index and the pose (4, 4) of each node of the file's scene.
 
-    The pose leads from the node's coordinates to the scene's. A file without scenes
-    shows all nodes. The order is that of a walk through the trees, not of indices.
+    The pose maps the node's coordinates to the scene's. In a file without scenes, all
+    nodes are in the scene. The order is that of a walk through the trees, not of
+    indices.
     """
     if header.scenes:
         roots = list(header.scenes[header.scene or 0].nodes)
@@ -94,7 +95,8 @@ class VertexJoints(NamedTuple):
     """The joints to which vertices are bound, and their weights."""
 
     joints: IntArray  # (V, 4 n) indices into the joints of the skin
-    weights: Float64Array  # (V, 4 n); those of a vertex sum to 1, but as stored
+    # (V, 4 n); weights of a vertex sum to 1, except in what `_read_joint_set` returns
+    weights: Float64Array
 
 
 def read_vertex_joints(
@@ -164,7 +166,9 @@ def _read_joint_set(
             file.path, "four joints and four weights of each vertex", "others"
         )
     joints = file.read_values(joints_index)[used].astype(np.int64)
-    return VertexJoints(joints, file.read_numbers(weights_index, used))
+    # Weights may be stored as integers, which `read_numbers` converts to fractions.
+    weights = file.read_numbers(weights_index, used)
+    return VertexJoints(joints, weights)
 
 
 def _is_vec4(accessor: Accessor, count: int) -> bool:
@@ -176,7 +180,7 @@ def read_inverse_binds(file: GltfFile, skin: Skin) -> Float64Array:
     """Return the inverse bind matrices (J, 4, 4), from the mesh to each joint.
 
     Raises:
-        FileFormatError: there are too few, or they are no matrices.
+        FileFormatError: there are too few, or they are not 4 x 4.
     """
     count = len(skin.joints)
     if skin.inverseBindMatrices is None:
@@ -207,12 +211,14 @@ def pose_part(
     Raises:
         FileFormatError: it is bound to joints that its skin does not have.
     """
-    max_joint = vertex_joints.joints.max(initial=0)
-    if max_joint >= len(matrices) or vertex_joints.joints.min(initial=0) < 0:
+    min_joint = int(vertex_joints.joints.min(initial=0))
+    max_joint = int(vertex_joints.joints.max(initial=0))
+    if max_joint >= len(matrices) or min_joint < 0:
+        wrong_joint = min_joint if min_joint < 0 else max_joint
         raise damaged(
             path,
             f"joints under {len(matrices)}, as its skin has",
-            f"number {int(vertex_joints.joints.max())}",
+            f"number {wrong_joint}",
         )
     # (V, 3, 4): the weighted mean of the matrices of a vertex's joints
     transforms = np.zeros((len(part.vertices), 3, 4))
@@ -224,12 +230,13 @@ def pose_part(
     normals = part.normals
     vertices = np.einsum("vij,vj->vi", linear, part.vertices) + transforms[:, :, 3]
     if normals is not None:
-        # The cofactors are the inverse transpose times the determinant, and exist for
-        # matrices without an inverse too.
+        # The matrix of cofactors is the inverse transpose times the determinant, and
+        # exists also for matrices without an inverse. Its row i is the cross product of
+        # the rows i + 1 and i + 2.
         cofactors = np.cross(linear[:, [1, 2, 0]], linear[:, [2, 0, 1]])
         normals = np.einsum("vij,vj->vi", cofactors, normals)
-    is_mirrored = bool((np.linalg.det(linear) < 0.0).all())
-    return replace_geometry(part, vertices, normals, is_mirrored=is_mirrored)
+    are_all_mirrored = bool((np.linalg.det(linear) < 0.0).all())
+    return replace_geometry(part, vertices, normals, is_mirrored=are_all_mirrored)
 
 
 def read_targets(
@@ -244,10 +251,11 @@ def read_targets(
         extras: extras of its mesh; exporters write names of targets to `targetNames`.
 
     Returns:
-        The targets; and what each adds to the normals, (V, 3) or None.
+        The targets; and the offsets that each adds to the normals, (V, 3) or None.
 
     Raises:
-        FileFormatError: a target is of other vertices, or has NaN or infinite numbers.
+        FileFormatError: a target has another number of vertices, or numbers that are
+            NaN or infinite.
     """
     names = extras.get("targetNames") if isinstance(extras, dict) else None
     if not isinstance(names, list):
@@ -278,7 +286,7 @@ def _read_offsets(
     name: str,
     used: IntArray,
 ) -> Float64Array | None:
-    """Return what a morph target adds to an attribute of used vertices, (V, 3).
+    """Return the offsets (V, 3) that a morph target adds to an attribute.
 
     The result is None if the target does not change the attribute.
 
@@ -290,7 +298,8 @@ def _read_offsets(
         used: (V,) the vertices that faces use.
 
     Raises:
-        FileFormatError: the offsets are of another type or number, or not finite.
+        FileFormatError: the type or the number of the offsets is wrong, or an offset is
+            not finite.
     """
     if name not in attributes:
         return None
@@ -320,7 +329,7 @@ def apply_targets(
     Args:
         part: a part as the file stores it, which is not changed.
         targets: its T morph targets.
-        normal_offsets: what each target adds to the normals, (V, 3) or None.
+        normal_offsets: offsets that each target adds to the normals, (V, 3) or None.
         weights: (T,) weights of the targets.
     """
     vertices = part.vertices
@@ -376,7 +385,7 @@ def count_targets(file: GltfFile, mesh_nodes: Sequence[int]) -> dict[int, int]:
 
     Raises:
         FileFormatError: the primitives of a mesh have different numbers of targets, or
-            there is more to move than `MAX_MOVES`: vertices times targets, plus joints.
+            the limit `MAX_MOVES` is exceeded.
     """
     header = file.header
     n_targets = dict[int, int]()
@@ -394,6 +403,8 @@ def count_targets(file: GltfFile, mesh_nodes: Sequence[int]) -> dict[int, int]:
                 "different numbers",
             )
         n_targets[node] = max(counts, default=0)
+        # Each primitive stores an inverse bind matrix for each joint of its skin, and
+        # offsets of its vertices for each target.
         if entry.skin is not None:
             n_moves += len(primitives) * len(header.skins[entry.skin].joints)
         n_moves += n_targets[node] * _count_vertices(header, primitives)
@@ -401,7 +412,7 @@ def count_targets(file: GltfFile, mesh_nodes: Sequence[int]) -> dict[int, int]:
         file.path,
         n_moves,
         MAX_MOVES,
-        "morph targets and joints for at most {} vertices",
+        "at most {} vertices of morph targets and joints of primitives",
     )
     return n_targets
 
@@ -431,7 +442,7 @@ def read_skeleton(file: GltfFile, target_counts: Mapping[int, int]) -> Skeleton 
         target_counts: the nodes with a mesh, and their number of morph targets.
 
     Raises:
-        FileFormatError: a clip is not as the format defines it, or clips are too large.
+        FileFormatError: a clip violates the format, or clips are too large.
     """
     header = file.header
     node_skins = {header.nodes[node].skin for node in target_counts}
@@ -439,7 +450,7 @@ def read_skeleton(file: GltfFile, target_counts: Mapping[int, int]) -> Skeleton 
     clips = _read_clips(file, target_counts, skins)
     if not (skins or clips or any(target_counts.values())):
         return None
-    # of nodes without a rotation the identity, (x, y, z, w)
+    # quaternions (x, y, z, w); the identity for nodes without a rotation
     rotations = np.array(
         [node.rotation or [0.0, 0.0, 0.0, 1.0] for node in header.nodes]
     )
@@ -460,11 +471,12 @@ def read_skeleton(file: GltfFile, target_counts: Mapping[int, int]) -> Skeleton 
 def _count_key_numbers(
     header: Header, used_channels: Sequence[Sequence[Channel]]
 ) -> int:
-    """Return how many numbers the keyframes of channels have, in all animations."""
+    """Return the number of numbers in the keys of channels, in all animations."""
     n_numbers = 0
     for animation, channels in zip(header.animations, used_channels, strict=True):
         for channel in channels:
-            keys = header.accessors[animation.samplers[channel.curve].output]
+            sampler = animation.samplers[channel.sampler_index]
+            keys = header.accessors[sampler.output]
             n_numbers += keys.count * keys.width
     return n_numbers
 
@@ -524,7 +536,7 @@ def _find_moving_channels(
         node = channel.target.node
         property_name = channel.target.path
         if node is None or property_name not in VALUE_WIDTHS:
-            return False  # an extension defines what it sets
+            return False  # the channel sets a property of an extension
         if property_name == "weights":
             return target_counts.get(node, 0) > 0
         return node in moving_nodes
@@ -544,9 +556,8 @@ def _read_track(
     """Read one channel of a clip: the keys of one property of a node.
 
     The file has a flat list of values. For each key it has one value, or for a cubic
-    spline three: the tangent before the key, the value, and the tangent after it. If
-    the property is the weights of morph targets, each of these is one number for every
-    target.
+    spline three: the tangent before the key, the value, and the tangent after it. The
+    weights of morph targets have one number per target in each value.
 
     Args:
         file: the glTF file.
@@ -555,26 +566,28 @@ def _read_track(
         target_counts: number of morph targets, by node.
 
     Raises:
-        FileFormatError: its keys are not as the format defines them.
+        FileFormatError: its keys violate the format.
     """
-    sampler = animation.samplers[channel.curve]
+    sampler = animation.samplers[channel.sampler_index]
     node = channel.target.node
     assert node is not None  # for mypy: `_read_clips` leaves others out
     property_name = channel.target.path
     times = _read_times(file, sampler.input)
+    # Weights move vertices, and not the node itself.
     if file.header.nodes[node].matrix is not None and property_name != "weights":
         raise damaged(
             file.path, f"a node {node} without matrix, because a clip moves it", "one"
         )
-    # a spline: the tangent before a key, its value, and the tangent after it
     values_per_key = 3 if sampler.interpolation == "CUBICSPLINE" else 1
     n_targets = target_counts[node] if property_name == "weights" else 1
     shape = (len(times), values_per_key, n_targets)
     keys = _read_keys(file, sampler.output, property_name, shape)
     if property_name == "rotation":
-        quaternions = keys[:, values_per_key // 2]  # without tangents
+        # Of three values, the second is no tangent.
+        value_index = 1 if values_per_key == 3 else 0
+        quaternions = keys[:, value_index]  # (K, 4)
         lengths = np.linalg.norm(quaternions, axis=1)
-        if not (lengths > MIN_QUATERNION_LENGTH).all():  # they have no direction
+        if not (lengths > MIN_QUATERNION_LENGTH).all():  # also for NaN
             raise damaged(
                 file.path,
                 "rotations of a clip that are unit quaternions",
@@ -592,11 +605,12 @@ def _read_keys(
         file: the glTF file.
         index: accessor of the values.
         property_name: the property that they set, a key of `VALUE_WIDTHS`.
-        shape: number of keys, of values for each key, and of the morph targets that a
-            value is for (1 for other properties).
+        shape: number of keys, of values for each key, and of morph targets (1 for a
+            property other than weights).
 
     Raises:
-        FileFormatError: there are more or fewer values, or others.
+        FileFormatError: the number of values, or of numbers in a value, is wrong; or a
+            number is NaN or infinite.
     """
     n_keys, values_per_key, n_targets = shape
     width = VALUE_WIDTHS[property_name]

@@ -1,10 +1,10 @@
 """Readers of images of linear radiance: OpenEXR (.exr) and Radiance (.hdr).
 
-The format of OpenEXR is in its project's "Technical Introduction to OpenEXR" and
-"OpenEXR File Layout". Radiance has shared-exponent RGB, run-length encoded line by
-line, as in the Radiance reference manual, "File Formats" (Ward 1997); XYZE images are
-rejected. None of our dependencies reads it, except Mitsuba, which must not be imported
-before its LLVM has been chosen.
+The format of OpenEXR is described in its project's "Technical Introduction to OpenEXR"
+and "OpenEXR File Layout". Radiance has shared-exponent RGB, run-length encoded line by
+line (Radiance reference manual, "File Formats", Ward 1997). XYZE images are rejected.
+Of our dependencies only Mitsuba reads Radiance, and it must not be imported before its
+LLVM has been chosen.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ from advsearch.trust.stored_files import check_most
 
 Plane = npt.NDArray[np.floating]
 Planes = tuple[Plane, Plane, Plane]
-# Limit of the pixels times channels of a file (8192 x 4096 with 4), before `scaled`.
+# Limit of the pixels times channels of a file, before `scale_limit`: 8192 x 4096 pixels
+# of 4 channels.
 MAX_VALUES = 2 * MAX_PIXELS
 CHANNEL_NAMES = {
     "r": "R",
@@ -54,14 +55,14 @@ MAIN_LAYER_NAMES = (
     "main",
     "image",
 )
-"""Names of layers that are the image itself, the likeliest first; other layers are read
-only if there is none of these.
+"""Names of layers that are the image itself, the likeliest first. Other layers are read
+only if no layer has one of these names.
 """
-# Weights of red, green and blue, and primaries, of ITU-R BT.709: those of a file that
-# names no others.
+# Defaults of a file, which are those of ITU-R BT.709: weights of red, green and blue,
+# and chromaticities (x, y) of the primaries and of white.
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 PRIMARIES = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.329)
-CUBE_MAP = 1
+CUBE_MAP = 1  # value of the attribute "envmap"
 
 
 @contextlib.contextmanager
@@ -84,16 +85,17 @@ def _suppress_output() -> Iterator[None]:
 def read_exr(file: Path, data: bytes) -> tuple[Planes, list[str]]:
     """Read the image of an OpenEXR file.
 
-    Of several parts and layers, the one with a name for the image itself is read, such
-    as "beauty", or else the first one with colors.
+    If there are several parts and layers, the one whose name means the image itself is
+    read, such as "beauty", or else the first one with colors.
 
     Args:
         file: path of the file, for messages.
         data: its bytes.
 
     Returns:
-        Red, green and blue, each (H, W) in half or float, of its display window, black
-        where the file has no data; and clauses about what is left out.
+        Red, green and blue of its display window, each (H, W) in half or float, black
+        where the file has no data; and notes on what is left out, each without the
+        name of the file.
 
     Raises:
         FileFormatError: the file is corrupt, too large, deep, a cube map, or has no
@@ -105,11 +107,11 @@ def read_exr(file: Path, data: bytes) -> tuple[Planes, list[str]]:
         with _suppress_output():
             header, planes, notes = _read_layer(file, data)
     except (AdvsearchError, MemoryError):
-        raise  # our own errors say already what is wrong
+        raise  # our own errors name the problem already
     except Exception as error:  # the library raises many kinds
         message = (
-            f"{file}: cannot be read as OpenEXR; it is damaged or cut short, "
-            "export it again"
+            f"{file}: cannot be read as OpenEXR; it is damaged or cut short: export it "
+            "again"
         )
         raise FileFormatError(message) from error
     # The library returns a number, or an enum with one as its value.
@@ -124,7 +126,7 @@ def read_exr(file: Path, data: bytes) -> tuple[Planes, list[str]]:
     colors = planes if "R" in planes else _convert_luminance(planes, size)
     if not _has_srgb_primaries(header):
         notes.append(
-            "its colours have primaries of their own and are taken for those of sRGB"
+            "its colours have other primaries than sRGB, and are read as sRGB colours"
         )
     rgb = (colors["R"], colors["G"], colors["B"])
     return _crop_to_display_window(header, rgb, notes), notes
@@ -136,7 +138,7 @@ def _read_layer(
     """Return the header, the planes and the notes of the layer that is the image.
 
     Planes are named by the values of `CHANNEL_NAMES`, such as "R". The file is opened
-    twice: first its header alone, to check its size before pixels are read.
+    twice. The first time only its header is read, to check its size.
 
     Raises:
         FileFormatError: the image is too large, or has no colors.
@@ -250,7 +252,7 @@ class _Layer(NamedTuple):
 
     @property
     def rank(self) -> tuple[int, bool]:
-        """Rank by the name in `MAIN_LAYER_NAMES`, then colors before luminance."""
+        """Rank by the name in `MAIN_LAYER_NAMES`, then by whether it lacks colors."""
         last_word = self.name.split(".")[-1].lower()
         name_rank = len(MAIN_LAYER_NAMES)
         if last_word in MAIN_LAYER_NAMES:
@@ -265,14 +267,14 @@ def _select_layer(
 
     It is the layer whose name comes first in `MAIN_LAYER_NAMES`. If several have the
     same rank, or none has such a name, a layer with colors is preferred to one with
-    luminance, and then the first one counts.
+    luminance, and then the first one is selected.
 
     Args:
         file: the file, for messages.
         parts: header and channels of each part.
 
     Returns:
-        Its header, its channels by `CHANNEL_NAMES`, and clauses about layers left out.
+        Its header, its channels by `CHANNEL_NAMES`, and notes on layers left out.
     """
     layers = _find_color_layers(parts)
     if not layers:
@@ -295,16 +297,15 @@ def _select_layer(
 
 
 def _describe_other_layers(selected: _Layer, layers: list[_Layer]) -> list[str]:
-    """Return a clause about the layers that are left out; none if there are none.
+    """Return a note on the layers that are left out, as a list of at most one.
 
     Args:
         selected: the layer that is read.
         layers: all layers with colors.
     """
     other_names = ", ".join(
-        # not more, so that the note stays readable
         format_name(layer.name)
-        for layer in layers[:20]
+        for layer in layers[:20]  # not more, so that the note stays readable
         if layer.name != selected.name
     )
     if not other_names:
@@ -312,7 +313,7 @@ def _describe_other_layers(selected: _Layer, layers: list[_Layer]) -> list[str]:
     if not selected.name:
         return [f"layers are left out: {other_names}"]
     name = format_name(selected.name)
-    return [f"of its layers {name} is taken; left out: {other_names}"]
+    return [f"of its layers only {name} is read; left out: {other_names}"]
 
 
 def _find_color_layers(
@@ -320,11 +321,11 @@ def _find_color_layers(
 ) -> list[_Layer]:
     """Return every layer with color or luminance.
 
-    A channel's name is the name of its layer, a dot, and what it holds: "diffuse.R". A
+    A channel's name is the name of its layer, a dot, and its content: "diffuse.R". A
     name without a dot belongs to the layer "", which gets the name of its part if the
-    file has several parts. A layer counts if it has R, G and B, or luminance Y, alone
-    or with both chroma channels RY and BY. Y together with X or Z is a color of XYZ and
-    does not count.
+    file has several parts. A layer is returned if it has R, G and B, or luminance Y,
+    alone or with both chroma channels RY and BY. Y together with X or Z is a color of
+    XYZ, which is not read.
 
     Args:
         parts: the header and the channels of each part.
@@ -339,15 +340,16 @@ def _find_color_layers(
         part_name = str(header.get("name", "")) if len(parts) > 1 else ""
         for layer, layer_channels in channels_by_layer.items():
             names = set(layer_channels)
-            # both chroma channels or none
-            is_luminance = (
-                "Y" in names
-                and ("RY" in names) == ("BY" in names)
-                and not {"R", "G", "B", "X", "Z"} & names
-            )
-            if is_luminance or {"R", "G", "B"} <= names:
+            if _is_luminance(names) or {"R", "G", "B"} <= names:
                 layers.append(_Layer(layer or part_name, header, layer_channels))
     return layers
+
+
+def _is_luminance(names: set[str]) -> bool:
+    """Return whether channels are luminance, alone or with both chroma channels."""
+    has_both_chromas_or_none = ("RY" in names) == ("BY" in names)
+    has_other_colors = bool({"R", "G", "B", "X", "Z"} & names)
+    return "Y" in names and has_both_chromas_or_none and not has_other_colors
 
 
 def _convert_luminance(
@@ -380,7 +382,8 @@ def _convert_luminance(
 def _resample(plane: Plane, size: tuple[int, ...]) -> Plane:
     """Interpolate chroma, which has a value at every n-th row and column, to a size.
 
-    The interpolation is linear along each axis. Past the last value it is repeated.
+    The interpolation is linear along each axis. Beyond the last value, that value is
+    repeated.
 
     Args:
         plane: (h, w) chroma.
@@ -459,7 +462,11 @@ _RESOLUTION = re.compile(
     rb"(?P<pixel_direction>[-+](?P<pixel_axis>[YX])) +(?P<line_length>\d{1,6})\r?\n"
 )
 """The direction and number of scanlines, and of the pixels in each: -Y 512 +X 1024."""
-_UPRIGHT_DIRECTIONS = (b"-Y", b"+X")  # y falls from the top, x grows from the left
+_UPRIGHT_DIRECTIONS = (b"-Y", b"+X")
+"""Directions of lines, and of the pixels in them, of an image that is not flipped: rows
+from top to bottom (y decreases), columns from left to right (x grows). Either may be
+the direction of the lines.
+"""
 _NUMBER = rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 
 
@@ -471,13 +478,14 @@ def _read_upright_pixels(path: Path, body: bytes) -> Bytes:
         body: what follows its header: a line with its size, and scanlines.
 
     Raises:
-        FileFormatError: the size is none, or too large, or scanlines are missing.
+        FileFormatError: there is no valid size, it is too large, or scanlines are
+            missing.
     """
     size_match = _RESOLUTION.match(body)
     if (
         not size_match
-        or not int(size_match["n_lines"])
-        or not int(size_match["line_length"])
+        or int(size_match["n_lines"]) == 0
+        or int(size_match["line_length"]) == 0
         or size_match["line_axis"] == size_match["pixel_axis"]
     ):
         line = body[:30].split(b"\n")[0].decode("latin-1")
@@ -489,9 +497,11 @@ def _read_upright_pixels(path: Path, body: bytes) -> Bytes:
     line_length = int(size_match["line_length"])
     check_pixels(path, line_length, n_lines)
     pixels = _decode_scanlines(path, body[size_match.end() :], n_lines, line_length)
-    if size_match["line_direction"] not in _UPRIGHT_DIRECTIONS:
+    are_lines_flipped = size_match["line_direction"] not in _UPRIGHT_DIRECTIONS
+    if are_lines_flipped:
         pixels = pixels[::-1]
-    if size_match["pixel_direction"] not in _UPRIGHT_DIRECTIONS:
+    are_pixels_flipped = size_match["pixel_direction"] not in _UPRIGHT_DIRECTIONS
+    if are_pixels_flipped:
         pixels = pixels[:, ::-1]
     if size_match["line_axis"] == b"X":  # its scanlines are columns
         pixels = pixels.transpose(1, 0, 2)
@@ -506,10 +516,10 @@ def read_radiance(path: Path, data: bytes) -> tuple[Bytes, Float32Array, list[st
         data: its bytes.
 
     Returns:
-        Pixels (H, W, 4) uint8, three mantissas and an exponent, row 0 on top:
-        `decode_rgbe` makes floats of them, which take three times the memory. Factors
-        (3,) float32 of the linear values, the inverse of all COLORCORR lines. Clauses
-        about what is left out.
+        Three values. Pixels (H, W, 4) uint8, three mantissas and an exponent, row 0 on
+        top; `decode_rgbe` converts them to floats, which take three times the memory.
+        Factors (3,) float32 of the linear values, the inverse of all COLORCORR lines.
+        Notes on what is left out, each without the name of the file.
 
     Raises:
         FileFormatError: the file is no Radiance picture, has XYZ colors, is too large,
@@ -536,10 +546,9 @@ def read_radiance(path: Path, data: bytes) -> tuple[Bytes, Float32Array, list[st
 def _read_color_corrections(header: bytes) -> tuple[Float32Array, list[str]]:
     """Return the inverse (3,) of all COLORCORR lines, and notes on invalid ones.
 
-    A line has three factors that were already applied to the pixels, so they are
-    divided by. A line that would take the result out of float32's range is invalid too.
-    EXPOSURE lines are ignored, since the brightness of environments is set by metering
-    anyway.
+    A line has three factors that were applied to the pixels, so that their inverse
+    restores the original. A line that would take the result out of float32's range is
+    invalid, too. EXPOSURE lines are ignored, since metering sets the exposure.
     """
     factors = np.ones(3)
     notes = list[str]()
@@ -570,9 +579,10 @@ def decode_rgbe(pixels: Bytes) -> Float32Array:
 
 
 def _decode_scanlines(path: Path, body: bytes, height: int, width: int) -> Bytes:
-    """Decode scanlines to pixels (height, width, 4), run-length encoded or plain.
+    """Decode scanlines to pixels (height, width, 4).
 
-    Each line is either encoded or plain. Only widths from 8 to 32767 may be encoded.
+    Each line is either run-length encoded or plain. Only lines of 8 to 32767 pixels may
+    be encoded.
 
     Args:
         path: path of the picture, for messages.
@@ -592,7 +602,7 @@ def _decode_scanlines(path: Path, body: bytes, height: int, width: int) -> Bytes
                 position = _decode_plain_line(body, position, result[row])
         except (IndexError, ValueError):
             got = (
-                f"{row} whole ones and the start of another; the file is cut short "
+                f"{row} complete ones and the start of another; the file is cut short "
                 "or damaged"
             )
             raise damaged(path, f"{height} scanlines of {width} pixels", got) from None

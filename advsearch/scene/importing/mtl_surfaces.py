@@ -28,13 +28,13 @@ from advsearch.scene.importing.unread import TrackedKeys
 from advsearch.trust.named_files import References, normalize_name
 
 IGNORED_KEYWORDS = frozenset("ka ks ns ni sharpness map_aat".split())
-"""Common statements that a physical material cannot have: ambient light, Phong's
+"""Common statements without a counterpart in a physical material: ambient light, Phong's
 highlights.
 """
 NORMAL_MAPS = ("norm", "map_kn", "map_bump", "bump")
 UV_MAPS = ("map_kd", "map_d", *NORMAL_MAPS, "map_ke")
-"""Maps that are sampled at texture coordinates, with the layout of the first of
-them.
+"""Maps that are sampled at texture coordinates. All have the layout (scale and offset of
+texture coordinates) of the first of them that a material has.
 """
 # Channels of an image by the value of ``-imfchan``.
 CHANNELS = {"r": 0, "g": 1, "b": 2, "m": 3}
@@ -46,7 +46,7 @@ DEFAULT_OPTIONS = {
     "bm": "1",
     "boost": "0",
 }
-"""Default values of options."""
+"""Default values of texture options (bm: bump multiplier, cc: color correction)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +55,8 @@ class MtlSurface:
 
     surface: ImportedSurface
     scale: Pair = (1.0, 1.0)  # factors of texture coordinates
-    offset: Pair = (0.0, 0.0)  # added to scaled texture coordinates
-    is_clamped: bool = False  # whether its textures are not to repeat
+    offset: Pair = (0.0, 0.0)  # offsets that are added after scaling
+    is_clamped: bool = False  # whether a texture must not repeat beyond its edges
 
 
 @dataclass
@@ -66,28 +66,29 @@ class MtlReader:
     Attributes:
         references: finds files beside the mesh file.
         notes: notes about the file.
-        find_mapped_faces: returns UVs (F, 3, 2) and areas (F,) of the faces with a
-            material, by its name and a UDIM square.
-        n_libraries: how many material files were read.
+        find_mapped_faces: function of a material's name and a UDIM square; returns UVs
+            (F, 3, 2) and areas (F,) of the faces with that material in that square.
+        n_libraries: number of material files that were read.
     """
 
     references: References
     notes: Notes
     find_mapped_faces: Callable[[str, int], tuple[Float64Array, Float64Array]]
     n_libraries: int = 0
-    # Materials by name, with and without what may be a comment after it.
+    # Materials by name. A name with a # is also listed without the text from there on.
     _materials: dict[str, MtlMaterial] = field(default_factory=dict)
-    # Surfaces by the identity of their material and the UDIM square.
+    # Surfaces by `id` of their material and the UDIM square.
     _surfaces: dict[tuple[int, int], MtlSurface] = field(default_factory=dict)
-    # Maps by the identity of their material and the keyword.
+    # Maps by `id` of their material and the keyword.
     _uses: dict[tuple[int, str], MapUse | None] = field(default_factory=dict)
 
     def read_library(self, name: str) -> None:
-        """Read a material file; of materials with the same name, the first counts.
+        """Read a material file, and store its materials by name for `get_surface`.
 
-        Its materials are stored by name for `get_surface`. A missing file is noted. So
-        is a second material with the same name in a file, unless its statements are the
-        same. Statements before the first material are recorded as left out.
+        If several materials have the same name, the first is stored. A missing file is
+        noted. So is a second material with the same name in a file, unless its
+        statements are the same. Statements before the first material are recorded as
+        left out.
 
         Args:
             name: name of the file, as the mesh file writes it.
@@ -111,15 +112,15 @@ class MtlReader:
     def _note_missing_library(self, name: str) -> None:
         """Note a material file that is missing, or that must not be read."""
         file_name = normalize_name(name)
-        missing_file = (
-            f"{format_name(file_name)}, which {self.references.refused[file_name]}"
-        )
-        self.notes.warn(
-            f" names the material file {missing_file}; neutral grey is used instead"
+        # `references.get` has stored a reason such as "is missing".
+        reason = self.references.refused[file_name]
+        self.notes.warn_that_file(
+            f"names the material file {format_name(file_name)}, which {reason}; "
+            "neutral grey is used instead"
         )
 
     def _add_materials(self, materials: Sequence[MtlMaterial]) -> None:
-        """Add the materials of one file by name; of equal names the first counts.
+        """Add the materials of one file by name; the first of equal names is stored.
 
         A second material of a name is noted, unless its statements are the same, or the
         first is of another file.
@@ -132,25 +133,23 @@ class MtlReader:
             ):
                 self.notes.warn(
                     f"{material.file} has the material {format_name(material.name)} "
-                    "more than once; the first counts"
+                    "more than once; the first one is used"
                 )
-        # A # may begin a comment or be part of a name: both are tried.
+        # A # may begin a comment or be part of a name. So both names are added.
         for material in materials:
             self._materials.setdefault(without_comment(material.name), material)
 
     def _find_material(self, name: str) -> MtlMaterial | None:
-        """Return the material of a name, which may have a comment after it; None if
-        none.
-        """
+        """Return the material of a name, which may end in a comment, or None."""
         return self._materials.get(name) or self._materials.get(without_comment(name))
 
     def get_surface(self, name: str, square: int = 0) -> MtlSurface | None:
-        """Return the material of a name as a surface; None if there is no such one.
+        """Return the material of a name as a surface; None if there is none.
 
         Args:
             name: the name as the mesh file writes it, perhaps with a comment after it.
-            square: the UDIM square whose images are used, if there is one for each; 0
-                for the images that the file names.
+            square: the UDIM square whose images replace those that the material names;
+                0 for none.
         """
         material = self._find_material(name)
         if material is None:
@@ -161,19 +160,19 @@ class MtlReader:
         return self._surfaces[key]
 
     def find_squares(self, name: str, candidates: Sequence[int]) -> list[int]:
-        """Return the UDIM squares for which a material has images: all candidates, or
-        none.
+        """Return the UDIM squares for which a material has images: all, or none.
 
         A UDIM texture has one image for each unit square of texture coordinates, with
         the number of the square in its name, such as "wood.1002.png". The material's
         first image with such a number decides. There are images for all squares if the
         name has the placeholder ``<UDIM>``, or if the file of another candidate square
-        exists. Otherwise the image is taken for an ordinary one that repeats, which is
+        exists. Otherwise the image is used as an ordinary one that repeats, which is
         noted.
 
         Args:
             name: the material.
-            candidates: UDIM squares of faces; 0, for faces outside of all, is ignored.
+            candidates: UDIM squares of the material's faces. A 0, for faces outside of
+                all squares, is left out of the result.
         """
         material = self._find_material(name)
         if material is None:
@@ -185,11 +184,12 @@ class MtlReader:
         named_square = find_square(numbered_name)
         other_squares = [square for square in squares if square != named_square]
         if not other_squares:
-            return []
+            return []  # the image that the material names is that of all faces
         other_names = (
             replace_square(numbered_name, square) for square in other_squares
         )
-        if named_square == PLACEHOLDER_SQUARE or any(
+        has_placeholder = named_square == PLACEHOLDER_SQUARE
+        if has_placeholder or any(
             _exists(self.references, other_name) for other_name in other_names
         ):
             return squares
@@ -227,14 +227,16 @@ class MtlReader:
             material_id == id(material) for material_id, _ in self._surfaces
         )
         uses = self._parse_uses(material, square)
-        # The mesh has one layout of texture coordinates: that of its first image, or
-        # without images the one that changes nothing.
-        first_use = next((uses[key] for key in UV_MAPS if key in uses), MapUse("", {}))
+        # The mesh has one layout of texture coordinates, which is that of its first
+        # image. Without images it has the defaults of `MapUse`.
+        no_use = MapUse(name="", options={})
+        first_use = next((uses[key] for key in UV_MAPS if key in uses), no_use)
         self._drop_other_layouts(material, uses, first_use)
         color, texture = self._make_base_color(material, uses.get("map_kd"))
         opaque_surface = ImportedSurface(color, texture, name=material.name)
         surface = replace(
             self._apply_opacity(material, uses.get("map_d"), opaque_surface),
+            # Maps of these two are averaged over the faces with this name and square.
             roughness=self._read_fraction(
                 material, "pr", uses.get("map_pr"), name, square
             ),
@@ -246,7 +248,8 @@ class MtlReader:
         )
         if not are_noted:
             self._note_unread(material)
-        is_clamped = bool(first_use.name) and any(
+        has_uv_map = first_use is not no_use
+        is_clamped = has_uv_map and any(
             use.options.get("clamp", "").lower() == "on" for use in uses.values()
         )
         return MtlSurface(surface, first_use.scale, first_use.offset, is_clamped)
@@ -254,7 +257,7 @@ class MtlReader:
     def _parse_uses(self, material: MtlMaterial, square: int) -> dict[str, MapUse]:
         """Return the maps of a material by keyword, with the images of a UDIM square.
 
-        The maps count as read, so that they are not noted. Normal maps do not yet:
+        The maps are marked as read, so that they are not noted. Normal maps are not:
         `_make_normal_map` reads only the first one that it can use.
         """
         uses = dict[str, MapUse]()
@@ -263,7 +266,8 @@ class MtlReader:
             if use is not None:
                 uses[key] = use
         material.keys.mark_read(*(key for key in uses if key not in NORMAL_MAPS))
-        material.keys.mark_read("illum")  # noted by its value
+        # `_note_unread` notes some values of illum, but not the statement itself.
+        material.keys.mark_read("illum")
         if square:
             uses = {
                 key: replace(use, name=replace_square(use.name, square))
@@ -282,7 +286,7 @@ class MtlReader:
         Args:
             material: the material.
             uses: its maps by keyword; maps are removed from it.
-            first_use: the map whose layout counts.
+            first_use: the map whose layout is that of the surface.
         """
         for key in [key for key in UV_MAPS if key in uses]:
             if (uses[key].scale, uses[key].offset) != (
@@ -294,8 +298,8 @@ class MtlReader:
                     f"{format_name(material.name)}"
                 )
                 self.notes.warn(
-                    f"{statement} lies elsewhere than its other maps (-s, -o); "
-                    "it is left out"
+                    f"{statement} has other texture coordinates (-s, -o) than its first "
+                    "map; it is left out"
                 )
                 material.keys.mark_read(key)
                 del uses[key]
@@ -305,9 +309,9 @@ class MtlReader:
     ) -> tuple[Float32Array | None, Float32Array | None]:
         """Return the color (3,) of ``Kd`` and the texture (H, W, 3) of ``map_Kd``.
 
-        A texture is not multiplied by ``Kd``: beside a texture that is more often an
-        exporter's default than a tint. The color is None if it is plain white and there
-        is a texture.
+        A texture is not multiplied by ``Kd``, which in a material with a texture is
+        more often an exporter's default than a tint. The color is None if it is plain
+        white and the material names a texture, even if its file is missing.
 
         Args:
             material: the material.
@@ -333,7 +337,7 @@ class MtlReader:
     def _read_color(self, material: MtlMaterial) -> Float32Array | None:
         """Return the color (3,) of ``Kd``; None, and a note, if it is no color.
 
-        Of four numbers, three count.
+        A fourth number is ignored.
         """
         argument = material.read_argument("kd")
         values = parse_numbers(argument)
@@ -351,30 +355,30 @@ class MtlReader:
     def _note_unread(self, material: MtlMaterial) -> None:
         """Note the statements that are not read, unless they change nothing.
 
-        These change nothing: numbers that are all 0, ignored keywords, the roughness of
-        a clear coat that is absent, a grey transmission filter, and an ambient map that
-        is the same image as the color's. Also noted are statements that were
-        overridden, a fourth number of Kd, and illumination models above 2, such as
-        ray-traced glass.
+        Also noted are statements that were overridden, a fourth number of Kd, and
+        illumination models above 2, such as ray-traced glass.
         """
         zero_keys = {
             key for key in material.statements if _is_zero(material.peek_argument(key))
         }
         base_map = parse_map(without_comment(material.statements.get("map_kd", "")))
 
-        def is_quiet(key: str, statement: str) -> bool:
+        def is_without_effect(key: str, statement: str) -> bool:
             """Return whether a statement changes nothing."""
-            rest = without_comment(statement)
-            if not rest or key in IGNORED_KEYWORDS or key in zero_keys:
+            argument = without_comment(statement)
+            if not argument or key in IGNORED_KEYWORDS or key in zero_keys:
                 return True
-            if key == "pcr" and "pc" in zero_keys:
-                return True
-            if key == "tf":  # a grey filter: all its numbers are equal
-                return len(set(rest.split())) == 1
-            if key != "map_ka" or base_map is None:
-                return False
-            ambient_map = parse_map(rest)
-            return ambient_map is not None and ambient_map.name == base_map.name
+            if key == "pcr":  # the roughness of a clear coat, which may be absent
+                return "pc" in zero_keys
+            if (
+                key == "tf"
+            ):  # a transmission filter; it is grey if all numbers are equal
+                return len(set(argument.split())) == 1
+            if key == "map_ka" and base_map is not None:
+                # exporters repeat the image of the color as that of ambient light
+                ambient_map = parse_map(argument)
+                return ambient_map is not None and ambient_map.name == base_map.name
+            return False
 
         for key in material.overridden:
             self.notes.record("earlier material statement", key)
@@ -384,15 +388,15 @@ class MtlReader:
             self.notes.record(
                 "illumination model", without_comment(material.statements["illum"])
             )
-        for name in material.keys.find_unread(is_quiet):
+        for name in material.keys.find_unread(is_without_effect):
             self.notes.record("material statement", name)
 
     def _parse_use(self, material: MtlMaterial, key: str) -> MapUse | None:
         """Parse a statement that names an image, and note options that are not read.
 
-        The result is None if it names none. Text from a # on belongs to the name if a
-        file with that name exists, and is a comment otherwise. Results are cached, so
-        that options are noted only once.
+        The result is None if the statement is missing or names no image. Text from a #
+        on belongs to the name if a file with that name exists, and is a comment
+        otherwise. Results are cached, so that options are noted only once.
         """
         if (id(material), key) in self._uses:
             return self._uses[id(material), key]
@@ -418,23 +422,21 @@ class MtlReader:
             use: the image and its options.
         """
         has_colors = key in ("map_kd", "map_ke")
-        read_options = ["s", "o", "mm", "clamp"]
+        read_options = ["s", "o", "mm", "clamp"]  # scale, offset, value range, clamping
         if key in NORMAL_MAPS:
-            read_options.append("bm")
+            read_options.append("bm")  # bump multiplier
         elif not has_colors:
-            read_options.append("imfchan")
+            read_options.append("imfchan")  # channel of the image
         options = TrackedKeys(use.options)
         options.mark_read(*read_options)
 
-        def is_quiet(option: str, value: str) -> bool:
+        def is_without_effect(option: str, value: str) -> bool:
             """Return whether an option has a value that changes nothing."""
             if option == "colorspace":
                 return value.lower() == ("srgb" if has_colors else "linear")
-            if option == "imfchan":
-                return False
             return value.lower() == DEFAULT_OPTIONS.get(option) or _is_zero(value)
 
-        for option in options.find_unread(is_quiet):
+        for option in options.find_unread(is_without_effect):
             self.notes.record(
                 "texture option", f"-{option} of {material.spelling[key]}"
             )
@@ -445,13 +447,13 @@ class MtlReader:
         """Return a surface with its opacity.
 
         The opacity is a number, ``d`` or 1 - ``Tr``, times the image of ``map_d``. The
-        image is resized to the size of the color texture. The single color, which
-        counts where there is no texture, is multiplied by the number alone.
+        image is resized to the size of the color texture. The single color of a surface
+        gets the number alone.
 
         Args:
             material: the material.
             use: its ``map_d``, or None.
-            surface: the surface with its color and texture.
+            surface: the surface with its color (3,) and texture (H, W, 3).
         """
         factor = self._read_opacity(material)
         image = self._load_image(
@@ -471,21 +473,22 @@ class MtlReader:
                 Image.fromarray(opacity).resize(size, Image.Resampling.BILINEAR)
             )
             texture = np.concatenate([texture, resized[:, :, None]], axis=2)
-        elif texture is None:  # the opacity is one number, of a plain color
+        elif texture is None:
+            # A surface without any color would have no opacity either.
             color = color_or_grey
         factor_array = np.array([factor], np.float32)
         return replace(
             surface,
-            color=apply_opacity(color, factor_array, None),
-            texture=apply_opacity(texture, factor_array, None),
+            color=apply_opacity(color, factor_array, cutoff=None),
+            texture=apply_opacity(texture, factor_array, cutoff=None),
         )
 
     def _read_opacity(self, material: MtlMaterial) -> float:
         """Return the opacity in [0, 1] that ``d`` or ``Tr`` states, 1 by default.
 
-        If both are there, ``d`` counts. Programs mean either transparency or opacity by
-        ``Tr``; one that agrees with ``d`` in neither sense is noted. Alone, ``Tr`` is
-        taken for a transparency, which is noted too.
+        If both are stated, ``d`` is returned. Programs mean either transparency or
+        opacity by ``Tr``. A ``Tr`` that agrees with ``d`` in neither sense is noted.
+        Without ``d``, ``Tr`` is read as a transparency, which is noted, too.
         """
         if "-halo" in material.read_argument("d").lower().split():
             self.notes.record("option", "-halo of d")
@@ -499,18 +502,18 @@ class MtlReader:
         if opacity is None:
             if transparency > 0.0:
                 self.notes.warn(
-                    f"{material_phrase} and no d: it is taken for transparency, which "
-                    f"makes its opacity {1.0 - transparency:g}; some programs"
-                    f" mean opacity by it, so write d in its place"
+                    f"{material_phrase} and no d: it is read as transparency, which "
+                    f"makes its opacity {1.0 - transparency:g}; some programs mean "
+                    "opacity by it, so write d instead"
                 )
             return 1.0 - transparency
-        # to two digits, since programs round
+        # The tolerance is two digits, since programs round.
         agrees_as_opacity = abs(transparency - opacity) <= 0.01
         agrees_as_transparency = abs(1.0 - transparency - opacity) <= 0.01
         if not agrees_as_opacity and not agrees_as_transparency:
             self.notes.warn(
-                f"{material_phrase} beside d {opacity:g}, which it contradicts; d is "
-                "taken for its opacity"
+                f"{material_phrase}, which contradicts its d {opacity:g}; d is used as "
+                "its opacity"
             )
         return opacity
 
@@ -524,7 +527,8 @@ class MtlReader:
     ) -> float | None:
         """Return a roughness ("pr") or metallic ("pm"), None if there is none.
 
-        It is the mean of its map over the faces that show it, or else its number.
+        It is the mean of its map over the faces that show it, or else the number of the
+        statement.
 
         Args:
             material: the material.
@@ -533,9 +537,9 @@ class MtlReader:
             name: name by which the mesh file uses the material.
             square: the UDIM square.
         """
-        note_template = (
-            f"{material.spelling.get(f'map_{key}')} {{name}} {{why}}; it is left out"
-        )
+        # The keyword is only used if there is a map, which has one.
+        keyword = material.spelling.get(f"map_{key}")
+        note_template = f"{keyword} {{name}} {{why}}; it is left out"
         image = self._load_image(use, "numbers", note_template)
         number = parse_fraction(material.read_argument(key))
         if use is not None and image is not None:
@@ -555,7 +559,7 @@ class MtlReader:
         """Return the first usable normal map (H, W, 3) of a material, or None.
 
         A bump map is usable if it holds normals; one of heights is left out with a
-        note. All statements with the same image count as read.
+        note. All statements with the same image are marked as read.
 
         Args:
             material: the material.
@@ -605,7 +609,7 @@ class MtlReader:
         if use is not None and image is None:
             return None
         if use is not None and not factor.any():
-            factor = np.ones(3)  # exporters leave Ke at 0 beside a map
+            factor = np.ones(3)  # exporters leave Ke at 0 if there is a map
         return compute_radiance(factor, image, self.notes)
 
     @cached_property
@@ -620,7 +624,7 @@ class MtlReader:
 
         Args:
             use: the image; None returns None.
-            kind: what it holds, such as "colours".
+            kind: content of the image, such as "colours".
             note_template: the note if it cannot be read, with `{name}` for the image
                 and `{why}` for the reason; then None is returned.
         """
@@ -638,9 +642,10 @@ class MtlReader:
 def _select_channel(picture: Float32Array, use: MapUse) -> Float32Array:
     """Return the values (H, W) of an image for a map of numbers.
 
-    They are those of the channel that ``-imfchan`` names, such as "r". Without one,
-    they are the alpha if it is not 1 everywhere, or else the mean of the colors. The
-    mean is also taken if ``-imfchan`` names the alpha of an image without alpha.
+    They are those of the channel that ``-imfchan`` names, such as "r". Without this
+    option, they are the alpha if it is not 1 everywhere, or else the mean of the
+    colors. The mean is also returned if ``-imfchan`` names the alpha of an image that
+    has none.
     """
     alpha_index = 3
     has_alpha = picture.shape[2] == 4
@@ -659,11 +664,11 @@ def find_libraries(arguments: Sequence[str], references: References) -> list[str
 
     A line may name several files, and a name may have blanks. If the full line is the
     name of a file that exists, it is one name. Otherwise it is split after each
-    ``.mtl``, and the rest at blanks. The pieces are taken if all of them end in
-    ``.mtl`` or one of them exists. If not, the line is taken as one name.
+    ``.mtl``, and the rest at blanks. These words are the names if all of them end in
+    ``.mtl`` or one of them exists. If not, the full line is one name.
 
     Args:
-        arguments: what follows ``mtllib`` in each line.
+        arguments: text after ``mtllib`` in each line.
         references: finds files beside the mesh file.
     """
     names: list[str] = []
@@ -708,14 +713,12 @@ def _split_libraries(line: str) -> list[str]:
 
 # ---- UDIM: one image for each unit square of texture coordinates ----
 #
-# The number of the square is in the name of the image.
-#
-# The square from (0, 0) is 1001, those to its right count on to 1010, and each row
-# above adds 10.
+# The number of the square is in the name of the image. The square from (0, 0) to (1, 1)
+# is 1001, those to its right are 1002 to 1010, and each row above adds 10.
 
 FIRST_SQUARE = 1001
 SQUARES_PER_ROW = 10
-PLACEHOLDER_SQUARE = 0  # of a name that stands for the images of all squares
+PLACEHOLDER_SQUARE = 0  # result of `find_square` for a name that stands for all squares
 _SQUARE_NUMBER = re.compile(r"(?<!\d)1\d{3}(?=\.\w+$)")
 _PLACEHOLDER = re.compile(r"<UDIM>", re.IGNORECASE)
 
@@ -759,11 +762,12 @@ def get_square_corner(square: int) -> tuple[int, int]:
 
 # ---- The grammar of material files (.mtl) ----
 #
-# Statements, comments, and the options of maps; their meaning is in `MtlReader`.
+# Statements, comments, and the options of maps. `MtlReader` interprets them.
 
 Pair = tuple[float, float]
 _MTL_NUMBER = r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
-_OPTIONS = {
+# Patterns of the values of options, by the option's name.
+_VALUE_PATTERNS = {
     **dict.fromkeys(("blendu", "blendv", "cc", "clamp"), "on|off"),
     **dict.fromkeys(("bm", "boost"), _MTL_NUMBER),
     **dict.fromkeys(("o", "s", "t"), rf"{_MTL_NUMBER}(?:\s+{_MTL_NUMBER}){{0,2}}"),
@@ -775,14 +779,18 @@ _OPTIONS = {
     },
     "type": r"sphere|cube_\w+",
 }
-_OPTION = re.compile(
+# A known option. It has two groups for each: "s" is its name as it is written, and "s_"
+# its value.
+_KNOWN_OPTION = re.compile(
     "|".join(
         rf"(?:(?<=\s)|^)-(?P<{name}>{name})\s+(?P<{name}_>{value})(?=\s|$)"
-        for name, value in _OPTIONS.items()
+        for name, value in _VALUE_PATTERNS.items()
     ),
     re.IGNORECASE,
 )
-_UNKNOWN = re.compile(
+# An unknown option with all of its values, which are switches or numbers. The group is
+# its name.
+_UNKNOWN_OPTION = re.compile(
     rf"-([a-z]\w*)(?:\s+(?:on|off|{_MTL_NUMBER})(?=\s))*\s+", re.IGNORECASE
 )
 _COMMENT = re.compile(r"(?:^|(?<=\s))#.*")
@@ -791,21 +799,23 @@ _CONTINUED = re.compile(r"^([^#\n][^\n]*?)\\[ \t]*\n", re.MULTILINE)
 
 @dataclass
 class MtlMaterial:
-    """The statements of one material.
+    """The statements of one material, by keyword in lower case.
 
-    They are by keyword in lower case; of several with the same one, the last counts.
+    If several statements have the same keyword, the last one is stored.
     """
 
-    name: str  # as it stands after ``newmtl``, with what may be a comment
+    name: str  # as it is written after ``newmtl``, perhaps with a comment
     file: str  # name of the material file
     statements: dict[str, str] = field(default_factory=dict)
-    spelling: dict[str, str] = field(default_factory=dict)
+    spelling: dict[str, str] = field(default_factory=dict)  # keywords as written
     # Keywords of statements that a later, different one overrides.
     overridden: list[str] = field(default_factory=list)
 
     @cached_property
     def keys(self) -> TrackedKeys[str]:
         """The statements, tracking which of them are read."""
+        # `find_unread` returns keywords as the file writes them, so that these are the
+        # keys here; they are looked up in lower case.
         return TrackedKeys(
             {
                 self.spelling[key]: statement
@@ -817,13 +827,13 @@ class MtlMaterial:
     def read_argument(self, key: str) -> str:
         """Return the arguments of a statement of numbers, "" if there is none.
 
-        The statement counts as read.
+        The statement is marked as read.
         """
         self.keys.mark_read(key)
         return self.peek_argument(key)
 
     def peek_argument(self, key: str) -> str:
-        """Return what `read_argument` does, without counting the statement as read."""
+        """Return what `read_argument` returns, but don't mark the statement as read."""
         return self.statements.get(key, "").partition("#")[0].strip()
 
 
@@ -831,14 +841,14 @@ class MtlMaterial:
 class MapUse:
     """A statement that names a picture."""
 
-    name: str  # name of the picture, as the file has it
-    options: dict[str, str]  # the values of its options by their names, in lower case
-    # How often the image repeats over a unit of u and of v (``-s``).
+    name: str  # name of the picture in the file
+    options: dict[str, str]  # values of its options by their names, in lower case
+    # Number of repeats of the image over a unit of u and of v (``-s``).
     scale: Pair = (1.0, 1.0)
-    offset: Pair = (0.0, 0.0)  # what is added to scaled texture coordinates (``-o``)
-    # What is added to the image's values after scaling, and their factor (``-mm``).
+    offset: Pair = (0.0, 0.0)  # offset of texture coordinates after scaling (``-o``)
+    # Offset of the image's values after scaling, and their factor (``-mm``).
     range: Pair = (0.0, 1.0)
-    bump: float = 1.0  # the factor of a normal map's x and y (``-bm``)
+    bump: float = 1.0  # factor of a normal map's x and y (``-bm``)
 
 
 def parse_mtl(text: str, file: str) -> tuple[list[MtlMaterial], list[str]]:
@@ -881,26 +891,25 @@ def parse_map(argument: str) -> MapUse | None:
     """Parse the arguments of a statement that names an image; None if it names none.
 
     In "-s 2 2 -clamp on old wood.png" the name is "old wood.png". Known options are
-    taken out wherever they stand. Words with a dash at the beginning of the rest are
-    unknown options, which are removed together with their values. What is left is the
-    name, which may have blanks.
+    removed wherever they are. Then words with a dash at the beginning are unknown
+    options, which are removed together with their values. The rest is the name, which
+    may have blanks.
     """
     options: dict[str, str] = {}
-    for match in _OPTION.finditer(argument):
-        for key in _OPTIONS:
-            # `_OPTION` has two groups for each option: "s" is its name as it stands,
-            # and "s_" its value.
+    for match in _KNOWN_OPTION.finditer(argument):
+        for key in _VALUE_PATTERNS:
             if match[key] is not None:
                 options[key] = match[f"{key}_"]
-    name = " ".join(_OPTION.sub("", argument).split())
-    unknown = _UNKNOWN.match(name)
+    name = " ".join(_KNOWN_OPTION.sub("", argument).split())
+    unknown = _UNKNOWN_OPTION.match(name)
     while unknown:
+        # The option is stored without its values, since only its name is noted.
         options[unknown[1].lower()] = ""
         name = name[unknown.end() :]
-        unknown = _UNKNOWN.match(name)
+        unknown = _UNKNOWN_OPTION.match(name)
     if not name:
         return None
-    bump, _ = _parse_pair(options, "bm", (1.0, 1.0))  # it has one number
+    bump, _ = _parse_pair(options, "bm", (1.0, 1.0))  # the option has one number
     return MapUse(
         name,
         options,
@@ -922,7 +931,7 @@ def _parse_pair(options: dict[str, str], key: str, default: Pair) -> Pair:
 
 
 def parse_numbers(argument: str) -> list[float] | None:
-    """Return the finite numbers of a statement; None if it has other words, or none."""
+    """Return the numbers of a statement; None unless all its words are finite numbers."""
     try:
         values = [float(word) for word in argument.split()]
     except ValueError:
@@ -933,7 +942,7 @@ def parse_numbers(argument: str) -> list[float] | None:
 def parse_fraction(argument: str) -> float | None:
     """Return the last word of a statement as a number clipped to [0, 1].
 
-    None if that is no number. Options may stand before it.
+    The result is None if that is no number. Options may precede it.
     """
     last_word = " ".join(argument.split()[-1:])
     values = parse_numbers(last_word)

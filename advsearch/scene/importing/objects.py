@@ -1,9 +1,9 @@
 """Objects from mesh files: ``--object path.obj`` and others of
 `advsearch.files.MESHES`.
 
-A file is read as a list of parts: one piece of geometry with one surface each, in the
-file's own coordinates. The readers are our own, since existing ones silently drop what
-they do not understand.
+A file is read as a list of parts. Each part has one surface and its geometry in the
+file's coordinates. The readers are our own, since existing ones silently drop entries
+that they do not support.
 """
 
 from __future__ import annotations
@@ -78,10 +78,13 @@ def read_parts(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
         FileFormatError: the file is corrupt, is no mesh, refers to missing geometry, or
             has no faces.
     """
+    notes = Notes(path)
+    # Readers limit images themselves, also above Pillow's limit of pixels.
     with warnings.catch_warnings(), np.errstate(all="ignore"), without_pillows_limit():
         warnings.simplefilter("ignore")
-        notes = Notes(path)
-        return get_reader(path.suffix.lower())(path, data, notes), list(notes)
+        reader = get_reader(path.suffix.lower())
+        parts = reader(path, data, notes)
+        return parts, list(notes)
 
 
 MAX_WARNINGS = 20  # warnings about one file
@@ -105,25 +108,25 @@ def import_object(
     - Normals are the file's; if it has none, or they contradict the faces, they are
       computed: smooth, with creases where faces meet at more than 40 degrees; flat in
       glTF.
-    - UVs are the file's, moved into [0, 1] if that takes little. If it has none, if
-      they repeat a texture or are squashed, and if there are several materials, xatlas
-      makes new ones and the images are baked into maps.
+    - UVs are the file's, moved into [0, 1] if they fit. If there are none, if they
+      repeat a texture or are squashed, or if there are several materials, xatlas makes
+      new ones and the images are baked into maps.
 
-    The warnings name what is left out or changed. The same file gives the same bytes
-    every time.
+    The warnings name all data that is left out or changed. The same file always gives
+    the same bytes.
 
     Args:
         path: a file of one of the kinds of `advsearch.files.MESHES`.
-        up: the axis of the file that points up; None: that of its format, or else the
-            one that its shape suggests.
+        up: the axis of the file that points up; None for the axis of its format, or
+            else the one that its shape suggests.
         facing: the axis of the file, one of `FRONT_AXES`, along which the object's
-            front faces; None: that of its format (`find_front`).
+            front faces; None for the axis of its format (`find_front`).
 
     Raises:
         FileFormatError: the file is missing, of another kind, corrupt, or has no faces;
             the message names it.
-        InputError: `up` is neither, `facing` is none of them or along the same axis, or
-            the geometry has NaN, infinite, or coincident vertices only.
+        InputError: `up` or `facing` is not valid, both are along the same axis, or the
+            geometry has NaN, infinite, or only coincident vertices.
     """
     if up not in (None, "y", "z"):
         raise InputError(f"up axis: expected 'y' or 'z', got {up!r}")
@@ -160,14 +163,14 @@ def check_facing(facing: str, up: str | None) -> str:
     if axis[1] == up:  # the letter behind the sign
         raise InputError(
             f"facing: {facing} is along the axis that points up, {up}; "
-            "give another one, or another `up`"
+            "choose another one, or another `up`"
         )
     return axis
 
 
 DEFAULT_FRONT = "+x"
 """The front in formats that define none: the axis along which bundled objects face."""
-# The axis that points up, by that of a front which rules out one of the two.
+# Up is y or z. If the front is along one of them, up is the other.
 UP_OF_FRONT = {"y": "z", "z": "y"}
 BLEND_SUFFIX = ".blend"
 USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
@@ -193,19 +196,18 @@ def find_front(path: Path, header: Header | None, up: str | None = None) -> File
         rule = "a format without a rule, as bundled objects face"
     elif VRM_0 in header.extensionsUsed and VRM_1 not in header.extensionsUsed:
         axis = "-z"
-        rule = "as VRM 0 says"
+        rule = "as VRM 0 defines"
     elif suffix == BLEND_SUFFIX:
         axis = "+z"
         rule = "-y in Blender, as its front view shows"
     else:
         axis = "+z"
-        rule = "as glTF says"
+        rule = "as glTF defines"
     opposite = f"-{axis[1]}" if axis[0] == "+" else f"+{axis[1]}"
     return FileAxis(
         axis,
-        f"{path.name}: its front is taken to face {axis} of the file ({rule}); if it "
-        "faces another way, give that, "
-        f"such as `facing={opposite}`",
+        f"{path.name}: its front is assumed to face {axis} of the file ({rule}); if it "
+        f"faces another axis, set `facing`, such as `facing={opposite}`",
     )
 
 
@@ -219,20 +221,20 @@ def make_object(
 ) -> ObjectAsset:
     """Return the object that parts of a file make up.
 
-    It is joined, turned, repaired and textured as `import_object` says. Its size in
-    metres is known only if the format has units, and the extent is plausible.
+    It is joined, rotated, repaired and textured as described in `import_object`. Its
+    size in meters is known only if the format has units, and the extent is plausible.
 
     Args:
         parts: at least one.
         notes: warnings about them so far.
         file: the file that they are from.
         name: name of the object.
-        up: the axis of the file that points up, "y" or "z"; None: that of the format,
-            or else the one that its shape suggests.
+        up: the axis of the file that points up, "y" or "z"; None for the axis of the
+            format, or else the one that its shape suggests.
         front: the axis of the file along which its front faces.
 
     Raises:
-        InputError: the geometry has NaN, infinite, or coincident vertices only.
+        InputError: the geometry has NaN, infinite, or only coincident vertices.
     """
     object_notes = Notes(file)
     is_gltf = file.suffix.lower() in GLTF_SUFFIXES
@@ -272,6 +274,7 @@ def _select_visible_parts(
 ) -> list[ImportedPart]:
     """Return the parts that are not fully transparent, and note the others."""
     visible_parts = select_visible(parts)
+    # Parts are compared by identity.
     transparent = [part for part in parts if part not in visible_parts]
     names = dict.fromkeys(
         format_name(part.surface.name or "a part") for part in transparent
@@ -314,14 +317,14 @@ def _find_up(
 def _find_opacity(color: Float32Array, notes: Notes) -> Float32Array | None:
     """Return the opacity (H, W) in a map of colors (H, W, 3 or 4); None if opaque.
 
-    An object that is transparent everywhere would be invisible. It counts as opaque,
+    An object that is transparent everywhere would be invisible. It becomes opaque,
     with a note.
     """
     if color.shape[2] < 4:
         return None
     opacity = np.ascontiguousarray(color[:, :, 3])
     if not opacity.any():
-        notes.warn("it is transparent all over; it is shown opaque")
+        notes.warn("it is fully transparent everywhere; it is rendered opaque")
         return None
     return opacity
 
@@ -332,20 +335,23 @@ def _compute_mean_material(
     """Return the roughness and metallic of all surfaces, averaged by area.
 
     The renderer has one roughness and one metallic for an object. If the surfaces
-    differ, a note says that means are used. Surfaces without faces do not count.
+    differ, there is a note that means are used. Surfaces without faces are left out.
 
     Args:
         soup: the object.
         surfaces: the surface of each of its parts.
         notes: notes about the file.
     """
+    # twice the area of each surface, in the order of `surfaces`
     visible_area = np.bincount(
         soup.part_ids,
         weights=np.linalg.norm(soup.compute_face_vectors(), axis=1),
         minlength=len(surfaces),
     )
     # What a surface does not state has the value of the default material.
-    materials = [Material().with_values(vars(surface), "") for surface in surfaces]
+    materials = [
+        Material().with_values(vars(surface), prefix="") for surface in surfaces
+    ]
     values = np.array(
         [[material.roughness, material.metallic] for material in materials]
     )
@@ -390,7 +396,7 @@ def _make_mesh(
         turn: rotation (3, 3) from the file's axes to ours.
     """
     material_names, material_of_face = index_materials(soup, surfaces)
-    # Groups end with the last material that has faces.
+    # Materials behind the last one with faces have no group.
     faces_by_material = zip(
         material_names, group_indices(material_of_face), strict=False
     )
@@ -402,13 +408,13 @@ def _make_mesh(
         normalised_mesh = replace(normalise_mesh(mesh), materials=materials)
     except InputError as error:  # it does not name the file
         raise InputError(f"{file}: {error}") from None
-    if stored_vertices is None:
+    if stored_vertices is None:  # nothing in the file moves
         return normalised_mesh
-    # A vertex of the file was divided by the extent of all parts when they were joined,
-    # and then by the mesh's own extent. The rig needs both.
+    # A vertex of the file was rotated, divided by the extent of all parts when they
+    # were joined, and then by the mesh's own extent.
     soup_extent = compute_extent(parts)
     mesh_extent = float(np.ptp(mesh.vertices.astype(np.float64), axis=0).max())
-    # Imported late: torch takes seconds, and most objects have no joints.
+    # Imported here, since torch takes seconds, and most objects have no joints.
     from advsearch.scene.rigged import SkeletonRig
 
     movable_parts = [part.movable for part in parts if part.movable is not None]
@@ -469,11 +475,11 @@ def _compute_emitted(
 
 
 TOUCHING_HEIGHT = 0.02
-"""Height, as a fraction of the largest extent, up to which a vertex touches the ground:
-feet and scans are uneven.
+"""Height, as a fraction of the largest extent, up to which a vertex is regarded as
+touching the ground. It is not 0, since feet and scans are uneven.
 """
-# The fractions of two axes must differ by more than this factor for the shape to tell
-# which one is up.
+# Ratio of the touching fractions of two axes above which the shape decides which axis
+# is up.
 MIN_UP_RATIO = 1.1
 
 
@@ -491,7 +497,7 @@ def guess_up(points: Float64Array, name: str) -> FileAxis:
         name: name of the file, for the note.
 
     Returns:
-        The axis, z if the shape does not tell, and a note with the reason.
+        The axis, and a note with the reason. It is z if the shape does not decide.
     """
     fractions = {
         # with the axes in the order z, x, y: then y is the third axis, up
@@ -503,7 +509,7 @@ def guess_up(points: Float64Array, name: str) -> FileAxis:
     if fractions["y"] > MIN_UP_RATIO * fractions["z"]:
         axis = "y"
         other_axis = "z"
-    reason = "its shape does not tell, as it rests as well either way"
+    reason = "its shape fits y and z equally well"
     if fractions[axis] > MIN_UP_RATIO * fractions[other_axis]:
         reason = (
             f"it then rests on {100 * fractions[axis]:.0f} % of what it covers, seen "
@@ -511,8 +517,8 @@ def guess_up(points: Float64Array, name: str) -> FileAxis:
         )
     return FileAxis(
         axis,
-        f"{name}: {axis} is taken for up, because {reason}; if it lies "
-        f"on its side, give `up={other_axis}`",
+        f"{name}: {axis} is assumed to be up, because {reason}; if it lies on its "
+        f"side, set `up={other_axis}`",
     )
 
 
@@ -520,7 +526,8 @@ def compute_touching_fraction(points: Float64Array) -> float:
     """Return the fraction of an object's footprint that touches the ground, in [0, 1].
 
     Up is the third axis of its points (P, 3). Areas are those of convex hulls, seen
-    from above; what touches is within `TOUCHING_HEIGHT` of the lowest point.
+    from above. Points touch the ground if they are within `TOUCHING_HEIGHT` of the
+    lowest one.
     """
     height = points[:, 2] - points[:, 2].min()
     is_touching = height <= TOUCHING_HEIGHT * np.ptp(points, axis=0).max()

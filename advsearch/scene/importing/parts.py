@@ -32,13 +32,10 @@ FLAT_TEXEL = np.array([0.5, 0.5, 1.0], np.float32)
 MAX_NORMAL_SCALE = 100.0  # larger factors of x and y make no visible difference
 # Minimum z of a normal before it is scaled to length 1: it points out of the surface.
 MIN_NORMAL_Z = 0.01
-# How much bluer than red a normal map is on average; a grey map of heights is not.
+# Smallest mean of blue minus red in a normal map. In a grey map of heights it is 0.
 MIN_BLUENESS = 0.1
-MAX_LENGTH_ERROR = 0.2
-MIN_NORMAL_FRACTION = 0.9
-"""Largest error of the length of a normal in an image, and the fraction of the texels
-for which it must hold.
-"""
+MAX_LENGTH_ERROR = 0.2  # largest error of the length of a normal in an image
+MIN_NORMAL_FRACTION = 0.9  # smallest fraction of the texels within that error
 
 
 def make_normal_map(picture: Float32Array, scale: float = 1.0) -> Float32Array:
@@ -86,8 +83,8 @@ def encode_normals(normals: npt.NDArray[np.floating]) -> Float32Array:
 
 
 NEUTRAL_GREY = 0.5  # display-referred grey of an object without material
-# Limit of the radiance that a surface emits; white in the light of a bundled
-# environment is about 1.
+# Limit of the radiance that a surface emits. A white surface in the light of a bundled
+# environment has a radiance of about 1.
 MAX_RADIANCE = 1e5
 
 
@@ -95,20 +92,20 @@ MAX_RADIANCE = 1e5
 class ImportedSurface:
     """The material of a part.
 
-    Colors are display-referred sRGB in [0, 1], and images have row 0 on top. None is
-    what the file does not define.
+    Colors are display-referred sRGB in [0, 1], and images have row 0 on top. An
+    attribute is None if the file does not define it.
     """
 
-    # (3,) base colour where there is no texture; (4,) with its opacity in [0, 1]
+    # (3,) base color if there is no texture; (4,) with its opacity in [0, 1]
     color: Float32Array | None = None
-    # (H, W, 3) base colour, or (H, W, 4) with the opacity
+    # (H, W, 3) base color, or (H, W, 4) with the opacity
     texture: Float32Array | None = None
-    roughness: float | None = None  # roughness in [0, 1]
-    metallic: float | None = None  # metallic in [0, 1]
-    normal_map: Float32Array | None = None  # (H, W, 3) of this module
-    # (H, W, 3) linear radiance; (1, 1, 3) where it is the same everywhere
+    roughness: float | None = None  # in [0, 1]
+    metallic: float | None = None  # in [0, 1]
+    normal_map: Float32Array | None = None  # (H, W, 3) encoded as in this module
+    # (H, W, 3) linear radiance; (1, 1, 3) if it is the same everywhere
     emission: Float32Array | None = None
-    name: str = ""  # name of the material in the file; empty where it has none
+    name: str = ""  # name of the material in the file; "" if it has none
 
     @property
     def images(self) -> tuple[Float32Array, ...]:
@@ -125,7 +122,7 @@ class ImportedSurface:
     def with_images(self, pictures: Iterable[Float32Array]) -> ImportedSurface:
         """Return the surface with other images, in the order of `images`.
 
-        There are as many as in `images`: what the surface does not have stays None.
+        Their number is that of `images`. Attributes that are None stay None.
         """
         remaining = iter(pictures)
         texture = None if self.texture is None else next(remaining)
@@ -192,18 +189,18 @@ def apply_opacity(
     """Return a base color with its opacity.
 
     Cut-out texels get the color of the nearest visible one. Otherwise filtering would
-    blend their own color into the edges.
+    blend their color into the edges.
 
     Args:
         color: (..., 3 or 4) base color; None returns None.
-        factor: (1,) which multiplies the alpha.
-        cutoff: opacity from which a texel is opaque, and below which it is cut out;
+        factor: (1,) factor of the alpha.
+        cutoff: opacity from which on a texel is opaque; below it, a texel is cut out.
             None keeps partial opacity.
 
     Returns:
         (..., 4), or (..., 3) if it is opaque everywhere.
     """
-    # Imported late: the reader of USD, a separate process, needs no scipy.
+    # Imported here, since the reader of USD, a separate process, needs no scipy.
     from scipy.ndimage import distance_transform_edt
 
     if color is None:
@@ -237,25 +234,24 @@ def clip_to_unit(value: float | None) -> float | None:
 class ImportedPart:
     """One part of a mesh file, with the transform of its node applied.
 
-    None is what the file does not define.
+    An attribute is None if the file does not define it.
     """
 
-    vertices: (
-        Float64Array  # (V, 3) positions in the file's axes and units; may hold NaN
-    )
-    faces: IntArray  # (F, 3) vertices, F > 0
-    # (V, 3) of the file, not necessarily unit length or finite
+    vertices: Float64Array  # (V, 3) in the file's axes and units; may hold NaN
+    faces: IntArray  # (F, 3) indices of vertices, F > 0
+    # (V, 3) normals of the file, not necessarily of unit length or finite
     normals: Float64Array | None = None
     uvs: Float64Array | None = None  # (V, 2), v = 0 at the bottom row
-    # (F, 3, 3) colour of each corner in [0, 1], which multiplies the base colour in
+    # (F, 3, 3) color of each corner in [0, 1], which multiplies the base color in
     # linear light
     colors: Float64Array | None = None
     surface: ImportedSurface = ImportedSurface()
-    node: int = -1  # index of its node in a glTF file; -1 in others
+    node: int = -1  # index of its node in a glTF file; -1 in other formats
     # Whether faces without normals are shaded flat; otherwise smooth normals are
     # computed.
     flat: bool = False
-    # If something moves it: the part as the file stores it, its vertices in this order.
+    # The part before joints or morph targets move it, with vertices in the same order;
+    # None if nothing moves it.
     movable: Movable | None = None
 
 
@@ -286,8 +282,9 @@ def transform_part(part: ImportedPart, matrix: Float64Array) -> ImportedPart:
     with np.errstate(all="ignore"):
         vertices = multiply_rows(part.vertices, linear.T) + matrix[:3, 3]
         if normals is not None:
-            # Normals are transformed by the cofactors of the matrix: the inverse
-            # transpose times the determinant, which singular matrices have too.
+            # Normals are transformed by the matrix of cofactors: the inverse transpose
+            # times the determinant, which exists also for singular matrices. Its row i
+            # is the cross product of the rows i + 1 and i + 2.
             cofactors = np.cross(linear[[1, 2, 0]], linear[[2, 0, 1]])
             normals = multiply_rows(normals, cofactors.T)
     return replace_geometry(
@@ -326,7 +323,7 @@ def replace_geometry(
 
 
 class IndexedValues(NamedTuple):
-    """Values that the corners of triangles look up."""
+    """Values, and the indices by which the corners of triangles refer to them."""
 
     values: Float64Array  # (N, C) float64
     rows: IntArray  # (F, 3) int64 rows of `values`; -1 if a corner has none
@@ -362,7 +359,7 @@ def split_at_corners(
     )
 
     def gather_vertex_values(indexed: IndexedValues | None) -> Float64Array | None:
-        """Return values (V, C), NaN where there are none; None if there are none."""
+        """Return values (V, C), NaN for vertices without one; None if all are without."""
         if indexed is None:
             return None
         rows = indexed.rows[triangles].reshape(-1)[first_corner]
@@ -397,7 +394,7 @@ def _number_corners(triangles: IntArray, *columns: IndexedValues | None) -> IntA
         (3 T,) numbers, corner by corner.
     """
     corner_number = np.zeros(3 * len(triangles), dtype=np.int64)
-    bound = 1  # all numbers are smaller
+    bound = 1  # all numbers are smaller than this
     for indexed in filter(None, columns):
         base = len(indexed.values) + 1
         # Replace the numbers by consecutive ones, so that the next digit does not

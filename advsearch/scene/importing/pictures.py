@@ -56,7 +56,7 @@ def read_image(
 def read_image_size(path: Path) -> tuple[int, int]:
     """Return the height and width of an image file in pixels, without decoding it.
 
-    Raises FileFormatError: as for `read_image`, but for what only decoding shows.
+    Raises FileFormatError as `read_image`, except for errors that only decoding finds.
     """
     with open_image(path, LARGEST_FILE) as image:
         check_decodable(image, path)
@@ -77,11 +77,11 @@ def load_display_image(
         image: the image.
         limit: longest side of the result; larger images are averaged down in linear
             light, weighted by opacity. None: no limit.
-        path: where it is from, for messages.
-        keep_alpha: keep it as a fourth channel, 1 if the image has none; otherwise it
-            is dropped.
-        is_raw: it holds numbers, as a normal map does, and no colors; larger ones are
-            averaged down as they are.
+        path: path of the image's file, for messages.
+        keep_alpha: whether alpha is returned as a fourth channel, 1 if the image has
+            none; otherwise it is dropped.
+        is_raw: whether the image holds numbers, as a normal map does, and no colors.
+            Numbers are averaged down without a conversion to linear light.
 
     Returns:
         (H, W, 3 or 4) float32 in [0, 1], row 0 on top.
@@ -93,9 +93,9 @@ def load_display_image(
     check_decodable(image, path)
     width, height = image.size
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of large images and odd metadata
+        warnings.simplefilter("ignore")  # about large images and odd metadata
         image.load()
-        # the factor by which the image becomes smaller; from 1 on it stays as it is
+        # factor of the size; the image is not enlarged
         shrink = 1.0 if limit is None else limit / max(height, width)
         if shrink >= 1.0:
             return np.asarray(_VALUE_OF_LEVEL[to_8bit_levels(image, alpha=keep_alpha)])
@@ -110,7 +110,7 @@ _VALUE_OF_LEVEL: Float32Array = np.arange(256, dtype=np.float32) / np.float32(25
 
 
 def _average_numbers(image: Image.Image, target_shape: tuple[int, int]) -> Float32Array:
-    """Return an image of numbers averaged down as it is, (height, width, 3)."""
+    """Average down an image of numbers, without a conversion: (height, width, 3)."""
     width, height = image.size
 
     def load_band(top: int, end: int) -> Float32Array:
@@ -126,7 +126,7 @@ def _average_colors(
 ) -> Float32Array:
     """Return an image of colors averaged down in linear light, display-referred.
 
-    Colors are weighted by opacity, so that transparent pixels do not count.
+    Colors are weighted by opacity, so that transparent pixels have no weight.
 
     Args:
         image: the image.
@@ -138,7 +138,7 @@ def _average_colors(
     is_weighted = keep_alpha or image.has_transparency_data
 
     def load_band(top: int, end: int) -> Float32Array:
-        """Return rows of colors; with opacity also that, and their product."""
+        """Return rows of linear colors; if weighted, also opacity and their product."""
         band_image = image.crop((0, top, width, end))
         levels = to_8bit_levels(band_image, alpha=is_weighted)
         colors = linear_of_level[levels[:, :, :3]]
@@ -148,12 +148,12 @@ def _average_colors(
         return np.concatenate([colors, opacity, colors * opacity], axis=2)
 
     averaged = average_in_bands(load_band, (height, width), target_shape)
-    # as `load_band` returns them
+    # in the order of the channels in `load_band`
     colors = averaged[:, :, :3]
     opacity = averaged[:, :, 3:4]
     if is_weighted:
         weighted_colors = averaged[:, :, 4:] / np.maximum(opacity, 1e-9)
-        # Where all is transparent, the mean color stays.
+        # Fully transparent pixels get the mean color without weights.
         colors = np.where(opacity > 0.0, weighted_colors, colors)
     display_colors = linear_to_srgb(colors)
     if not keep_alpha:
@@ -172,8 +172,8 @@ def average_in_bands(
     `average_area` for the full image.
 
     Args:
-        load_band: returns rows from its first argument to before its second, (n, W, C)
-            float32.
+        load_band: function of a start and an end; returns the rows from start to before
+            end, (n, W, C) float32.
         size: rows and columns of the image.
         target: rows and columns of the result.
 
@@ -187,7 +187,7 @@ def average_in_bands(
     bands = []
     for start in range(0, target[0], rows_per_band):
         weights = row_weights[start : start + rows_per_band]
-        # the source rows that these rows of the result take
+        # the source rows that these rows of the result need
         top = int(weights.indices.min())
         end = int(weights.indices.max()) + 1
         bands.append(_average(load_band(top, end), weights[:, top:end], column_weights))
@@ -241,10 +241,10 @@ def _compute_overlaps(source: int, target: int) -> sparse.csr_array:
     """Return the weights (target, source) of source cells in target cells.
 
     Both grids divide the same length, one into `source` and the other into `target`
-    equal cells. A weight is the length of the overlap of two cells, normalised so that
+    equal cells. A weight is the length of the overlap of two cells, normalized so that
     each row sums to 1. To find overlaps, the length is cut at the edges of both grids.
-    Each piece then lies in one source cell and in one target cell, and its length is
-    their overlap.
+    Each piece is in one source cell and in one target cell, and its length is their
+    overlap.
     """
     target_edges = np.arange(target + 1) * (source / target)
     all_edges = np.unique(
@@ -264,15 +264,15 @@ def _compute_overlaps(source: int, target: int) -> sparse.csr_array:
 
 ImageKind = Literal["colours", "colours and alpha", "numbers"]  # what a picture holds
 LARGEST_SUM = 2 * MAX_PIXELS
-"""Limit of the pixels of all color textures of a file, and of those of numbers; before
-`scaled`.
+"""Limit of the pixels of all color textures of a file, and another one of all textures
+of numbers; before `scale_limit`.
 """
 UNREADABLE = "cannot be read as a picture"
-NO_PATH = ": "  # begins the message of an error about an image without a path
-MIN_TEXTURE_SIDE = 64  # however many materials a file has
+NO_PATH = ": "  # beginning of the message of an error whose path is ""
+MIN_TEXTURE_SIDE = 64  # smallest limit of the sides of textures, texels
 MAX_FULL_TEXTURES = 16
-"""Materials whose textures may be as large as `TEXTURE_LIMIT`; more are baked into one
-map, so that smaller ones suffice.
+"""Number of materials up to which textures may be as large as `TEXTURE_LIMIT`. More
+materials are baked into one map, so that smaller textures suffice.
 """
 
 
@@ -280,17 +280,17 @@ map, so that smaller ones suffice.
 class FileImages:
     """Decodes the images of one file, each once, within limits in total."""
 
-    materials: int  # how many the file has
+    materials: int  # number of materials of the file
     references: References  # finds the files that it names
     notes: Notes  # notes about the file: images made smaller, or missing
-    # Longest side of a texture; None: that of an object with so many materials.
+    # Longest side of a texture; None for a limit by the number of materials.
     limit: int | None = None
     # Values, or the reason why there are none, by image and kind.
     _cache: dict[tuple[Hashable, ImageKind], Float32Array | str] = field(
         default_factory=dict
     )
-    # Pixels so far, by whether they are numbers.
-    _pixels: Counter[bool] = field(default_factory=Counter)
+    # Pixels decoded so far, by "numbers" or "colours".
+    _pixel_counts: Counter[str] = field(default_factory=Counter)
 
     @property
     def max_side(self) -> int:
@@ -321,17 +321,16 @@ class FileImages:
         name: str,
         message: str,
     ) -> Float32Array | None:
-        """Return an image's values, as `load_display_image`; None, and a note, if it
-        fails.
+        """Return the values of an image, as `load_display_image` does.
 
-        An image is decoded once for each kind, and so is its failure; the note is added
-        at each call.
+        If this fails, a note is added and None is returned. An image is decoded only
+        once for each kind. A failure is cached, too, but noted at each call.
 
         Args:
             key: identifies the image in the cache, such as its name.
             read_bytes: returns the content of its file; raises OSError or ValueError if
                 there is none.
-            kind: what it holds, such as "colours".
+            kind: content of the image, such as "colours".
             name: its name in the file.
             message: the note, with {name} and {why}.
         """
@@ -344,9 +343,12 @@ class FileImages:
         return image_or_reason
 
     def note_missing(self, name: str, reason: str, message: str) -> None:
-        """Note that an image is missing, and what replaces it.
+        """Note that an image is missing.
 
-        The message has {name} and {why}; the latter becomes the reason.
+        Args:
+            name: name of the image, which replaces {name} in the message.
+            reason: predicate that replaces {why}, such as "is missing".
+            message: the note.
         """
         self.notes.warn(
             message.replace("{name}", format_name(name)).replace("{why}", reason)
@@ -357,21 +359,24 @@ class FileImages:
     ) -> Float32Array | str:
         """Return the values of an image, or the reason why there are none.
 
-        A note is added if the image was made smaller.
+        A reason is a predicate, such as "is missing". A note is added if the image was
+        made smaller.
 
         Args:
             read_bytes: returns the content of its file.
-            kind: what it holds, such as "numbers".
+            kind: content of the image, such as "numbers".
             name: its name in the file, for notes.
         """
         try:
             image = Image.open(io.BytesIO(read_bytes()), formats=FORMATS)
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+            # A file that must not be read has a reason here.
             return self.references.refused.get(normalize_name(name), UNREADABLE)
         try:
             texture = self._load_within_limits(image, kind)
         except FileFormatError as error:
-            return f"is not read ({str(error).removeprefix(NO_PATH)})"
+            problem = str(error).removeprefix(NO_PATH)
+            return f"is not read ({problem})"
         except (OSError, ValueError, SyntaxError, EOFError):
             return UNREADABLE
         width, height = image.size
@@ -396,10 +401,13 @@ class FileImages:
         """
         width, height = image.size
         is_raw = kind == "numbers"
-        n_pixels = self._pixels[is_raw] + width * height
-        check_pixels("", width, height)
+        content = "numbers" if is_raw else "colours"
+        n_pixels = self._pixel_counts[content] + width * height
+        # The caller names the image, so that the path in errors is empty.
+        no_path = ""
+        check_pixels(no_path, width, height)
         check_most(
-            "",
+            no_path,
             n_pixels,
             LARGEST_SUM,
             "pictures of at most {} pixels",
@@ -408,9 +416,9 @@ class FileImages:
         texture = load_display_image(
             image,
             self.max_side,
-            "",
+            no_path,
             keep_alpha=kind == "colours and alpha",
             is_raw=is_raw,
         )
-        self._pixels[is_raw] = n_pixels
+        self._pixel_counts[content] = n_pixels
         return texture

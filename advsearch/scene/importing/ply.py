@@ -1,7 +1,7 @@
 """Reader of PLY files.
 
-The format leaves the names of elements and properties open; those of many programs are
-known here.
+The format does not define the names of elements and properties; those of many programs
+are known here.
 """
 
 from __future__ import annotations
@@ -66,10 +66,10 @@ _END = re.compile(rb"^end_header[ \t]*(?:\r\n|\n|\r)", re.MULTILINE)
 
 @dataclass(frozen=True, eq=False)
 class ListValues:
-    """The values of a list property: several in each row."""
+    """The values of a list property, which has several values in each row."""
 
-    counts: IntArray  # (N,) how many each row has
-    values: Numbers  # those of all rows, concatenated
+    counts: IntArray  # (N,) number of values in each row
+    values: Numbers  # values of all rows, concatenated
 
 
 @dataclass
@@ -77,8 +77,8 @@ class Element:
     """A table of a file: its properties, their types and their values."""
 
     name: str
-    count: int  # count of its rows
-    # Types of properties; of a list, that of its values.
+    count: int  # number of its rows
+    # Types of properties; for a list, the type of its values.
     types: dict[str, np.dtype[np.generic]] = field(default_factory=dict)
     # Types of the counts of lists.
     count_types: dict[str, np.dtype[np.generic]] = field(default_factory=dict)
@@ -100,11 +100,12 @@ def read_elements(data: bytes, notes: Notes) -> tuple[dict[str, Element], list[s
             than its header states.
     """
     has_magic = data.startswith(b"ply")
-    # Some files end their lines in carriage returns alone.
+    # Some files end their lines in carriage returns alone. Replacing them leaves all
+    # positions as they are.
     ends_in_returns = data.startswith(b"ply\r") and not data.startswith(b"ply\r\n")
     header_end = _END.search(data.replace(b"\r", b"\n") if ends_in_returns else data)
     if not has_magic or header_end is None:
-        # Given bytes, `damaged` tells in its message what kind of file they are.
+        # If `got` is bytes, the message describes what kind of file they are.
         got = "half of one" if has_magic else data
         raise notes.damaged("a PLY file with a complete header", got)
     elements, comments, byte_order = _parse_header(
@@ -112,9 +113,10 @@ def read_elements(data: bytes, notes: Notes) -> tuple[dict[str, Element], list[s
     )
     notes.check_faces(elements["face"].count if "face" in elements else 0)
     body = data[header_end.end() :]
-    # `cells` are the bytes that rows are read from. The numbers of an ASCII file are
-    # parsed to float64 first; then their bytes are read as those of a binary file.
-    if byte_order:
+    # `cells` are the bytes from which rows are read. The numbers of an ASCII file are
+    # first parsed to float64; then their bytes are read as those of a binary file.
+    is_binary = byte_order != ""
+    if is_binary:
         cells = np.frombuffer(body, np.uint8)
         text = b""
     else:
@@ -159,7 +161,10 @@ def _parse_header(
                 element = Element(name, int(count))
                 elements[name] = element
             case ["property", "list", count_kind, kind, name] if (
-                element and count_kind in _TYPES and kind in _TYPES
+                element
+                and count_kind in _TYPES
+                and kind in _TYPES
+                and name not in element.types
             ):
                 element.types[name] = _make_dtype(kind, byte_order)
                 element.count_types[name] = _make_dtype(count_kind, byte_order)
@@ -182,8 +187,10 @@ def _parse_header(
 
 
 def _make_dtype(kind: str, byte_order: str | None) -> np.dtype[np.generic]:
-    """Return the type of numbers of a kind; without a byte order, in that of the
-    machine.
+    """Return the type of numbers of a kind, such as "float".
+
+    The byte order is that of the machine if `byte_order` is "" (of an ASCII file) or
+    None (the `format` line has not come yet).
     """
     return np.dtype((byte_order or "") + _TYPES[kind])
 
@@ -198,10 +205,11 @@ class _RowReader:
         cells: the bytes of the file's body; of an ASCII file, those of its numbers as
             float64.
         text: the body of an ASCII file; empty for a binary file.
-        values: by property, the number of its type that begins at each byte.
-        counts: by property that is a list, the count that begins at each byte. A list
-            is its count and then its values.
-        widths: by property, the bytes of a scalar, or of the count of a list.
+        values: for each property an array with an entry for each byte of `cells`: the
+            number of the property's type that begins there.
+        counts: for each property that is a list, such an array of its counts. A list is
+            its count and then its values.
+        widths: for each property the bytes of a scalar, or of the count of a list.
     """
 
     notes: Notes
@@ -219,9 +227,10 @@ class _RowReader:
             name: self._view_from_any_byte(kind)
             for name, kind in element.count_types.items()
         }
+        # A list begins with its count, and a scalar is its value.
         self.widths = {
-            name: self.counts.get(name, numbers).itemsize
-            for name, numbers in self.values.items()
+            name: self.counts.get(name, values).itemsize
+            for name, values in self.values.items()
         }
 
     def read(self, position: int) -> int:
@@ -233,7 +242,8 @@ class _RowReader:
         Raises:
             FileFormatError: the file ends early, or has a list of an impossible length.
         """
-        if not self.element.count or not self.widths:
+        has_properties = bool(self.widths)
+        if not self.element.count or not has_properties:
             return position
         # The header may state any number of rows. Before memory is allocated for them,
         # check that the file is long enough at least for their scalars and counts.
@@ -242,7 +252,8 @@ class _RowReader:
         # lists at these positions differ in length, rows are walked one by one.
         starts, end = self._find_even_rows(position)
         lists_differ = end > len(self.cells) or any(
-            np.ptp(numbers[starts[name]]) != 0 for name, numbers in self.counts.items()
+            np.ptp(count_at_byte[starts[name]]) != 0
+            for name, count_at_byte in self.counts.items()
         )
         if lists_differ:
             starts, end = self._walk_rows(position, self.element.count)
@@ -254,10 +265,13 @@ class _RowReader:
 
         No byte is copied: number i of the view is made of the bytes from i on.
         """
-        kind = np.dtype(np.float64) if self.text else kind  # an ASCII file's numbers
+        if self.text:  # the numbers of an ASCII file
+            kind = np.dtype(np.float64)
         n_starts = max(0, len(self.cells) - kind.itemsize + 1)
-        # a stride of one byte
-        numbers: Numbers = np.ndarray((n_starts,), kind, self.cells, 0, (1,))
+        # The stride is one byte.
+        numbers: Numbers = np.ndarray(
+            (n_starts,), kind, buffer=self.cells, offset=0, strides=(1,)
+        )
         return numbers
 
     def _find_even_rows(self, position: int) -> tuple[dict[str, IntArray], int]:
@@ -297,9 +311,10 @@ class _RowReader:
     def _read_length(self, name: str, byte: int) -> int:
         """Return the length of the list that begins at a byte."""
         length = self.counts[name].item(byte)
-        # A longer list than the whole file could hold is damage. A float64 of an ASCII
-        # file has 8 bytes.
-        max_length = len(self.cells) // (8 if self.text else 1)
+        # The full file could not hold a longer list. A value has at least one byte, and
+        # in an ASCII file the 8 bytes of a float64.
+        min_value_size = 8 if self.text else 1
+        max_length = len(self.cells) // min_value_size
         if not 0 <= length <= max_length:
             expected = f"lists in the PLY element {format_name(self.element.name)}"
             raise self.notes.damaged(expected, f"one of {length:g} values")
@@ -316,30 +331,34 @@ class _RowReader:
         `starts` are, by property, the bytes (rows,) at which it begins in each row.
         """
         for name, property_starts in starts.items():
-            values = self.values[name]
+            value_at_byte = self.values[name]
             if name in self.counts:
                 lengths = self.counts[name][property_starts].astype(np.int64)
                 first_values = property_starts + self.counts[name].itemsize
-                self.element.lists[name] = _gather_lists(values, first_values, lengths)
+                self.element.lists[name] = _gather_lists(
+                    value_at_byte, first_values, lengths
+                )
             else:
-                self.element.scalars[name] = values[property_starts]
+                self.element.scalars[name] = value_at_byte[property_starts]
 
 
 def _gather_lists(
-    values: Numbers, first_values: IntArray, lengths: IntArray
+    value_at_byte: Numbers, first_values: IntArray, lengths: IntArray
 ) -> ListValues:
     """Return the values of N lists, one list after the other.
 
     Args:
-        values: the number that begins at each byte.
+        value_at_byte: the number that begins at each byte.
         first_values: (N,) the byte of each list's first value.
-        lengths: (N,) how many values each list has.
+        lengths: (N,) number of values of each list.
     """
     list_starts = np.cumsum(lengths) - lengths
-    # 0, 1, ... for each list anew
+    # 0, 1, ... in each list
     index_in_list = np.arange(int(lengths.sum())) - np.repeat(list_starts, lengths)
-    value_bytes = np.repeat(first_values, lengths) + values.itemsize * index_in_list
-    return ListValues(lengths, values[value_bytes])
+    value_bytes = (
+        np.repeat(first_values, lengths) + value_at_byte.itemsize * index_in_list
+    )
+    return ListValues(lengths, value_at_byte[value_bytes])
 
 
 def _make_length_error(notes: Notes, element: Element, text: bytes) -> FileFormatError:
@@ -353,7 +372,8 @@ def _make_length_error(notes: Notes, element: Element, text: bytes) -> FileForma
     if odd_word is not None:
         got = f"{format_name(odd_word)} among their numbers"
     return notes.damaged(
-        f"{element.count:,} rows of {format_name(element.name)}, as the PLY header says",
+        f"{element.count:,} rows of {format_name(element.name)}, as the PLY header "
+        "states",
         got,
     )
 
@@ -387,21 +407,21 @@ def read_ply(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
         notes: notes about the file, to which sentences are added.
 
     Raises:
-        FileFormatError: the file is corrupt, refers to vertices that are not there, or
-            has no faces.
+        FileFormatError: the file is corrupt, refers to missing vertices, or has no
+            faces.
     """
     elements, comments = read_elements(data, notes)
     reader = _Properties(elements, notes)
     points = reader.read_columns("vertex", (("x", "y", "z"),))
     if reader.has_splats:
-        notes.warn(
-            f" has Gaussian splats, which are left out: a model that {SPLATS_ADVICE}"
+        notes.warn_that_file(
+            f"has Gaussian splats, which are left out: {SPLATS_ADVICE}"
         )
     if points is None:
         if reader.has_splats:
             raise FileFormatError(
                 f"{path}: expected a mesh with faces, got Gaussian "
-                f"splats, a model that {SPLATS_ADVICE}"
+                f"splats: {SPLATS_ADVICE}"
             )
         raise notes.damaged("a PLY file with vertices that have x, y and z", "none")
     return _make_parts(reader, points, _parse_texture_names(comments))
@@ -413,7 +433,7 @@ def _combine_colors(
     group: IntArray,
     notes: Notes,
 ) -> tuple[ImportedSurface, Float64Array | None]:
-    """Return the surface of some faces and the colors that tint it.
+    """Return the surface of a group of faces and the colors that multiply its color.
 
     A texture has precedence over the colors of vertices and faces.
 
@@ -425,7 +445,7 @@ def _combine_colors(
     """
     if colors is None:
         return surface, None
-    if surface.texture is None:  # white, so that only these colors count
+    if surface.texture is None:  # white, which does not change these colors
         return ImportedSurface(color=np.ones(3, np.float32)), colors
     if colors[group].min() < 1.0:
         notes.warn("colours of vertices or faces are left out where there is a texture")
@@ -437,8 +457,8 @@ def _make_parts(
 ) -> list[ImportedPart]:
     """Return the faces of a file as parts.
 
-    There is a part for each texture. Faces without texture coordinates are parts of
-    their own.
+    There is a part for each texture. Faces without texture coordinates are in separate
+    parts.
 
     Args:
         reader: reads the properties of vertices and faces.
@@ -508,7 +528,7 @@ class _Properties:
     def read_columns(
         self, element: str, groups: Sequence[tuple[str, ...]]
     ) -> Float64Array | None:
-        """Return the values (N, C) of the first group of properties that is there.
+        """Return the values (N, C) of the first group of properties that exists.
 
         Args:
             element: name of the element.
@@ -532,7 +552,7 @@ class _Properties:
         return lists[group[0]] if group else None
 
     def _get_scalars(self, element: str) -> Mapping[str, Numbers]:
-        """Return the scalar properties of an element, none if there is no such one."""
+        """Return the scalar properties of an element; {} if it does not exist."""
         return self.elements[element].scalars if element in self.elements else {}
 
     def _find_group(
@@ -543,7 +563,7 @@ class _Properties:
     ) -> tuple[str, ...]:
         """Return the first group of names that are all properties, () if none is.
 
-        The properties of that group count as read.
+        The properties of that group are marked as read.
 
         Args:
             element: name of the element.
@@ -561,15 +581,15 @@ class _Properties:
         """Return the polygons of the file: its faces, then the triangles of strips.
 
         Args:
-            n_points: how many vertices there are.
+            n_points: number of vertices.
 
         Returns:
             The vertices (C,) of the corners of all polygons, concatenated, and the
             number of corners of each, (P,).
 
         Raises:
-            FileFormatError: there are none, one has too many or too few corners, or
-                refers to what is not there.
+            FileFormatError: there is no polygon with 3 corners, one has too many, or
+                refers to a missing vertex.
         """
         faces = self._find_corner_lists()
         strips = self._find_list("tristrips", CORNER_NAMES)
@@ -588,8 +608,8 @@ class _Properties:
     def _find_corner_lists(self) -> ListValues | None:
         """Return the vertices of the corners of each face, or None.
 
-        If no list of the faces has one of the known names, any other list is taken,
-        except for those of texture coordinates.
+        If no list of the faces has one of the known names, any other list is returned,
+        except for texture coordinates.
         """
         names: tuple[str, ...] = CORNER_NAMES
         if "face" in self.elements:
@@ -604,17 +624,17 @@ class _Properties:
 
         Args:
             corners: (C,) the vertex of each corner of the polygons.
-            counts: (P,) how many corners each polygon has.
-            n_points: how many vertices there are.
+            counts: (P,) number of corners of each polygon.
+            n_points: number of vertices.
 
         Raises:
             FileFormatError: there is no polygon with 3 corners, one has too many, or
-                refers to a vertex that is not there.
+                refers to a missing vertex.
         """
         if (counts < 3).all():
             got = "points or lines only; export triangles"
             if self.has_splats:
-                got = f"Gaussian splats, a model that {SPLATS_ADVICE}"
+                got = f"Gaussian splats: {SPLATS_ADVICE}"
             raise FileFormatError(
                 f"{self.notes.path}: expected a mesh with faces, got {got}"
             )
@@ -625,7 +645,7 @@ class _Properties:
         if corners.min() < 0 or corners.max() >= n_points:
             raise self.notes.damaged(
                 "faces of its own vertices",
-                "a face that refers to a vertex that is not there",
+                "a face that refers to a vertex that does not exist",
             )
 
     def read_uvs(
@@ -662,27 +682,30 @@ class _Properties:
             counts: (P,) how many corners each polygon has.
             triangles: (T, 3) corners of the polygons.
         """
-        # Triangles of strips, which come after the faces, have no wedges.
+        # Faces are the first polygons. Triangles of strips, which follow, have no
+        # wedges.
+        n_faces = len(wedges.counts)
         wedge_counts = np.zeros(len(counts), np.int64)
-        wedge_counts[: len(wedges.counts)] = wedges.counts
+        wedge_counts[:n_faces] = wedges.counts
         is_mapped = wedge_counts == 2 * counts
         if not is_mapped[wedge_counts > 0].all():
             self.notes.warn(
                 "texture coordinates of faces that are not two for each "
                 "corner are left out"
             )
-        is_used = np.repeat(is_mapped[: len(wedges.counts)], wedges.counts)
-        used_uvs = wedges.values[is_used].astype(np.float64).reshape(-1, 2)
-        # Equal pairs become one. As complex numbers, u + v i, both are compared at
-        # once.
-        distinct_uvs, index_of_pair = np.unique(
-            used_uvs.view(np.complex128), return_inverse=True
+        # (wedge values,) and (corners,): whether they are of a face with coordinates
+        is_used_value = np.repeat(is_mapped[:n_faces], wedges.counts)
+        is_mapped_corner = np.repeat(is_mapped, counts)
+        corner_uvs = wedges.values[is_used_value].astype(np.float64).reshape(-1, 2)
+        # Equal pairs become one. As complex numbers, u + v i, pairs are compared as
+        # single values.
+        distinct_pairs, index_of_pair = np.unique(
+            corner_uvs.view(np.complex128), return_inverse=True
         )
+        distinct_uvs = distinct_pairs.view(np.float64).reshape(-1, 2)
         uv_of_corner = np.full(int(counts.sum()), -1)  # -1 for none
-        uv_of_corner[np.repeat(is_mapped, counts)] = index_of_pair.reshape(-1)
-        return IndexedValues(
-            distinct_uvs.view(np.float64).reshape(-1, 2), uv_of_corner[triangles]
-        )
+        uv_of_corner[is_mapped_corner] = index_of_pair.reshape(-1)
+        return IndexedValues(distinct_uvs, uv_of_corner[triangles])
 
     def read_colors(
         self, vertices: IntArray, polygons: IntArray
@@ -715,8 +738,8 @@ class _Properties:
     ) -> Float64Array | None:
         """Return the linear colors (..., 3) of rows of an element, or None.
 
-        Triangles of strips have no row among the faces. Their index is past the last
-        row, and gives neutral grey.
+        Triangles of strips have no row among the faces. Their index is beyond the last
+        row, and their color is neutral grey.
 
         Args:
             element: name of the element, "vertex" or "face".
@@ -725,24 +748,26 @@ class _Properties:
         values = self.read_columns(element, COLOR_NAMES)
         if values is None:
             return None
+        # The three channels are assumed to have the same type.
         scalars = self.elements[element].scalars
-        red_name = self._find_group(element, scalars, COLOR_NAMES)[0]
+        red_name, _, _ = self._find_group(element, scalars, COLOR_NAMES)
         color_type = self.elements[element].types[red_name]
+        # Alphas have the scale of the colors, which is known here.
         self._mark_opaque_alphas(element, color_type)
-        display = np.clip(
-            np.nan_to_num(values / _find_scale(values, color_type)), 0.0, 1.0
-        )
+        full_brightness = _find_scale(values, color_type)
+        display = np.clip(np.nan_to_num(values / full_brightness), 0.0, 1.0)
         linear = srgb_to_linear(display.astype(np.float32))
         neutral = srgb_to_linear(np.full((1, 3), NEUTRAL_GREY, np.float32))
         padded = np.concatenate([linear, neutral])
-        return padded[np.minimum(index, len(linear))].astype(np.float64)
+        neutral_row = len(linear)
+        return padded[np.minimum(index, neutral_row)].astype(np.float64)
 
     def _mark_opaque_alphas(
         self, element: str, color_type: np.dtype[np.generic]
     ) -> None:
-        """Mark alphas of an element as read, so unnoted, if they are opaque everywhere.
+        """Mark alphas of an element as read if they are opaque everywhere.
 
-        Other alphas are left out, with the note that all unread properties get.
+        Then they are not noted. Other alphas are noted as all unread properties are.
         """
         scalars = self.elements[element].scalars
         for name in set(ALPHA_NAMES) & set(scalars):
@@ -759,8 +784,8 @@ class _Properties:
         """Return the index of each polygon's texture, (P,); -1 for none.
 
         It is the `texnumber` of faces, or that of a face's first vertex. Without
-        either, all polygons have the first texture. A number for which the file names
-        no texture is noted.
+        either, all polygons have the first texture. A number without a texture of the
+        file is noted.
 
         Args:
             names: the textures of the file.
@@ -789,8 +814,8 @@ class _Properties:
         n_wrong = int(is_wrong.sum())
         if n_wrong:
             self.notes.warn(
-                f"{n_wrong:,} faces have a texnumber of a texture that it "
-                "does not name; they have none"
+                f"{n_wrong:,} faces have a texnumber for which the file names no "
+                "texture; they have none"
             )
         return np.where(is_wrong, -1, texture)
 
@@ -807,18 +832,23 @@ class _Properties:
     ) -> list[ImportedSurface]:
         """Return the surface of each texture.
 
-        Its alpha is left out, with a note if it is not opaque.
+        The alpha of textures is left out, with a note if it is not opaque.
 
         Args:
-            names: the texture files that the file names.
+            names: names of the texture files.
             has_no_colors: whether the file has no colors that could replace a texture.
         """
-        pictures = FileImages(len(names), References(Path(self.notes.path)), self.notes)
+        references = References(Path(self.notes.path))
+        # Each texture is the surface of one material.
+        pictures = FileImages(
+            materials=len(names), references=references, notes=self.notes
+        )
         surfaces = {}
         substitute = "the colours of its vertices or faces are"
         if has_no_colors:
             substitute = "neutral grey is"
         for name in dict.fromkeys(names):
+            # The blank makes the file the subject: "chair.ply names the texture ...".
             note_template = (
                 f" names the texture {{name}}, which {{why}}; {substitute} used instead"
             )
@@ -832,7 +862,10 @@ class _Properties:
 
 
 def _to_integers(values: npt.NDArray[np.generic]) -> IntArray:
-    """Return values as integers; floats that hold none, of 2^53 and more, become -1."""
+    """Return values as integers; -1 for floats that are too large to be exact.
+
+    A float64 of 2^53 or more may be a rounded integer.
+    """
     if values.dtype.kind == "f":
         numbers = values.astype(np.float64)
         values = np.where(np.abs(numbers) < 2.0**53, numbers, -1.0)
@@ -871,21 +904,25 @@ def _split_strips(vertices: IntArray, counts: IntArray) -> IntArray:
         vertices: the vertices of all strips, concatenated.
         counts: (S,) how many vertices each strip has.
     """
+    is_end_mark = vertices < 0
+    # One entry more than there are vertices, for an end mark that is the last vertex.
     is_strip_start = np.zeros(len(vertices) + 1, dtype=np.bool_)
-    is_strip_start[np.cumsum(counts) - counts] = True
-    is_strip_start[1:][vertices < 0] = True  # the vertex after a -1
+    is_strip_start[np.cumsum(counts) - counts] = True  # the first vertex of each strip
+    is_strip_start[1:][is_end_mark] = True
     index = np.arange(len(vertices))
-    # for each vertex, where its strip began
+    # for each vertex the index at which its strip began, and its position in the strip
     strip_start = np.maximum.accumulate(np.where(is_strip_start[:-1], index, 0))
     position = index - strip_start
-    # every vertex but the first two of a strip is the last of a triangle
-    last_corner = np.flatnonzero((position >= 2) & (vertices >= 0))
+    # Every vertex of a strip, except the first two, is the last one of a triangle.
+    last_corner = np.flatnonzero((position >= 2) & ~is_end_mark)
     triangles: IntArray = np.stack(
         [vertices[last_corner - 2], vertices[last_corner - 1], vertices[last_corner]],
         axis=1,
     )
-    is_odd = position[last_corner] % 2 == 1
-    triangles[is_odd] = triangles[is_odd][:, [1, 0, 2]]
+    # The first triangle of a strip ends at position 2. Every second one is reversed:
+    # its first two corners are swapped.
+    is_reversed = position[last_corner] % 2 == 1
+    triangles[is_reversed] = triangles[is_reversed][:, [1, 0, 2]]
     a, b, c = triangles.T
     is_degenerate = (a == b) | (b == c) | (a == c)
     return np.asarray(triangles[~is_degenerate])

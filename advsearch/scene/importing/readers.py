@@ -14,9 +14,9 @@ from advsearch.scene.importing.files import Notes, read_bytes
 from advsearch.scene.importing.parts import ImportedPart
 
 Reader = Callable[[Path, bytes, Notes], list[ImportedPart]]
-"""Returns the parts with faces of a file, given its path, content and notes.
+"""Function of a file's path, content and notes that returns its parts with faces.
 
-It raises as `objects.read_parts`.
+It raises the errors of `objects.read_parts`.
 """
 
 READERS: Registry[Reader] = Registry(
@@ -32,8 +32,8 @@ _READ_AS_GLTF = ("glb", "gltf", "vrm", *_CONVERTERS)
 GLTF_SUFFIXES = tuple(
     f".{name}" for name in _READ_AS_GLTF if name in (*READERS.built_ins, *_CONVERTERS)
 )
-"""Suffixes of glTF files and of files that are converted to it: y is up, and vertex
-colors are linear.
+"""Suffixes of glTF files and of files that are converted to glTF. In these, y is up and
+vertex colors are linear.
 """
 
 
@@ -54,7 +54,7 @@ def read_mesh_bytes(path: Path, what: str, suffixes: tuple[str, ...]) -> bytes:
 
     Args:
         path: the file.
-        what: what it should hold, such as "object", for messages.
+        what: expected content, such as "object", for messages.
         suffixes: suffixes that it may have, in lower case with the dot.
 
     Raises:

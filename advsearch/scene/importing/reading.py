@@ -1,5 +1,5 @@
-"""What readers of mesh files and converters to glTF are made of: parts, glTF, messages,
-bounds, other programs.
+"""Building blocks of readers of mesh files and converters to glTF: parts, glTF, messages,
+limits, external programs.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _LATE_MODULES = {
     "hdr": "advsearch.scene.importing.hdr",
     "pictures": "advsearch.scene.importing.pictures",
 }
-"""Only some need these, and they import pydantic, scipy, torch or OpenEXR."""
+"""Modules that few readers need, and that import pydantic, scipy, torch or OpenEXR."""
 
 
 def __getattr__(name: str) -> Any:

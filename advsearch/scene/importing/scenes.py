@@ -1,9 +1,9 @@
 """Scenes from glTF files: one node as the object, the rest as its surroundings.
 
-``--object scene.glb#chair`` selects the node. Lengths are in object sizes, so
-everything is moved and scaled with the object: its largest extent is 1, it stands on z
-= 0, and z is up. The axis of the file that its format calls the front of an asset is
-+x.
+``--object scene.glb#chair`` selects the node. Lengths are in object sizes: all of the
+scene is moved and scaled so that the object's largest extent is 1 and the object stands
+on z = 0. z is up. The axis of the file that its format defines as the front of an asset
+becomes +x.
 """
 
 from __future__ import annotations
@@ -57,13 +57,13 @@ from advsearch.scene.parts import (
 from advsearch.scene.skeleton import with_ancestors
 
 GLTF_CAMERA_AXES = np.diag([-1.0, 1.0, -1.0])
-"""Rotation (3, 3) between the axes of cameras: glTF's look along -z with +x to the
-right, ours along +z with +x to the left.
+"""Rotation (3, 3) that converts a camera's axes: a camera of glTF looks along -z with +x
+to the right, ours along +z with +x to the left.
 """
 MITSUBA_SUFFIX = ".xml"  # suffix of Mitsuba's scenes
 LUMENS = 683.0
-"""Lumens of a watt, at 555 nm. Blender's exporter multiplies the power of lights by it,
-but no emission.
+"""Lumens of a watt, at 555 nm. Blender's exporter multiplies the power of lights by this
+factor, but not the emission of surfaces.
 """
 # Limit of the distance of a light or camera in object sizes, and of the radiant
 # intensity of a light.
@@ -93,14 +93,16 @@ def split_node(spec: str) -> tuple[str, str | None]:
     return match[1], match[3]
 
 
-@np.errstate(all="ignore")  # values out of range are rejected
+# Values out of range are rejected later, not reported by NumPy's warnings.
+@np.errstate(all="ignore")
 def import_scene(path: Path, node: str) -> ImportedScene:
     """Read a scene from a glTF file, with one node as the object.
 
-    The object is repaired, normalised and textured as by `import_object`; so is every
-    other node with a mesh, which stays in its position around it. Point and spot lights
-    of KHR_lights_punctual become lamps, directional ones distant lamps; perspective
-    cameras are kept by name. The object's warnings name what is not imported.
+    The object is repaired, normalized and textured as by `import_object`. So is every
+    other node with a mesh, which keeps its position relative to the object. Point and
+    spot lights of KHR_lights_punctual become lamps, directional lights distant lamps.
+    Perspective cameras are returned by name. The object's warnings name all entries of
+    the file that are not imported.
 
     Args:
         path: the .glb or .gltf file.
@@ -108,7 +110,7 @@ def import_scene(path: Path, node: str) -> ImportedScene:
             node with that index.
 
     Raises:
-        UnknownNameError: no node of that name has a mesh, or one below it.
+        UnknownNameError: there is no node of that name with a mesh in or below it.
         FileFormatError: the file is missing, corrupt, or has no faces.
         InputError: the geometry cannot be used; several nodes have the name; or there
             are too many other meshes and lights.
@@ -117,14 +119,14 @@ def import_scene(path: Path, node: str) -> ImportedScene:
     header = gltf.read_header(path, data)
     parts, notes = read_parts(path, data)
     node_poses = dict(iterate_poses(header))
-    # the named node with all below it is the object; the rest surrounds it
+    # The named node with its descendants is the object; the rest surrounds it.
     object_nodes = header.find_descendants([_find_node(path, header, parts, node)])
     object_parts = [part for part in parts if part.node in object_nodes]
     lights = _find_node_lights(header, node_poses)
     n_other_meshes = len({part.node for part in parts} - object_nodes)
     _check_surroundings(path, n_other_meshes + len(lights))
     front = find_front(path, header)
-    # y is up in glTF. Everything around the object is put into the object's frame.
+    # y is up in glTF. Surroundings are converted to the object's frame.
     frame = _compute_frame(object_parts, compute_rotation("y", front.axis))
     names = UniqueNames(RESERVED_NAMES)
     surroundings = _make_surrounding_meshes(
@@ -174,9 +176,9 @@ def _make_surrounding_meshes(
     Args:
         path: the file, for messages.
         header: header of the file.
-        parts: what its nodes draw.
+        parts: the parts that its nodes draw.
         object_nodes: the nodes of the object.
-        names: names that are taken; those of the meshes are added.
+        names: names that are used already; those of the meshes are added.
         front: the axis of the file that is the front.
         frame: frame of the object.
         notes: warnings are added to it.
@@ -210,7 +212,7 @@ def _make_lamps(
         lights: the light of each node that has one, by the node's index.
         candela_per_unit: how many candela are one unit of radiant intensity.
         node_poses: pose (4, 4) of each node, by its index.
-        names: names that are taken; those of the lamps are added.
+        names: names that are used already; those of the lamps are added.
         frame: frame of the object.
 
     Raises:
@@ -229,17 +231,17 @@ def _find_node(
 ) -> int:
     """Return the index of the node with a name that draws geometry.
 
-    A node counts if it or one of its descendants draws something.
+    A node is a candidate if it or one of its descendants draws a part.
 
     Args:
         path: the file, for messages.
         header: header of the file.
-        parts: what its nodes draw.
+        parts: the parts that its nodes draw.
         name: name of the node, or "node 3" for the one with that index.
 
     Raises:
-        UnknownNameError: there is none.
-        InputError: there are several.
+        UnknownNameError: no candidate has the name.
+        InputError: several candidates have the name.
     """
     candidates = sorted(with_ancestors(header.parents, {part.node for part in parts}))
     labels = {index: header.get_label(index) for index in candidates}
@@ -252,8 +254,8 @@ def _find_node(
     if len(matches) > 1:
         choices = ", ".join(f"{path.name}#node {index}" for index in matches[:10])
         raise InputError(
-            f"{path}: {len(matches)} nodes are called {format_name(name)}; say which: "
-            f"{choices}"
+            f"{path}: {len(matches)} nodes have the name {format_name(name)}; choose "
+            f"one of {choices}"
         )
     return matches[0]
 
@@ -261,7 +263,7 @@ def _find_node(
 def _check_surroundings(path: Path, count: int) -> None:
     """Raise InputError if there are more than `MAX_SURROUNDINGS` meshes and lamps."""
     if count > MAX_SURROUNDINGS:
-        limit = f"at most {MAX_SURROUNDINGS} meshes and lights beside the object"
+        limit = f"at most {MAX_SURROUNDINGS} meshes and lights around the object"
         raise InputError(
             f"{path}: expected {limit}, got {count}; join some of them in the file"
         )
@@ -276,13 +278,13 @@ def _make_surrounding_mesh(
 ) -> tuple[ScenePart, tuple[str, ...]]:
     """Return one node's parts as a scene part around the object, and the warnings.
 
-    The shape is normalised as an object is; its pose puts it back to where it was, with
-    the size that it had relative to the object.
+    The shape is normalized as an object is. Its pose restores its position and size
+    relative to the object.
 
     Args:
         path: the file, for messages.
         name: name of the part.
-        parts: what the node draws.
+        parts: the parts that the node draws.
         front: the axis of the file that is the front.
         object_frame: frame of the object.
     """
@@ -340,17 +342,17 @@ class NodeContents:
     """A node with geometry."""
 
     name: str  # name that `import_scene` accepts
-    mesh_name: str  # its name in controls if another node is the object
-    triangles: int  # number of them in its own mesh
+    mesh_name: str  # name of its mesh in controls if another node is the object
+    triangles: int  # number of triangles of its own mesh
     # Bounding box in the file's axes and units, (3,).
     size: tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
 class Contents:
-    """What can be imported from a file."""
+    """The contents of a file that can be imported."""
 
-    object: ObjectAsset  # everything with geometry, as one object
+    object: ObjectAsset  # all geometry of the file, as one object
     nodes: tuple[NodeContents, ...] = ()  # nodes of a glTF file, in their order
     lights: tuple[str, ...] = ()
     cameras: tuple[str, ...] = ()
@@ -364,24 +366,26 @@ def _group_by_node(parts: Iterable[ImportedPart]) -> dict[int, list[ImportedPart
     return parts_of_node
 
 
+# Values out of range are rejected later, not reported by NumPy's warnings.
 @np.errstate(all="ignore")
 def list_contents(path: Path) -> Contents:
-    """Return what can be imported from a mesh or glTF file.
+    """Return the contents of a mesh or glTF file that can be imported.
 
-    For Mitsuba's files see `scene_files.read_contents`.
+    The contents of Mitsuba's files are read by `scene_files.read_contents`.
 
     Raises:
         FileFormatError: the file is missing, of another kind, corrupt, or has no faces.
         InputError: the geometry cannot be used, such as vertices that all coincide.
     """
+    # Errors about an unknown suffix also list the one of Mitsuba's files.
     data = read_mesh_bytes(path, "object", (*list_suffixes(), MITSUBA_SUFFIX))
     parts, notes = read_parts(path, data)
     name = make_safe_name(path)
     if path.suffix.lower() not in GLTF_SUFFIXES:
-        front = find_front(path, None)
-        return Contents(
-            make_object(parts, notes, file=path, name=name, up=None, front=front)
-        )
+        front = find_front(path, header=None)
+        # The axis that points up is guessed from the shape.
+        asset = make_object(parts, notes, file=path, name=name, up=None, front=front)
+        return Contents(asset)
     header = gltf.read_header(path, data)
     notes += gltf_parts.describe_changed_lights(header, path.name)
     asset = make_object(
@@ -414,9 +418,9 @@ def _measure_node(
 
 @dataclass(frozen=True, eq=False)
 class FileFrame:
-    """The position and size of something in a file.
+    """The position and size of an object in a file.
 
-    A point of the file, turned to our axes, is `size` times the point in the frame,
+    A point of the file, rotated to our axes, is `size` times the point in the frame,
     plus `origin` (3,).
     """
 
@@ -430,10 +434,10 @@ class FileFrame:
 
 
 def _compute_frame(parts: Sequence[ImportedPart], turn: Float64Array) -> FileFrame:
-    """Return the frame in which parts have extent 1, stand on z = 0 and are centred.
+    """Return the frame in which parts have extent 1, stand on z = 0 and are centered.
 
-    The largest extent becomes 1, and parts are centred in x and y. Only visible faces
-    with an area count, since the repair of the geometry removes all others.
+    The largest extent becomes 1, and parts are centered in x and y. Only visible faces
+    with an area are used, since the repair of the geometry removes all others.
 
     Args:
         parts: the parts.
@@ -442,20 +446,19 @@ def _compute_frame(parts: Sequence[ImportedPart], turn: Float64Array) -> FileFra
     face_corners = []
     for part in select_visible(parts):
         triangles = part.vertices[part.faces]
-        area = np.linalg.norm(compute_area_vectors(triangles), axis=1)
+        doubled_area = np.linalg.norm(compute_area_vectors(triangles), axis=1)
         extent = float(np.ptp(triangles.reshape(-1, 3), axis=0).max())
-        face_corners.append(
-            triangles[area > MIN_DOUBLED_AREA * extent**2].reshape(-1, 3)
-        )
+        has_area = doubled_area > MIN_DOUBLED_AREA * extent**2
+        face_corners.append(triangles[has_area].reshape(-1, 3))
     points = np.concatenate(face_corners) @ turn.T
     is_valid = (
         np.isfinite(points).all() and len(points) and np.ptp(points, axis=0).max() > 0.0
     )
     if not is_valid:
-        # The repair of the geometry rejects it with a reason.
-        return FileFrame(1.0, np.zeros(3), turn)
+        # The frame is not used: `make_object` raises an error with the reason.
+        return FileFrame(size=1.0, origin=np.zeros(3), rotation=turn)
     origin, size = find_footing(points)
-    return FileFrame(size, origin, turn)
+    return FileFrame(size=size, origin=origin, rotation=turn)
 
 
 def _find_light_unit(
@@ -463,15 +466,16 @@ def _find_light_unit(
 ) -> tuple[float, str]:
     """Return how many candela are one unit of radiant intensity, and a note on it.
 
-    glTF states lamps in candela and surfaces in nit (candela per square metre); a nit
-    of a surface is one unit here. Exporters write watts times `LUMENS` for lamps. So if
-    there are only lamps, `LUMENS` candela are one unit. If surfaces emit light too, the
-    ratio of both counts: it is that of glTF, or in Blender's files the one that Blender
-    shows.
+    glTF states lamps in candela and surfaces in nit (candela per square meter); a nit
+    of a surface is one unit of radiance here. Exporters write watts times `LUMENS` for
+    lamps. So if there are only lamps, `LUMENS` candela are one unit. If surfaces emit
+    light, too, lamps must have the right brightness in comparison with them. By glTF's
+    definition one candela is one unit. But Blender does not multiply surfaces by
+    `LUMENS`, so that in its files `LUMENS` candela are one unit.
 
     Args:
         header: header of the file.
-        parts: what its nodes draw.
+        parts: the parts that its nodes draw.
         has_lights: whether it has lamps.
 
     Returns:
@@ -485,13 +489,13 @@ def _find_light_unit(
         return LUMENS, ""
     if "blender" in str(header.asset.generator).lower():
         return LUMENS, (
-            "it has lights beside surfaces that emit light, and is Blender's, which "
-            "exports lights 683 times as bright "
-            "beside them as it shows them: they are as Blender shows them"
+            "it has lights and surfaces that emit light, and Blender exports lights 683 "
+            "times too bright in comparison with surfaces; here both are as bright as "
+            "Blender shows them"
         )
     return 1.0, (
-        "it has lights beside surfaces that emit light: they are taken as "
-        "candela and nit, as glTF defines them"
+        "it has lights and surfaces that emit light: their units are candela and nit, "
+        "as glTF defines them"
     )
 
 
@@ -528,9 +532,8 @@ def _make_lamp(
     if not is_in_range.all():
         raise InputError(
             f"{path}: expected the light {name} within {MAX_DISTANCE:g} object sizes, "
-            "and "
-            "no brighter than that, got "
-            "more; correct its place or its intensity, or remove it"
+            f"and with an intensity of at most {MAX_DISTANCE:g}, got more; correct its "
+            "position or its intensity, or remove it"
         )
     x, y, z = map(float, position)
     red, green, blue = map(float, intensity)
@@ -556,9 +559,9 @@ def _position_light(
     """Return the position (3,) of a light and its radiant intensity (3,).
 
     A directional light is stated in lux. It becomes a lamp so far away that its rays
-    are almost parallel. With the intensity lux times squared distance, it causes the
-    same lux at the object. For other lights, lengths are divided by the object's size,
-    so intensities are divided by its square.
+    are almost parallel. Its intensity is lux times squared distance, so that it causes
+    the same lux at the object. For other lights, lengths are divided by the object's
+    size, and therefore intensities by its square.
 
     Args:
         light: its entry in the header.
@@ -580,10 +583,15 @@ def _position_light(
 def _make_cameras(
     path: Path, header: Header, node_poses: Mapping[int, Float64Array], frame: FileFrame
 ) -> dict[str, PosedCamera]:
-    """Return the perspective cameras of a file by name; errors as for each."""
+    """Return the perspective cameras of a file by name.
+
+    Raises InputError as `_make_camera`.
+    """
     cameras = {}
     for index, name in _make_camera_names(header, node_poses).items():
-        camera = header.cameras[header.nodes[index].camera or 0]
+        camera_index = header.nodes[index].camera
+        assert camera_index is not None  # for mypy: only nodes with a camera are named
+        camera = header.cameras[camera_index]
         cameras[name] = _make_camera(path, name, camera, node_poses[index], frame)
     return cameras
 
@@ -611,14 +619,16 @@ def _make_camera(
     axes = axes / np.maximum(np.linalg.norm(axes, axis=0), 1e-12)
     matrix = np.eye(4)
     matrix[:3, :3] = axes
+    # `to_frame` takes points that are rotated to our axes.
     matrix[:3, 3] = frame.to_frame(frame.rotation @ pose[:3, 3])
-    # `yfov` is along the height. In a wide image the larger side is the width, with a
-    # tangent larger by the aspect ratio. If the file states none, it is that of the
-    # rendered image (section 5.13), for which `upright` tells that `fov` is the
-    # height's.
+    # `yfov` is the field of view along the height. Ours is along the larger side: in a
+    # wide image that is the width, whose tangent is larger by the aspect ratio. If the
+    # file has no aspect ratio, that of the rendered image is used (section 5.13). It is
+    # not known here, so that `upright` states that `fov` is along the height.
     aspect_ratio = camera.perspective.aspectRatio
+    larger_side_ratio = 1.0 if aspect_ratio is None else max(aspect_ratio, 1.0)
     half_tangent = math.tan(camera.perspective.yfov / 2.0)
-    fov = math.degrees(2.0 * math.atan(half_tangent * max(aspect_ratio or 1.0, 1.0)))
+    fov = math.degrees(2.0 * math.atan(half_tangent * larger_side_ratio))
     problem = _find_camera_problem(matrix, fov)
     if problem:
         raise InputError(f"{path}: expected the camera {name} {problem}, or remove it")
@@ -626,25 +636,31 @@ def _make_camera(
 
 
 def _find_camera_problem(matrix: Float64Array, fov: float) -> str | None:
-    """Return why a camera cannot be imported, as the end of a message, or None.
+    """Return why a camera cannot be imported; None if it can be.
+
+    The text continues a message that begins with "expected the camera NAME".
 
     Args:
         matrix: (4, 4) its pose, with unit vectors as axes.
         fov: its field of view in degrees.
     """
     axes = matrix[:3, :3]
-    if not (np.abs(matrix[:3, 3]) <= MAX_DISTANCE).all():  # NaN is not
-        return f"within {MAX_DISTANCE:g} object sizes, got more; correct its place"
+    is_near = (np.abs(matrix[:3, 3]) <= MAX_DISTANCE).all()  # False for NaN
+    if not is_near:
+        return f"within {MAX_DISTANCE:g} object sizes, got more; correct its position"
     if not np.allclose(np.linalg.norm(axes, axis=0), 1.0):
         return (
-            "to look somewhere, got axes without length; correct the scale of its node"
+            "to have a direction, got axes without length; correct the scale of its "
+            "node"
         )
     is_mirrored = np.linalg.det(axes) < 0.0
     is_rectangular = np.allclose(axes.T @ axes, np.eye(3), atol=MAX_AXIS_COSINE)
     if is_mirrored or not is_rectangular:
         got = "mirrored" if is_mirrored else "sheared"
         advice = "apply the scale of the nodes above it (in Blender Ctrl A)"
-        return f"under nodes that turn, move and scale it, got {got} axes; {advice}"
+        return (
+            f"under nodes that only rotate, move and scale it, got {got} axes; {advice}"
+        )
     if not 0.0 < fov <= MAX_FOV:
         return (
             f"with a field of view up to {MAX_FOV:g} degrees, got {fov:.4g}; correct it"

@@ -26,7 +26,7 @@ _NAME_LINE = re.compile(
 )
 _WORDS = frozenset("facet outer vertex endloop endfacet end".split())
 _COLOR_FLAG = 0x8000  # the highest bit of a facet's attribute
-# of a binary file: the header, then the number of facets in 4 bytes
+# A binary file has a header, then the number of facets in 4 bytes, then the facets.
 _HEADER_SIZE = 80
 _FACETS_START = _HEADER_SIZE + 4
 
@@ -35,8 +35,8 @@ def read_stl(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     """Read an STL file as one part.
 
     A file is binary if its length fits its number of facets, even if it begins with
-    "solid", as text does. Its facet normals are ignored and computed anew, as in other
-    programs.
+    "solid", as text does. The normals of facets are ignored and computed anew, as in
+    other programs.
 
     Args:
         path: path of the file.
@@ -109,7 +109,7 @@ def _read_magics_color(head: bytes, notes: Notes) -> Float32Array | None:
         notes.record("header entry", "MATERIAL")
     color = np.frombuffer(head, np.uint8, 3, color_start) / np.float32(255.0)
     opacity = head[color_start + 3]
-    # 0, which would make it invisible, counts as none stated
+    # 0, which would make the object invisible, means that no opacity is stated
     if 0 < opacity < 255:
         notes.record("opacity of its header entry", "COLOR")
     return np.asarray(color, np.float32)
@@ -173,15 +173,18 @@ def _read_colors(
     if object_color is not None:
         colors = colors[:, ::-1]
         default_color = object_color
-        # Where no facet has any bit set, all have the color of the object.
-        has_color = (attributes & _COLOR_FLAG == 0) & bool(attributes.any())
+        # If no facet has any bit set, none has a color, and all have the object's.
+        has_any_bits = bool(attributes.any())
+        has_color = (attributes & _COLOR_FLAG == 0) & has_any_bits
     else:
         default_color = np.full(3, NEUTRAL_GREY, np.float32)
         has_color = attributes & _COLOR_FLAG != 0
         if not has_color.any():
             if attributes.any():
+                # a kind and a name, as in "property 'confidence' is left out"
                 notes.record(
-                    "attribute bytes of its facets, which are no colours known here,",
+                    "attribute bytes of its facets, which are no colours of Magics or "
+                    "VisCAM,",
                     f"{attributes.max():#06x}",
                 )
             return None

@@ -1,8 +1,8 @@
 """Texture maps of an imported object, and texture coordinates that fit them.
 
-The file's UVs and textures are used if they can be used unchanged. Otherwise the mesh
-is unwrapped with xatlas, and what the file has (repeating textures, several materials,
-vertex colors) is baked into one map each of color, normals and emission.
+The file's UVs and textures are used if they need no change. Otherwise the mesh is
+unwrapped with xatlas, and repeating textures, several materials or vertex colors are
+baked into one map each of color, normals and emission.
 """
 
 from __future__ import annotations
@@ -40,23 +40,24 @@ from advsearch.scene.surface_parts import unwrap
 # Width and height, in texels, of the base color map of an object of one color.
 PLAIN_SIZE = 8
 BAKED_SIZE = 512  # width and height of the smallest base color map that is baked
-_UV_TOLERANCE = 1e-4  # how far UVs may overstep [0, 1] and still be clipped
+_UV_TOLERANCE = 1e-4  # distance from [0, 1] up to which UVs are clipped
 _MAX_SQUASHED = 0.05  # fraction of the surface that may have no area in UV space
-_MIN_UV_AREA = 0.02  # fraction of the unit square that UVs must cover in all
-_MAX_WINDOW = (
-    1.5  # how many textures wide and high UVs may be and still keep their layout
-)
-_EMISSION_BORDER = (
-    2.0  # texels outside a chart up to which it emits light: filtering needs them
-)
+_MIN_UV_AREA = 0.02  # smallest total area of the faces in UV space
+# Largest width and height of the UVs' bounding box at which images are cropped to it,
+# in widths and heights of the texture.
+_MAX_WINDOW = 1.5
+# Distance from a chart, in texels, up to which texels emit light, since filtering needs
+# them.
+_EMISSION_BORDER = 2.0
 _MAX_SHARED = 0.005  # fraction of the texels that may be on several faces
-# How many times more texels an image may have than a baked texture without a note.
+# Ratio of the texels of images to those of a baked texture from which on there is a
+# note.
 _MAX_TEXEL_RATIO = 1.5
 # Limits of the points at which a mean is sampled, and of the steps along a face's side.
 _MAX_SAMPLES = 1 << 18
 _MAX_STEPS = 256
 _FILL_FRACTION = 0.5  # approximate fraction of an atlas that its charts fill
-# area in UV space below which a face is a point or a line
+# Area in UV space below which a face is a point or a line.
 _MIN_FACE_UV_AREA = 1e-12
 SHARED_LIGHT_REASON = (
     "several faces share a texture that emits light; it was unwrapped anew "
@@ -91,14 +92,14 @@ def apply_textures(
     """Give every corner of a repaired soup UVs in [0, 1], and make the maps that fit.
 
     The file's UVs and images are used if all faces have the same images and these can
-    be used without baking; at most they are cropped to the window that the UVs use.
-    Otherwise the soup is unwrapped, the images are baked, and a note says why. A soup
-    of one color gets a small plain map, and keeps its UVs if these are usable.
+    be used without baking; they may be cropped to the window that the UVs use.
+    Otherwise the soup is unwrapped, the images are baked, and a note has the reason. A
+    soup of one color gets a small plain map, and keeps its UVs if these are usable.
 
     Args:
         soup: a repaired soup.
         surfaces: the surface of each of its parts.
-        notes: where it is reported why images were baked.
+        notes: notes about the file; the reason for baking is added.
 
     Returns:
         The soup with its UVs, and the maps for them.
@@ -108,24 +109,24 @@ def apply_textures(
     is_uniform = all(surface.has_same_maps(first_surface) for surface in used_surfaces)
     # `soup.colors` are factors of the base color
     has_uniform_factor = bool((soup.colors == soup.colors[0, 0]).all())
-    _, material = index_materials(soup, surfaces)
+    _, material_of_face = index_materials(soup, surfaces)
     # Cases that need no baking return here.
-    is_lit_twice = False
+    shares_emission = False
     if is_uniform and has_uniform_factor:
         if not first_surface.images:
-            return _texture_plain(soup, first_surface, material)
+            return _texture_plain(soup, first_surface, material_of_face)
         cropped = _crop_images(soup, first_surface)
         if cropped is not None:
             uvs, images = cropped
-            is_lit_twice = _is_lit_twice(uvs, first_surface, images)
-            if not is_lit_twice:
+            shares_emission = _shares_emission(uvs, first_surface, images)
+            if not shares_emission:
                 return _texture_with_images(
                     soup, uvs, first_surface.with_images(images)
                 )
-    unwrapped_soup = unwrap(soup, material)
+    unwrapped_soup = unwrap(soup, material_of_face)
     maps = bake(unwrapped_soup.uvs, soup, surfaces)
     reason = SHARED_LIGHT_REASON
-    if not is_lit_twice:
+    if not shares_emission:
         reason = _describe_reason(soup, used_surfaces, is_uniform, has_uniform_factor)
     notes.warn(f"{reason} ({_describe_size(len(maps.color), soup, surfaces)})")
     return unwrapped_soup, maps
@@ -190,8 +191,8 @@ def index_materials(
 def _has_overlap(uvs: Float64Array, material: IntArray) -> bool:
     """Return whether faces of different materials share many texels.
 
-    Many is more than the fraction `_MAX_SHARED` of the texels that faces cover, in a
-    map of `BAKED_SIZE` texels a side.
+    They share many if it is more than the fraction `_MAX_SHARED` of the texels that
+    faces cover, in a map with a width and height of `BAKED_SIZE` texels.
 
     Args:
         uvs: (F, 3, 2) texture coordinates of the faces.
@@ -223,10 +224,10 @@ def _make_plain_map(soup: TriangleSoup, surface: ImportedSurface) -> Float32Arra
     return np.full((PLAIN_SIZE, PLAIN_SIZE, len(color)), color, dtype=np.float32)
 
 
-def _is_lit_twice(
+def _shares_emission(
     uvs: Float64Array, surface: ImportedSurface, pictures: Sequence[Float32Array]
 ) -> bool:
-    """Return whether texels that emit light are on several faces.
+    """Return whether several faces share texels that emit light.
 
     Mitsuba would send light from only one of these faces. A fraction of up to
     `_MAX_SHARED` of the lit texels may be on several faces. An emission that is the
@@ -274,7 +275,7 @@ def _describe_reason(
         has_uniform_factor: whether vertex colors are the same everywhere.
     """
     if not is_uniform:
-        # Materials without a name are told apart as objects.
+        # Materials without a name are different if they are different objects.
         n_materials = len({surface.name or id(surface) for surface in used})
         if n_materials > 1:
             baked_things = f"the colours of its {n_materials} materials"
@@ -289,7 +290,7 @@ def _describe_reason(
         if used[0].texture is not None:
             substitute = "the texture's mean colour is used"
         return (
-            "it has a texture but lacks texture coordinates; where it does, "
+            "it has a texture, but lacks texture coordinates; where they are missing, "
             f"{substitute}"
         )
     return (
@@ -365,7 +366,10 @@ def _move_into_unit_square(soup: TriangleSoup) -> Float64Array:
     # (charts, 2) the smallest u and v of each chart
     chart_corner = np.full((int(chart.max()) + 1, 2), np.inf)
     np.minimum.at(chart_corner, chart[vertex.reshape(-1)], flat_uvs)
-    uvs: Float64Array = soup.uvs - np.floor(chart_corner + _UV_TOLERANCE)[chart[vertex]]
+    # With the tolerance, a chart that begins just below an integer begins at it: it is
+    # clipped later, and not moved to the end of the unit square.
+    chart_offset = np.floor(chart_corner + _UV_TOLERANCE)
+    uvs: Float64Array = soup.uvs - chart_offset[chart[vertex]]
     return uvs
 
 
@@ -396,49 +400,75 @@ def _crop_to_window(
     """Crop images to the window that UVs span; the layout of the charts stays.
 
     The window is the bounding box of the UVs, one texel wider on each side, so that
-    filtering finds the neighbours of its texels. Images are cropped if UVs overstep the
+    filtering finds the neighbors of its texels. Images are cropped if UVs overstep the
     unit square, or use only a small part of it. Then they are resampled at texels of
-    the same size. Images stay as they are if UVs lie inside and fill enough of the
-    square, or if the window is larger than `_MAX_WINDOW` textures, since textures
-    repeat there.
+    about the same size. Images stay as they are if UVs are inside and fill enough of
+    the square, or if the window is larger than `_MAX_WINDOW`, since textures repeat
+    there.
 
     Args:
         uvs: (F, 3, 2).
         pictures: images (H, W, C).
-        colors: which of them has colors, filtered in linear light.
+        colors: the image with colors, which is filtered in linear light; None if there
+            is none.
 
     Returns:
         UVs relative to the window, and the images of it; or both as they were.
     """
-    # (2,) width and height of a texel of the coarsest image, in textures
-    largest_texel = np.max(
-        [1.0 / np.array(picture.shape[1::-1]) for picture in pictures], axis=0
-    )
+    # (2,) width and height of a texel of the coarsest image, as fractions of the image
+    largest_texel = np.max([1.0 / _get_size(picture) for picture in pictures], axis=0)
     window_lower = uvs.min(axis=(0, 1)) - largest_texel
     window_upper = uvs.max(axis=(0, 1)) + largest_texel
     window_size = window_upper - window_lower
+    # The window is a texel larger than the UVs, which is allowed for here.
+    tolerance = largest_texel.max()
     is_inside = (
-        window_lower.min() >= -_UV_TOLERANCE - largest_texel.max()
-        and window_upper.max() <= 1.0 + _UV_TOLERANCE + largest_texel.max()
+        window_lower.min() >= -_UV_TOLERANCE - tolerance
+        and window_upper.max() <= 1.0 + _UV_TOLERANCE + tolerance
     )
-    is_filled = (
-        is_inside and np.abs(compute_doubled_areas(uvs)).sum() / 2.0 >= _MIN_UV_AREA
-    )
-    if window_size.max() > _MAX_WINDOW or is_filled:
+    uv_area = np.abs(compute_doubled_areas(uvs)).sum() / 2.0
+    fills_square = is_inside and uv_area >= _MIN_UV_AREA
+    if window_size.max() > _MAX_WINDOW or fills_square:
         return uvs, pictures
+    cropped = [
+        _crop_image(picture, window_lower, window_upper, is_color=picture is colors)
+        for picture in pictures
+    ]
+    return (uvs - window_lower) / window_size, cropped
 
-    def crop(picture: Float32Array) -> Float32Array:
-        """Return an image of the window; texels keep their size."""
-        shape = np.ceil(window_size * np.array(picture.shape[1::-1]))
-        width, height = np.clip(shape, 1, TEXTURE_LIMIT).astype(int)
-        # u of the columns, and v of the rows from the top (the largest v) down
-        columns = window_lower[0] + (np.arange(width) + 0.5) / width * window_size[0]
-        rows = window_upper[1] - (np.arange(height) + 0.5) / height * window_size[1]
-        grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-        look_up = sample_colors if picture is colors else sample_texture
-        return look_up(picture, grid).reshape(height, width, -1)
 
-    return (uvs - window_lower) / window_size, [crop(picture) for picture in pictures]
+def _get_size(picture: Float32Array) -> IntArray:
+    """Return the width and height (2,) of an image (H, W, C)."""
+    height, width = picture.shape[:2]
+    return np.array([width, height])
+
+
+def _crop_image(
+    picture: Float32Array,
+    window_lower: Float64Array,
+    window_upper: Float64Array,
+    *,
+    is_color: bool,
+) -> Float32Array:
+    """Return the image of a window, with at most `TEXTURE_LIMIT` texels a side.
+
+    Unless they are limited, texels keep about their size.
+
+    Args:
+        picture: (H, W, C) image, which repeats.
+        window_lower: (2,) smallest u and v of the window.
+        window_upper: (2,) largest u and v of the window.
+        is_color: whether it has colors, which are filtered in linear light.
+    """
+    window_size = window_upper - window_lower
+    exact_size = np.ceil(window_size * _get_size(picture))
+    width, height = np.clip(exact_size, 1, TEXTURE_LIMIT).astype(int)
+    # u of the columns, and v of the rows from the top (the largest v) down
+    columns = window_lower[0] + (np.arange(width) + 0.5) / width * window_size[0]
+    rows = window_upper[1] - (np.arange(height) + 0.5) / height * window_size[1]
+    grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+    look_up = sample_colors if is_color else sample_texture
+    return look_up(picture, grid).reshape(height, width, -1)
 
 
 # ---- Baking ----
@@ -461,9 +491,9 @@ def bake(
 ) -> SurfaceMaps:
     """Bake the colors, normals and emission of a soup into maps for new UVs.
 
-    Texels outside every chart repeat the nearest one inside, so that filtering finds no
-    seam. Faces without UVs in the file have the mean color of their texture, and
-    neither bumps nor emission.
+    Texels outside of charts repeat the nearest one inside, so that filtering causes no
+    seam. Faces without UVs in the file get the mean color of their texture, and neither
+    bumps nor emission.
 
     Args:
         uvs: (F, 3, 2) new UVs in [0, 1] without overlaps.
@@ -507,7 +537,7 @@ def _bake_bumps_and_emission(
     soup: TriangleSoup,
     uvs: Float64Array,
 ) -> None:
-    """Fill in the normals and the emission of a part, as far as it has some.
+    """Fill in the normals and the emission of a part, if it has any.
 
     Args:
         maps: the maps of the object.
@@ -535,9 +565,9 @@ class _Texels(NamedTuple):
     """Texels (T,) of a map that faces cover, as `rasterize_triangles` returns them.
 
     Attributes:
-        face: (T,) the face that each is on.
-        row: (T,).
-        column: (T,).
+        face: (T,) index of the face on each texel.
+        row: (T,) row of each texel.
+        column: (T,) column of each texel.
         weights: (T, 3) barycentric weights of the corners of its face.
     """
 
@@ -558,7 +588,7 @@ class _Texels(NamedTuple):
 
 
 def _make_blank_maps(surfaces: Sequence[ImportedSurface], size: int) -> SurfaceMaps:
-    """Return blank maps (N, N, ...) as far as surfaces need them.
+    """Return the blank maps (N, N, ...) that surfaces need.
 
     Colors are white and opaque, normals flat, and the emission black. The color has a
     fourth channel if a surface has an opacity.
@@ -629,10 +659,10 @@ def _sample_base_color(
 
 
 def _count_texels(soup: TriangleSoup, surfaces: Sequence[ImportedSurface]) -> float:
-    """Return how many texels of the file's images an object shows.
+    """Return how many texels of the file's images are on an object.
 
     For a part this is the area of its UVs times the number of texels of its largest
-    image. Texels of an image that repeats count as often as they are shown.
+    image. Texels of an image that repeats are counted at each repeat.
     """
     n_texels = 0.0
     uv_areas = np.nan_to_num(np.abs(compute_doubled_areas(soup.uvs)) / 2.0)
@@ -676,11 +706,11 @@ def average_over_faces(
         return np.asarray(texture.mean(axis=(0, 1), dtype=np.float64), np.float32)
     uvs = uvs[is_known]
     areas = areas[is_known]
-    # the finest division whose samples, its square for each face, stay within the limit
+    # the finest division whose samples, n_steps^2 for each face, are within the limit
     n_steps = int(np.clip(np.sqrt(_MAX_SAMPLES / len(areas)), 1, _MAX_STEPS))
     weights = _compute_sample_weights(n_steps)
     weighted_sum = np.zeros(texture.shape[2])
-    # In batches, so that memory is bounded. Twice negated, the quotient is rounded up.
+    # In batches, so that memory is bounded. Negated twice, the quotient is rounded up.
     n_batches = -(-len(areas) * len(weights) // _MAX_SAMPLES)
     for batch in np.array_split(np.arange(len(areas)), n_batches):
         sample_uvs = np.einsum("pk,fkc->fpc", weights, uvs[batch]).reshape(-1, 2)
@@ -718,8 +748,8 @@ def _compute_sample_weights(steps: int) -> Float64Array:
 def sample_colors(colors: Float32Array, uvs: Float64Array) -> Float32Array:
     """Sample a repeating texture of display-referred colors in linear light.
 
-    Interpolation is bilinear. Transparent texels do not count: colors are weighted by
-    their opacity.
+    Interpolation is bilinear. Colors are weighted by their opacity, so that transparent
+    texels have no weight.
 
     Args:
         colors: (H, W, 3 or 4) display-referred colors, perhaps with opacity.
@@ -798,14 +828,14 @@ def _unmirror(
     mirrored_fraction = float(area[is_mirrored].sum() / area.sum())
     if normals is None or mirrored_fraction < MIN_MIRRORED_FRACTION:
         return soup, maps
-    if 1.0 - mirrored_fraction < MIN_MIRRORED_FRACTION:  # (almost) all faces are
-        return soup, replace(maps, normals=_reverse_component(normals, 1))
+    if 1.0 - mirrored_fraction < MIN_MIRRORED_FRACTION:  # (almost) all are mirrored
+        return soup, replace(maps, normals=_reverse_component(normals, component=1))
     new_uvs = uvs.copy()
     # Both halves have half of the width: u in [0, 2] first, then halved.
     new_uvs[is_mirrored, :, 0] = 2.0 - new_uvs[is_mirrored, :, 0]
     new_uvs[:, :, 0] /= 2.0
     # in the mirrored half, bumps along u are reversed
-    mirrored_normals = _reverse_component(normals[:, ::-1], 0)
+    mirrored_normals = _reverse_component(normals[:, ::-1], component=0)
     emission = maps.emission
     # a single texel is one value everywhere
     if emission is not None and emission.shape != (1, 1, 3):
@@ -854,15 +884,18 @@ def convert_normals(
     normal = normalize_vectors(np.einsum("tk,tkc->tc", weights, old_soup.normals[face]))
     old_tangent = _compute_tangents(old_soup, normal, face)
     new_tangent = _compute_tangents(replace(old_soup, uvs=new_uvs), normal, face)
-    # the file's bitangent points up the image, also where UVs are mirrored
-    handedness = np.sign(compute_doubled_areas(old_soup.uvs[face]))[:, None]
-    old_bitangent = np.cross(normal, old_tangent) * handedness
+    # The file's bitangent points up the image. That is normal x tangent, or its
+    # opposite where UVs are mirrored.
+    mirror_sign = np.sign(compute_doubled_areas(old_soup.uvs[face]))[:, None]
+    old_bitangent = np.cross(normal, old_tangent) * mirror_sign
+    # The renderer's bitangent is always normal x tangent.
+    new_bitangent = np.cross(normal, new_tangent)
     x, y, z = np.moveaxis(texels.astype(np.float64) * 2.0 - 1.0, -1, 0)  # decoded
     in_plane = x[:, None] * old_tangent + y[:, None] * old_bitangent
-    # along the renderer's tangent and bitangent, which is normal x tangent
     new_x = (in_plane * new_tangent).sum(axis=1)
-    new_y = (in_plane * np.cross(normal, new_tangent)).sum(axis=1)
+    new_y = (in_plane * new_bitangent).sum(axis=1)
     bumps = np.stack([new_x, new_y, z], axis=1)
+    # Tangents are NaN on faces without area in UV space.
     is_valid = np.isfinite(bumps).all(axis=1, keepdims=True)
     return encode_normals(np.where(is_valid, bumps, [0.0, 0.0, 1.0]))
 
@@ -873,7 +906,15 @@ def _compute_tangents(
     """Return unit tangents (T, 3) along u on faces (T,), orthogonal to normals (T, 3).
 
     A tangent is the direction on the face in which u grows and v is constant, minus its
-    component along the normal. It is NaN where UVs have no area.
+    component along the normal. It is NaN where UVs have no area, since a vector of
+    length 0 has no direction.
+
+    For a face with corners a, b, c, and UVs (u1, v1) of b and (u2, v2) of c relative to
+    those of a, the derivative of the position by u is
+
+        ((b - a) v2 - (c - a) v1) / (u1 v2 - u2 v1)
+
+    Only the sign of the divisor, the doubled area in UV space, affects the direction.
 
     Args:
         soup: the object, with the UVs.
@@ -884,13 +925,10 @@ def _compute_tangents(
     a, b, c = (soup.points[soup.faces[used_faces, k]] for k in range(3))
     uvs = soup.uvs[used_faces]
     v = uvs[:, :, 1]
-    # v of the second and third corner, from the first one
     v1 = v[:, 1] - v[:, 0]
     v2 = v[:, 2] - v[:, 0]
-    handedness = np.sign(compute_doubled_areas(uvs))[:, None]
-    # d position / d u is (b - a) v2 - (c - a) v1 over the UVs' doubled area, of which
-    # only the sign matters here
-    tangent = ((b - a) * v2[:, None] - (c - a) * v1[:, None]) * handedness
+    area_sign = np.sign(compute_doubled_areas(uvs))[:, None]
+    tangent = ((b - a) * v2[:, None] - (c - a) * v1[:, None]) * area_sign
     tangent = tangent[used_index.reshape(-1)]
     along_normal = normal * (tangent * normal).sum(axis=1, keepdims=True)
     return normalize_vectors(tangent - along_normal)

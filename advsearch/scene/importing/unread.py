@@ -19,13 +19,14 @@ T = TypeVar("T")
 class TrackedKeys(Generic[T]):
     """Read values by key, and list the keys that were not read.
 
-        entries = TrackedKeys({"Fl-X": 500.0, "k7": 0.1}, fold=plain)
-        entries.get("flx", "fx")        # 500.0: the value of the first of these keys that has one
-        entries.unread()                # ["k7"], as the file spells it
-        join_names(entries.unread())    # "'k7'": bounded in length, for a message
+        entries = TrackedKeys({"Fl-X": 500.0, "k7": 0.1}, fold=normalize_key)
+        entries.get("flx", "fx")           # 500.0: the value of the first key that has one
+        entries.find_unread()              # ["k7"], as the file spells it
+        join_names(entries.find_unread())  # "'k7'": bounded in length, for a message
 
-    `fold` turns a key into the form by which it is looked up, such as ``str.lower``. Of
-    keys with the same form the last counts; the earlier ones are in `repeated`.
+    `fold` converts a key to the form by which it is looked up, such as ``str.lower``:
+    the folded key. If several keys have the same folded key, the last one is stored,
+    and the earlier ones are in `repeated`.
     """
 
     def __init__(
@@ -35,18 +36,18 @@ class TrackedKeys(Generic[T]):
         fold: Callable[[str], str] = str,
         prefix: str = "",
     ) -> None:
-        """Fold all keys, and find those that a later one of the same form hides.
+        """Fold all keys, and find those with the same folded key as a later one.
 
         Args:
             values: values by key, as the file spells the keys.
-            fold: turns a key into the form by which it is looked up.
-            prefix: is put before keys in the list of unread ones, such as "camera.".
+            fold: function that returns the folded key of a key.
+            prefix: text before keys in the list of unread ones, such as "camera.".
         """
-        # Keys, as spelled, that a later one of the same form hides.
+        # Keys, as the file spells them, that have the same folded key as a later one.
         self.repeated: list[str] = []
         self._fold = fold
         self._prefix = prefix
-        # All others are by folded keys.
+        # These four are by folded keys.
         self._values: dict[str, T] = {}
         self._spelling: dict[str, str] = {}  # keys as the file spells them
         self._read: set[str] = set()
@@ -60,27 +61,29 @@ class TrackedKeys(Generic[T]):
             self._spelling[folded] = key
 
     def get(self, *keys: str) -> T | None:
-        """Return the value of the first of some keys, in folded form, that has one.
+        """Return the value of the first of several folded keys that has one, or None.
 
-        The result is None if none has. The key whose value is returned counts as read.
-        So do those of the keys without a value; further keys with a value stay unread.
+        That key is marked as read, and so are keys without a value. Other keys with a
+        value stay unread, since their values are ignored.
         """
         keys_with_value = [key for key in keys if self._values.get(key) is not None]
-        self._read.update(key for key in keys if key not in keys_with_value[1:])
+        ignored_keys = keys_with_value[1:]
+        self._read.update(key for key in keys if key not in ignored_keys)
         return self._values[keys_with_value[0]] if keys_with_value else None
 
     def peek(self, key: str) -> T | None:
-        """Return a value without counting its key as read."""
+        """Return the value of a folded key without marking the key as read."""
         return self._values.get(key)
 
     def mark_read(self, *keys: str) -> None:
-        """Count keys, in folded form, as read."""
+        """Mark folded keys as read."""
         self._read.update(keys)
 
     def get_nested(self, key: str) -> TrackedKeys[Any]:
-        """Return the keys within the value of a key; they are tracked separately.
+        """Return the keys within the value of a folded key; they are tracked separately.
 
-        Without such a value there are no keys. A value that is no mapping stays unread.
+        If the value is missing or no mapping, there are no keys within it. A value that
+        is no mapping stays unread.
         """
         if key not in self._nested:
             value = self._values.get(key)
@@ -99,11 +102,12 @@ class TrackedKeys(Generic[T]):
     ) -> list[str]:
         """Return the keys that were not read, as the file spells them.
 
-        A nested key has the keys that it is in before it, with dots: "camera.k7".
+        A key within the value of another one is listed as "camera.k7".
 
         Args:
-            is_quiet: returns whether a key, in folded form, with its value needs no
-                note, because it changes nothing. Nested keys are not passed to it.
+            is_quiet: function of a folded key and its value that returns whether the
+                key is left out of the list, because it changes nothing. It is not
+                applied to keys within values.
         """
         names = []
         for key, spelled in self._spelling.items():
@@ -115,13 +119,11 @@ class TrackedKeys(Generic[T]):
         return names
 
     def get_spelling(self, key: str) -> str:
-        """Return a key, in folded form, as the file spells it; itself if it is
-        absent.
-        """
+        """Return a folded key as the file spells it, or itself if it is absent."""
         return self._spelling.get(key, key)
 
     def items(self) -> Iterator[tuple[str, T]]:
-        """Yield folded keys and values, and count none as read."""
+        """Yield folded keys and values, without marking any as read."""
         yield from self._values.items()
 
     def __contains__(self, key: str) -> bool:
@@ -132,7 +134,10 @@ class TrackedKeys(Generic[T]):
 
 
 def join_names(names: Iterable[str], max_named: int = MAX_NAMED) -> str:
-    """Format names out of a file for a message: quoted, cut, and the rest counted."""
+    """Format names in a file for a message: quoted, cut, and at most `max_named`.
+
+    The number of the remaining names is added.
+    """
     unique_names = list(dict.fromkeys(names))
     text = ", ".join(format_name(name) for name in unique_names[:max_named])
     n_more = len(unique_names) - max_named

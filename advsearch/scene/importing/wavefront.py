@@ -1,7 +1,7 @@
 """Reader of Wavefront OBJ files.
 
-Statements of numbers (``v``, ``vt``, ``vn``, ``f``) are parsed as arrays, since a file
-may have millions of lines; all other statements are parsed line by line.
+Statements with numbers (``v``, ``vt``, ``vn``, ``f``) are parsed as arrays, since a file
+may have millions of lines. All other statements are parsed line by line.
 """
 
 from __future__ import annotations
@@ -61,9 +61,9 @@ NON_FACE_STATEMENTS = {
     **dict.fromkeys(FREE_FORM, "curves and curved surfaces"),
 }
 # Limit of the material files, and of the materials, that a file may name; before
-# `scaled`.
+# `scale_limit`.
 MAX_MATERIALS = 10_000
-# How far texture coordinates may lie outside [0, 1] before the wrap mode matters.
+# Texture coordinates may be outside [0, 1] by this much before the wrap mode matters.
 WRAP_TOLERANCE = 0.01
 # First words of a smoothing group (``s``) that turn smoothing off.
 NOT_SMOOTH = ("off", "0", "")
@@ -114,15 +114,15 @@ def _transform_uvs(
 def _note_repetition(uvs: Float64Array, notes: Notes) -> None:
     """Note that clamped textures repeat here, if UVs reach beyond their edges."""
     if _reaches_beyond(uvs):
-        notes.warn(
-            " has textures that are not to repeat beyond their edges "
-            "(-clamp); here they do"
+        notes.warn_that_file(
+            "has textures that must not repeat beyond their edges (-clamp); here they "
+            "do"
         )
 
 
 @dataclass(frozen=True, eq=False)
 class _Triangles:
-    """The T triangles of a file, with what the statements before them set.
+    """The T triangles of a file, with the material and smoothing in effect.
 
     Attributes:
         position: points of their corners.
@@ -131,7 +131,7 @@ class _Triangles:
         colors: (T, 3, 3) linear colors of their corners, None if the file has none.
         material_names: names of the materials.
         material: (T,) index of the material; -1 before the first ``usemtl``.
-        square: (T,) UDIM square, 0 where one image is for all.
+        square: (T,) UDIM square; 0 if the material has one image for all squares.
         is_flat: (T,) whether smoothing is off.
         has_uvs: (T,) whether all corners have texture coordinates.
     """
@@ -151,7 +151,7 @@ class _Triangles:
     ) -> tuple[Float64Array, Float64Array]:
         """Return UVs (F, 3, 2) and doubled areas (F,) of the triangles with a material.
 
-        Those of another UDIM square, and those without UVs, are left out.
+        Triangles of another UDIM square, and those without UVs, are left out.
         """
         material = self.material_names.index(material_name)
         is_selected = (self.material == material) & (self.square == square)
@@ -164,8 +164,8 @@ class _Triangles:
 def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     """Read an OBJ file and the material files that it names.
 
-    Faces with the same material, smoothing and UDIM square become one part; those among
-    them without texture coordinates become another one.
+    Faces with the same material, smoothing and UDIM square become one part. Those
+    without texture coordinates become a separate part.
 
     Args:
         path: path of the file.
@@ -179,7 +179,7 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     lines = ObjLines(data, notes)
     tables = {kind: lines.read_table(kind) for kind in TABLES}
     if not len(tables["v"]):
-        raise notes.damaged(EXPECTED, data)
+        raise notes.damaged(EXPECTED, got=data)
     faces = lines.read_faces({kind: len(table) for kind, table in tables.items()})
     _, corner_counts, _ = faces
     if (corner_counts < 3).all():
@@ -189,12 +189,15 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
         )
 
     statements = _parse_statements(lines, notes)
-    reader = MtlReader(
-        References(path),
-        notes,
-        # called only when materials are converted: after the triangles exist
-        lambda name, square: triangles.measure_mapped_faces(name, square),
-    )
+
+    def find_mapped_faces(name: str, square: int) -> tuple[Float64Array, Float64Array]:
+        """Return UVs and areas of the triangles with a material.
+
+        The reader calls this when it converts a material, after `triangles` is set.
+        """
+        return triangles.measure_mapped_faces(name, square)
+
+    reader = MtlReader(References(path), notes, find_mapped_faces)
     _read_libraries(reader, statements.library_lines, notes)
     triangles = _make_triangles(lines, tables, faces, statements, reader)
     names_libraries = bool(statements.library_lines)
@@ -213,12 +216,12 @@ def _make_triangles(
     statements: _Statements,
     reader: MtlReader,
 ) -> _Triangles:
-    """Return the triangles of a file's faces, with what the statements set.
+    """Return the triangles of a file's faces, with the statements in effect.
 
     Args:
         lines: lines of the file.
         tables: points, UVs and normals of the file, by the keywords "v", "vt" and "vn".
-        faces: what `ObjLines.read_faces` returns: corners, counts, rows of lines.
+        faces: result of `ObjLines.read_faces`: corners, counts, rows of lines.
         statements: material and smoothing statements, with the rows of their lines.
         reader: reader of the materials.
     """
@@ -252,9 +255,10 @@ def _make_part(
 
     Args:
         triangles: all triangles of the file.
-        group: indices of those in the group, which all have UVs or all none.
+        group: indices of the triangles of the group. Either all or none have UVs.
         reader: reader of the materials.
-        names_libraries: whether the file names material files.
+        names_libraries: whether the file names material files; otherwise a missing
+            material gets a note about that.
     """
     first = group[0]  # all triangles of the group have the same properties
     name = ""
@@ -263,7 +267,7 @@ def _make_part(
     square = int(triangles.square[first])
     has_colors = triangles.colors is not None
     mtl_surface = _find_material(reader, name, square, has_colors, names_libraries)
-    surface, tint = _combine_colors(
+    surface, corner_colors = _combine_colors(
         mtl_surface.surface, triangles.colors, group, reader.notes
     )
     uv = _transform_uvs(triangles.uv, square, mtl_surface)
@@ -274,7 +278,7 @@ def _make_part(
         points=triangles.position,
         normals=triangles.normal,
         uvs=uv,
-        colors=tint,
+        colors=corner_colors,
         surface=surface,
         flat=bool(triangles.is_flat[first]),
     )
@@ -315,13 +319,13 @@ def _find_flat_faces(
     """
     values, group = _find_values_in_effect(smoothing_changes, rows)
     is_off_by_group = [value in NOT_SMOOTH for value in values]
-    # Index -1, of triangles before the first statement, is the last entry.
+    # Triangles before the first statement have the group -1, which is the last entry.
     is_off = np.array([*is_off_by_group, False])[group]
     lacks_normals = (normal.rows < 0).any(axis=1)
     if ((group >= 0) & ~is_off & lacks_normals).any():
         notes.warn(
-            "smoothing groups are left out: its normals are made, with creases "
-            "at sharp edges"
+            "smoothing groups are left out: its normals are computed, with creases at "
+            "sharp edges"
         )
     return np.asarray(is_off)
 
@@ -329,15 +333,15 @@ def _find_flat_faces(
 def _find_squares(
     reader: MtlReader, names: Sequence[str], material: IntArray, uv: IndexedValues
 ) -> IntArray:
-    """Return the UDIM square of each triangle, (T,); 0 where one image is for all.
+    """Return the UDIM square of each triangle, (T,); 0 if one image is for all.
 
     A UDIM texture has an image for each unit square of texture coordinates, numbered
-    from 1001. Only squares for which the material has an image count.
+    from 1001. Triangles in squares without an image get 0, too.
 
     Args:
         reader: reader of the materials.
         names: names of the materials.
-        material: (T,) the material of each triangle; -1: none.
+        material: (T,) the material of each triangle; -1 for none.
         uv: the texture coordinates of the triangles.
     """
     square = np.zeros(len(material), np.int64)
@@ -370,7 +374,8 @@ def _find_material(
         square_number: the UDIM square, 0 for none.
         has_colors: whether vertices have colors.
         names_libraries: whether the file names material files. If it does and none
-            could be read, another note says so, and none is added here.
+            could be read, `MtlReader.read_library` has noted that, and no note is added
+            here.
     """
     if not name:
         return MtlSurface(ImportedSurface())
@@ -383,12 +388,13 @@ def _find_material(
         lacking_files = (
             "its .mtl file lacks" if reader.n_libraries == 1 else "its .mtl files lack"
         )
-        reader.notes.warn(
-            f" uses the material {format_name(name)}, which {lacking_files}; {substitute_text}"
+        reader.notes.warn_that_file(
+            f"uses the material {format_name(name)}, which {lacking_files}; "
+            f"{substitute_text}"
         )
     elif not names_libraries:
-        reader.notes.warn(
-            f" uses materials and names no material file (mtllib); {substitute_text}"
+        reader.notes.warn_that_file(
+            f"uses materials and names no material file (mtllib); {substitute_text}"
         )
     return MtlSurface(ImportedSurface(name=without_comment(name)))
 
@@ -396,47 +402,50 @@ def _find_material(
 def _combine_colors(
     surface: ImportedSurface, colors: Float64Array | None, group: IntArray, notes: Notes
 ) -> tuple[ImportedSurface, Float64Array | None]:
-    """Decide how vertex colors and a material's own color are combined.
+    """Decide how vertex colors and the color of a material are combined.
 
     If the material has a texture, vertex colors are left out. If it has a color, vertex
-    colors multiply it. If it has neither, vertex colors alone count.
+    colors multiply it. If it has neither, it becomes white, so that vertex colors alone
+    are visible.
 
     Args:
         surface: the material.
         colors: (T, 3, 3) linear vertex colors of the corners of all triangles, or None.
         group: the triangles that have the material.
-        notes: where it is reported what is left out.
+        notes: notes about the file.
 
     Returns:
-        The surface, and the colors that multiply its color (None: nothing does).
+        The surface; and the colors of all triangles if they multiply its color, or
+        None.
     """
     if colors is None:
         return surface, None
-    is_tinted = colors[group].min() < 1.0
+    has_vertex_colors = colors[group].min() < 1.0  # not only white ones
     if surface.texture is not None:
-        if is_tinted:
+        if has_vertex_colors:
             notes.warn("colours of vertices are left out where there is a texture")
         return surface, None
-    if surface.color is None:  # white, so that only the vertex colors count
+    if surface.color is None:
         return replace(surface, color=np.ones(3, np.float32)), colors
     is_white = surface.color[:3].min() >= 0.999
-    if is_tinted and not is_white:
+    if has_vertex_colors and not is_white:
         notes.warn("colours of vertices are multiplied by the Kd of their material")
     return surface, colors
 
 
 def _reaches_beyond(uvs: Float64Array) -> bool:
-    """Return whether UVs reach beyond [0, 1], where a texture repeats; NaN counts."""
-    return not (uvs.min() >= -WRAP_TOLERANCE and uvs.max() <= 1.0 + WRAP_TOLERANCE)
+    """Return whether UVs reach beyond [0, 1], where a texture repeats, or are NaN."""
+    is_inside = uvs.min() >= -WRAP_TOLERANCE and uvs.max() <= 1.0 + WRAP_TOLERANCE
+    return not is_inside
 
 
 class _Statements(NamedTuple):
-    """The statements of a file that are no numbers.
+    """The statements of a file that have no numbers.
 
     Attributes:
-        library_lines: the texts after ``mtllib``, which names material files.
-        material_changes: rows and material names of ``usemtl``.
-        smoothing_changes: rows and words of ``s``.
+        library_lines: the texts after ``mtllib``, which are names of material files.
+        material_changes: line index and material name of each ``usemtl``.
+        smoothing_changes: line index and argument of each ``s``.
     """
 
     library_lines: list[str]
@@ -445,7 +454,7 @@ class _Statements(NamedTuple):
 
 
 def _parse_statements(lines: ObjLines, notes: Notes) -> _Statements:
-    """Parse the statements that are no numbers, and note those that are left out.
+    """Parse the statements that have no numbers, and note those that are left out.
 
     Statements that only name groups of faces, or switch something off, need no note.
     """
@@ -463,7 +472,7 @@ def _parse_statements(lines: ObjLines, notes: Notes) -> _Statements:
             smoothing_changes.append((row, clean_argument))
         elif key in NON_FACE_STATEMENTS:
             notes.record(f"{NON_FACE_STATEMENTS[key]}, statement", key)
-        # What only groups faces, or is switched off, changes nothing.
+        # Statements that group faces, or switch something off, change nothing.
         elif key not in GROUPING and clean_argument not in ("off", "0"):
             notes.record("statement", keyword)
     return _Statements(library_lines, material_changes, smoothing_changes)
@@ -479,15 +488,15 @@ def _find_values_in_effect(
         rows: the rows at which the value is looked up.
 
     Returns:
-        The different values, and for each row the index of the last one set before it,
-        -1 if none was.
+        The different values; and for each row the index of the last value set before
+        it, -1 if none was.
     """
     values = list(dict.fromkeys(value for _, value in changes))
     index_of_value = {value: index for index, value in enumerate(values)}
     change_rows = np.array([row for row, _ in changes], dtype=np.int64)
     # the last change on a row before; -1 if there is none
     last_change = np.searchsorted(change_rows, rows) - 1
-    # Rows before the first change have position -1, which is the last entry: -1.
+    # Rows before the first change have the index -1, of the last entry, which is -1.
     index_of_change = np.array([*(index_of_value[value] for _, value in changes), -1])
     return values, index_of_change[last_change]
 
@@ -504,7 +513,8 @@ def _read_colors(
     Args:
         lines: lines of the file.
         table: (V, 7) the numbers of ``v`` lines, NaN where there are none.
-        notes: where weights and opacities are recorded, which are not read.
+        notes: notes about the file; weights and opacities, which are not read, are
+            recorded.
     """
     weight = table[:, 3]
     opacity = table[:, 6]
@@ -531,15 +541,18 @@ def _read_colors(
 
 Bytes = npt.NDArray[np.uint8]
 TABLES = {"v": (3, 7), "vt": (1, 2), "vn": (3, 3)}
-"""Statements of numbers: how many each has at least, and how many are read."""
+"""Statements with numbers: the smallest number of these, and how many are read."""
 KINDS = (*TABLES, "f")
 EXPECTED = "a Wavefront OBJ file (text with 'v' and 'f' lines)"
-_CONTINUED = re.compile(rb"\\[ \t]*\n")
-_COMMENTED = re.compile(rb"^([ \t]*#[^\n]*?)\\[ \t]*\n", re.MULTILINE)
+OTHER_KIND = len(KINDS)  # kind of all other lines
+_CONTINUATION = re.compile(rb"\\[ \t]*\n")
+# A comment that ends in a backslash. The group is the comment without the backslash.
+_CONTINUED_COMMENT = re.compile(rb"^([ \t]*#[^\n]*?)\\[ \t]*\n", re.MULTILINE)
 _CORNER = re.compile(r"[-+]?\d+(?:/(?:[-+]?\d+)?){0,2}")
 _NEWLINE, _HASH, _SLASH = b"\n#/"
-# Tables over all bytes: which are blank, and which may stand in the corners of faces.
-_BLANK, _IN_CORNERS = (
+# (256,) bool tables over all bytes: whether a byte is blank, and whether it may occur in
+# the corners of faces.
+_IS_BLANK, _IS_IN_CORNERS = (
     np.isin(np.arange(256), np.frombuffer(characters, np.uint8))
     for characters in (b" \t\n\v\f", b"+-/0123456789 \t\n\v\f")
 )
@@ -551,12 +564,10 @@ class ObjLines:
     Attributes:
         text: the file, as `_normalize_lines` returns it.
         bytes: the same as an array.
-        starts, ends: (L,) where each line begins, and its line break.
-        kind: (L,) index into `KINDS` of each line; their number for another line.
-        is_unended: whether the last line has no line break.
-
-    Raises:
-        FileFormatError: the file is not text.
+        starts: (L,) index of the first byte of each line.
+        ends: (L,) index of the line break of each line.
+        kind: (L,) index into `KINDS` of each line, or `OTHER_KIND`.
+        is_unended: whether the last line of the file has no line break.
     """
 
     def __init__(self, data: bytes, notes: Notes) -> None:
@@ -568,15 +579,19 @@ class ObjLines:
         Args:
             data: the bytes of the file.
             notes: notes about the file.
+
+        Raises:
+            FileFormatError: the file is not text.
         """
         if b"\x00" in data:
-            raise notes.damaged(EXPECTED, data)
+            raise notes.damaged(EXPECTED, got=data)
         text = _normalize_lines(data)
         self.notes = notes
         self.text = text
-        # Files that were cut short do not end in a line break.
+        # A file without a last line break may be cut short; `_check_sizes` uses this.
         self.is_unended = not data.endswith((b"\n", b"\r"))
         self.bytes = np.frombuffer(text, dtype=np.uint8)
+        # The normalized text ends in a line break, so that every line has an end.
         self.ends = np.flatnonzero(self.bytes == _NEWLINE)
         self.starts = np.concatenate([[0], self.ends[:-1] + 1])
         # a last line may be shorter than three bytes
@@ -585,7 +600,7 @@ class ObjLines:
             padded[self.starts + offset] for offset in range(3)
         )
         # A keyword has one or two letters, and a blank after it.
-        self.kind = np.full(len(self.starts), len(KINDS), dtype=np.int8)
+        self.kind = np.full(len(self.starts), OTHER_KIND, dtype=np.int8)
         for index, kind in enumerate(KINDS):
             if len(kind) == 2:
                 matches = (first_byte == ord(kind[0])) & (second_byte == ord(kind[1]))
@@ -593,14 +608,17 @@ class ObjLines:
             else:
                 matches = first_byte == ord(kind[0])
                 after_keyword = second_byte
-            self.kind[matches & _BLANK[after_keyword]] = index
+            self.kind[matches & _IS_BLANK[after_keyword]] = index
 
     def iterate_others(self) -> Iterator[tuple[int, str, str]]:
-        """Yield the row, keyword and rest of every line that is no table or comment."""
+        """Yield the row, keyword and argument of each line that is not in `KINDS`.
+
+        Empty lines and comments are left out.
+        """
         first_byte = self.bytes[self.starts]
-        is_other = (
-            (self.kind == len(KINDS)) & (first_byte != _NEWLINE) & (first_byte != _HASH)
-        )
+        is_empty = first_byte == _NEWLINE
+        is_comment = first_byte == _HASH
+        is_other = (self.kind == OTHER_KIND) & ~is_empty & ~is_comment
         for row in np.flatnonzero(is_other):
             line = decode_text(self.text[self.starts[row] : self.ends[row]])
             keyword, _, rest = line.strip().replace("\t", " ").partition(" ")
@@ -609,7 +627,7 @@ class ObjLines:
     def read_table(self, kind: str) -> Float64Array:
         """Return the numbers of all lines of a kind, (N, columns) as in `TABLES`.
 
-        Numbers that a line lacks are 0 for ``vt`` and NaN for the others. Numbers
+        Missing numbers of a line are 0 for ``vt`` and NaN for other kinds. Numbers
         beyond the last column are left out.
 
         Raises:
@@ -631,7 +649,7 @@ class ObjLines:
             table = values.reshape(len(rows), -1)[:, :columns]
             n_missing = columns - table.shape[1]
             return np.pad(table, ((0, 0), (0, n_missing)), constant_values=fill)
-        # Otherwise each number is written to the row and column that it has.
+        # Otherwise each number is written to its row and column.
         first_of_line = np.cumsum(counts) - counts
         column = np.arange(len(values)) - np.repeat(first_of_line, counts)
         row = np.repeat(np.arange(len(rows)), counts)
@@ -653,22 +671,22 @@ class ObjLines:
                 )
             if not all(map(is_number, words)):
                 raise self.notes.damaged(f"numbers {where}", got)
-        # No single line is wrong, and yet they could not be parsed together.
+        # No single line is wrong, but they could not be parsed together.
         raise self.notes.damaged(f"numbers after {kind!r}", "something else")
 
     def read_faces(self, counts: dict[str, int]) -> tuple[IntArray, IntArray, IntArray]:
         """Return the corners of all faces.
 
         Args:
-            counts: how many rows the tables of points, UVs and normals have.
+            counts: number of rows of the tables of points, UVs and normals.
 
         Returns:
             (C, 3) for each corner the rows of the three tables, -1 for none; (P,) the
             number of corners of each face; and (P,) the row of each face's line.
 
         Raises:
-            FileFormatError: a face is malformed, is too large, or refers to what is not
-                in the file; or there are too many.
+            FileFormatError: a face is malformed, is too large, or refers to a missing
+                row of a table; or there are too many faces.
         """
         rows, line_bytes = self._select_lines("f")
         if not len(rows):
@@ -699,8 +717,8 @@ class ObjLines:
     def _check_sizes(self, rows: IntArray, sizes: IntArray) -> None:
         """Raise FileFormatError for a last face cut short, or faces over a limit.
 
-        A face of fewer than 3 corners counts as cut short only if its line is the last
-        one of the file and has no line break.
+        A face of fewer than 3 corners is cut short only if its line is the last one of
+        the file and has no line break.
 
         Args:
             rows: (P,) row of each face's line.
@@ -721,13 +739,13 @@ class ObjLines:
     def _resolve_relative(
         self, index: IntArray, kind: str, rows: IntArray, sizes: IntArray
     ) -> None:
-        """Replace negative indices (C,) in place by those that count from 1.
+        """Replace negative indices (C,) in place by indices that count from 1.
 
-        They count back from their face's line: -1 is the last row of the table `kind`
-        before it.
+        A negative index counts back from the line of its face: -1 is the last row of
+        the table `kind` above it.
 
         Args:
-            index: (C,) of all corners.
+            index: (C,) indices of all corners.
             kind: one of `TABLES`.
             rows: (P,) the row of each face's line in the file.
             sizes: (P,) the number of corners of each face.
@@ -735,7 +753,8 @@ class ObjLines:
         is_relative = index < 0
         if not is_relative.any():
             return
-        # how many rows of the table stand above each line, for each corner
+        # For each corner, the number of rows of the table above its line. (The sum has
+        # the line itself, which is a face and no row of a table.)
         count_before_line = np.cumsum(self.kind == KINDS.index(kind))
         count_before = np.repeat(count_before_line[rows], sizes)
         if (index < -count_before).any():
@@ -763,15 +782,22 @@ class ObjLines:
     def _select_lines(self, kind: str) -> tuple[IntArray, Bytes]:
         """Return the rows of the lines of a kind, and their bytes, one after the other.
 
-        Keywords become blanks, and comments are removed: only the arguments and one
-        line break for each line are left.
+        Keywords become blanks, and comments are removed. The arguments and one line
+        break for each line remain.
+
+        Args:
+            kind: keyword, one of `KINDS`.
         """
         is_selected = self.kind == KINDS.index(kind)
+        # Lengths include line breaks, so that they add up to the length of the text.
         lengths = self.ends - self.starts + 1
         rows = np.flatnonzero(is_selected)
-        line_bytes = self.bytes[np.repeat(is_selected, lengths)]
-        # where each selected line begins in `line_bytes`
-        starts = np.cumsum(lengths[rows]) - lengths[rows]
+        is_selected_byte = np.repeat(is_selected, lengths)
+        line_bytes = self.bytes[is_selected_byte]
+        # index of the first byte of each selected line in `line_bytes`
+        selected_lengths = lengths[rows]
+        starts = np.cumsum(selected_lengths) - selected_lengths
+        # A line begins with its keyword, without blanks before it.
         for offset in range(len(kind)):
             line_bytes[starts + offset] = ord(" ")
         if (line_bytes == _HASH).any():
@@ -780,7 +806,7 @@ class ObjLines:
         return rows, line_bytes
 
     def _iterate_words(self, rows: IntArray) -> Iterator[tuple[int, list[str]]]:
-        """Yield the line number, from 1, and the arguments of each of some lines."""
+        """Yield the number (from 1) and the arguments of the lines in these rows."""
         for row in rows:
             line = decode_text(self.text[self.starts[row] : self.ends[row]])
             yield int(row) + 1, line.partition("#")[0].split()[1:]
@@ -789,24 +815,26 @@ class ObjLines:
         """Raise FileFormatError for the first face that has a wrong index.
 
         An index must be an integer other than 0. A negative one must not go back
-        further than the first row.
+        further than the first row. Indices that are too large are found by
+        `read_faces`.
         """
         counts_before_line = np.stack(
             [np.cumsum(self.kind == KINDS.index(kind)) for kind in TABLES], axis=1
         )
         for line_number, words in self._iterate_words(rows):
-            counts = counts_before_line[line_number - 1]
+            row = line_number - 1
+            counts = counts_before_line[row]
             for word in words:
                 if not _CORNER.fullmatch(word):
                     raise self.notes.damaged(
                         f"whole numbers in the face on line {line_number}",
                         format_name(word),
                     )
-                # What is left out, as in 1//3, is right: it counts as 1.
+                # A missing index, as in 1//3, is valid, and so is the 1 in its place.
                 indices = [int(text or "1") for text in word.split("/")]
-                # A negative index counts backwards from the face's line.
+                # A corner may have fewer indices than there are tables.
                 is_wrong = any(
-                    not index or index < -count
+                    index == 0 or index < -count
                     for index, count in zip(indices, counts, strict=False)
                 )
                 if is_wrong:
@@ -814,7 +842,7 @@ class ObjLines:
                         f"indices that count from 1 in the face on line {line_number}",
                         format_name(word),
                     )
-        # No single face is wrong, and yet they could not be parsed together.
+        # No single face is wrong, but they could not be parsed together.
         raise self.notes.damaged("whole numbers in faces", "something else")
 
 
@@ -827,11 +855,14 @@ def _normalize_lines(data: bytes) -> bytes:
         data.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").replace(b"\r", b"\n")
         + b"\n"
     )
-    # A backslash continues a line, but not a comment.
-    if _CONTINUED.search(text):
-        text = _CONTINUED.sub(b" ", _COMMENTED.sub(rb"\1\n", text))
-    # Lines without their leading blanks.
-    if b"\n " in text or b"\n\t" in text or text[:1] in b" \t":
+    # A backslash at the end of a line continues the line, but not a comment. So it is
+    # removed from comments first, whose line breaks stay.
+    if _CONTINUATION.search(text):
+        without_continued_comments = _CONTINUED_COMMENT.sub(rb"\1\n", text)
+        text = _CONTINUATION.sub(b" ", without_continued_comments)
+    # Leading blanks of lines are removed.
+    has_leading_blanks = b"\n " in text or b"\n\t" in text or text[:1] in b" \t"
+    if has_leading_blanks:
         text = re.sub(rb"\n[ \t]+", b"\n", text.lstrip(b" \t"))
     # Old files have ``fo`` for a face.
     if b"\nfo" in text:
@@ -841,7 +872,7 @@ def _normalize_lines(data: bytes) -> bytes:
 
 def _count_words(data: Bytes) -> IntArray:
     """Return how many words each line of bytes has; the last byte is a line break."""
-    is_blank = _BLANK[data]
+    is_blank = _IS_BLANK[data]
     is_word_start = ~is_blank
     is_word_start[1:] &= is_blank[:-1]
     ends = np.flatnonzero(data == _NEWLINE)
@@ -853,20 +884,25 @@ def _find_columns(is_first: BoolArray, is_after_two_slashes: BoolArray) -> IntAr
     """Return the column of each number in its corner, by the slashes before it.
 
     The column is the number of slashes in the corner before the number: in ``7//5`` the
-    7 is in column 0 and the 5 in column 2. A corner has at most three numbers, so it is
-    enough to add the slashes right before the number and those right before its up to
-    two predecessors in the corner.
+    7 is in column 0 and the 5 in column 2. A corner has at most three numbers. So the
+    column is a sum of at most three terms: the slashes right before the number, before
+    its predecessor, and before the predecessor of that, as far as they are in the same
+    corner.
 
     Args:
-        is_first: whether a number is the first of its corner.
-        is_after_two_slashes: whether two slashes, not one, are between a number that is
-            not the first and its predecessor.
+        is_first: (N,) whether a number is the first of its corner.
+        is_after_two_slashes: (N,) whether a number that is not the first has two
+            slashes before it, and not one.
     """
-    # Slashes between a number and its predecessor in the same corner.
-    n_slashes = np.where(is_first, 0, np.where(is_after_two_slashes, 2, 1))
+    # slashes between a number and its predecessor in the same corner
+    n_slashes_if_not_first = np.where(is_after_two_slashes, 2, 1)
+    n_slashes = np.where(is_first, 0, n_slashes_if_not_first)
     column = n_slashes.copy()
+    # Numbers that are not the first have a predecessor in the corner.
     column[1:] += np.where(is_first[1:], 0, n_slashes[:-1])
-    column[2:] += np.where(is_first[2:] | is_first[1:-1], 0, n_slashes[:-2])
+    # They have two predecessors unless they or their predecessor are the first.
+    is_first_or_second = is_first[2:] | is_first[1:-1]
+    column[2:] += np.where(is_first_or_second, 0, n_slashes[:-2])
     return np.asarray(column)
 
 
@@ -883,32 +919,58 @@ def _parse_corners(data: Bytes) -> tuple[IntArray, IntArray] | None:
         (C, 3) indices of points, UVs and normals as the file has them, 0 for none; and
         (P,) the number of corners of each face. None if the text is malformed.
     """
-    is_blank = _BLANK[data]
     is_slash = data == _SLASH
-    is_digit = ~(is_blank | is_slash)
-    # a blank is before the first number: the keyword was blanked out
-    number_starts = np.flatnonzero(is_digit[1:] & ~is_digit[:-1]) + 1
-    is_first = is_blank[number_starts - 1]  # of its corner
+    number_starts, is_first = _find_numbers(data)
     # The byte two before a number is a slash if two slashes are before it. For the
     # first number of a corner, `_find_columns` ignores that.
     column = _find_columns(is_first, is_slash[number_starts - 2])
-    # three numbers in a row that are not the first of a corner: it has four
-    has_fourth = ~(is_first[3:] | is_first[2:-1] | is_first[1:-2])
-    is_malformed = (
-        (is_slash[1:] & is_blank[:-1]).any()  # a corner begins with a slash
-        or not _IN_CORNERS[data].all()
-        or has_fourth.any()
-        or (column > 2).any()
-    )
     without_slashes = np.where(is_slash, np.uint8(ord(" ")), data)
     values = parse_number_array(without_slashes.tobytes(), np.int64)
-    if is_malformed or len(values) != len(number_starts) or (values == 0).any():
+    if (
+        len(values) != len(number_starts)
+        or (values == 0).any()  # the file counts from 1
+        or _has_malformed_corner(data, is_first, column)
+    ):
         return None
-    # corners before each line break, minus those before the one above
+    # (P,) corners before each line break, minus those before the previous one
     corner_starts = number_starts[is_first]
     line_ends = np.flatnonzero(data == _NEWLINE)
     sizes = np.diff(np.searchsorted(corner_starts, line_ends), prepend=0)
+    # (N,) the corner of each number: the number of corners that have begun, minus 1
+    corner_of_number = np.cumsum(is_first) - 1
     corners = np.zeros((len(corner_starts), 3), dtype=np.int64)
-    # the corner of each number is how many began up to it, less 1
-    corners[np.cumsum(is_first) - 1, column] = values
+    corners[corner_of_number, column] = values
     return corners, sizes
+
+
+def _find_numbers(data: Bytes) -> tuple[IntArray, BoolArray]:
+    """Return the first byte of each number in face lines, and which begin a corner.
+
+    Numbers are runs of bytes that are neither blank nor a slash. The lines have their
+    keywords replaced by blanks, so that no number is at the first byte.
+    """
+    is_blank = _IS_BLANK[data]
+    is_in_number = ~(is_blank | (data == _SLASH))
+    number_starts = np.flatnonzero(is_in_number[1:] & ~is_in_number[:-1]) + 1
+    is_first_of_corner = is_blank[number_starts - 1]
+    return number_starts, is_first_of_corner
+
+
+def _has_malformed_corner(data: Bytes, is_first: BoolArray, column: IntArray) -> bool:
+    """Return whether face lines have other characters, or corners of a wrong form.
+
+    Args:
+        data: the lines without keywords.
+        is_first: (N,) whether a number is the first of its corner.
+        column: (N,) column of each number in its corner.
+    """
+    begins_with_slash = (data[1:] == _SLASH) & _IS_BLANK[data[:-1]]
+    # A number is the fourth of its corner, or a later one, if neither it nor its two
+    # predecessors are the first.
+    is_fourth = ~(is_first[3:] | is_first[2:-1] | is_first[1:-2])
+    return bool(
+        begins_with_slash.any()
+        or not _IS_IN_CORNERS[data].all()
+        or is_fourth.any()
+        or (column > 2).any()
+    )

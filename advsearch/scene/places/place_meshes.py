@@ -348,7 +348,7 @@ def _read_pieces(
             piece = read_primitive(
                 file,
                 variant_primitive,
-                extras=header.meshes[mesh].extras,
+                mesh_extras=header.meshes[mesh].extras,
                 is_skinned=False,
             )
             if piece is not None and len(piece.part.faces):

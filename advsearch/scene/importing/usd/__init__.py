@@ -1,7 +1,7 @@
 """Converter of OpenUSD files to glTF, with `usd-core` in a separate process.
 
-Its readers of binary formats are written in C++, and a file may make them crash or use
-all memory.
+The process is separate because the readers of binary formats in `usd-core` are written
+in C++: a corrupt file may make them crash or use all memory.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ from advsearch.extend import errors, reading, stored_files
 PACKAGE_SUFFIX = ".usdz"
 LAYER_SUFFIXES = (".usd", ".usda", ".usdc")
 USD_TIMEOUT_S = 120  # timeout in seconds, before `scale_limit`
-MAX_MEMORY = 8 << 30  # limit of its memory in bytes, before `scale_limit`
+MAX_MEMORY = 8 << 30  # limit of the process's memory in bytes, before `scale_limit`
+# Limit of the bytes of the glTF file, in which textures may be written anew.
+MAX_RESULT_SIZE = 4 * stored_files.LARGEST_FILE
 USD_MAGIC_BYTES = (b"PXR-USDC", b"#usda", b"PK\x03\x04")
 REJECTED_PREFIX = "refused: "
 _LIMITED_SCRIPT = f"""
@@ -26,7 +28,7 @@ import runpy, sys
 try:
     import resource
     resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[1]),) * 2)
-    resource.setrlimit(resource.RLIMIT_FSIZE, ({stored_files.LARGEST_FILE} * 4,) * 2)
+    resource.setrlimit(resource.RLIMIT_FSIZE, ({MAX_RESULT_SIZE},) * 2)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 except ImportError:
     pass
@@ -59,25 +61,25 @@ def convert_usd(path: Path, data: bytes) -> bytes:
     if not is_installed():
         raise errors.FileFormatError(
             f"{path}: an OpenUSD file needs usd-core, which is not installed: pip "
-            "install 'advsearch[usd]'; or export "
-            "glTF (.glb) where it is from"
+            "install 'advsearch[usd]'; or export glTF (.glb) from the program that "
+            "made it"
         )
     with tempfile.TemporaryDirectory(prefix="advsearch-usd-") as folder:
         target = Path(folder) / "scene.glb"
         process = _run_conversion(path, target)
         if process.returncode or not target.is_file():
             raise _make_conversion_error(path, process.stderr, process.returncode)
-        for name in json.loads(process.stdout.splitlines()[-1]):
+        # The last line is the list of files; usd-core may print lines before it.
+        files_read = json.loads(process.stdout.splitlines()[-1])
+        for name in files_read:
             stored_files.record_opened(name)
-        return stored_files.read_bytes(
-            target, "a glTF file", 4 * stored_files.LARGEST_FILE
-        )
+        return stored_files.read_bytes(target, "a glTF file", MAX_RESULT_SIZE)
 
 
 def _run_conversion(path: Path, target: Path) -> subprocess.CompletedProcess[str]:
-    """Let a process of its own convert a file, with a limit of memory.
+    """Convert a file in a separate process, with a limit on its memory.
 
-    `target` is the path of the result. Packages are unpacked beside it.
+    `target` is the path of the result. Packages are unpacked in the same folder.
     """
     package_folder = target.with_name("package")
     package_folder.mkdir()
@@ -102,11 +104,11 @@ def _make_conversion_error(
 ) -> errors.FileFormatError:
     """Return the error of a conversion that failed, by the last line of its output."""
     lines = [line for line in stderr.splitlines() if line.strip()]
-    last_line = lines[-1] if lines else "without a word"
+    last_line = lines[-1] if lines else "no message"
     if last_line.startswith(REJECTED_PREFIX):
-        # The process names the file without its folder.
         message = last_line.removeprefix(REJECTED_PREFIX)
         if message.startswith(path.name):
+            # The message begins with the file's name, to which its folder is added.
             return errors.FileFormatError(f"{path.parent / message}")
         return errors.FileFormatError(f"{path}: {message}")
     reason = f"signal {-returncode}"

@@ -1,7 +1,7 @@
 """Checks of the layers and packages of an OpenUSD file, before they are composed.
 
-All that a layer names has to be a layer or a package (.usdz) in the folder of the first
-one or below; all that a layer in a package names has to be in that package.
+A layer may only refer to layers and packages (.usdz) in or below the folder of the
+first layer. A layer in a package may only refer to files in that package.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from pxr import Ar, Sdf
 from advsearch.extend import errors, reading, stored_files
 from advsearch.scene.importing.usd import LAYER_SUFFIXES, PACKAGE_SUFFIX
 
-MAX_LAYERS = 1000
-MAX_ENTRIES = 10_000
-MAX_PACKAGE_DEPTH = 4  # limit of packages in packages
+MAX_LAYERS = 1000  # limit of the layers and packages of a file
+MAX_ENTRIES = 10_000  # limit of the files in a package
+MAX_PACKAGE_DEPTH = 4  # limit of the nesting of packages
 
 
 def unpack_package(package: Path, folder: Path) -> Path:
@@ -44,8 +44,8 @@ def open_package(name: str, content: bytes) -> zipfile.ZipFile:
     """Open the content of a .usdz file, whose entries are not compressed.
 
     Raises:
-        FileFormatError: it is corrupt, too large, has compressed entries or names
-            outside of it, or its first entry is no layer.
+        FileFormatError: it is corrupt or too large, has compressed entries or names
+            that lead outside, or its first entry is no layer.
     """
     try:
         archive = zipfile.ZipFile(io.BytesIO(content))
@@ -79,12 +79,14 @@ def _check_entries(name: str, archive: zipfile.ZipFile) -> None:
         archive: the opened package.
 
     Raises:
-        FileFormatError: one of these does not hold, or a limit is exceeded.
+        FileFormatError: one of these requirements is not met, or a limit is exceeded.
         BadZipFile: the header of an entry is corrupt.
     """
     entries = archive.infolist()
     size = sum(entry.file_size for entry in entries)
     got = f"{len(entries):,} of {size:,}"
+    # `check_most` scales a limit itself. It is scaled here only for the message, which
+    # has both limits.
     max_files = stored_files.scale_limit(MAX_ENTRIES)
     max_bytes = stored_files.scale_limit(stored_files.LARGEST_FILE)
     expected = f"at most {max_files:,} files of {max_bytes:,} bytes in all"
@@ -93,13 +95,14 @@ def _check_entries(name: str, archive: zipfile.ZipFile) -> None:
     for entry in entries:
         path = PurePosixPath(entry.filename)
         is_outside = path.is_absolute() or ".." in path.parts
-        has_odd_name = re.search(r"[\\:\[\]]", entry.filename)
-        is_packed = entry.compress_type != zipfile.ZIP_STORED or entry.flag_bits & 1
-        if is_outside or has_odd_name or is_packed:
+        has_special_characters = re.search(r"[\\:\[\]]", entry.filename)
+        is_compressed = entry.compress_type != zipfile.ZIP_STORED
+        is_encrypted = bool(entry.flag_bits & 1)
+        if is_outside or has_special_characters or is_compressed or is_encrypted:
             raise errors.FileFormatError(
-                f"{name}: expected files that lie in it as they are, got "
-                f"{entry.filename[:80]!r}, "
-                "which is packed or lies elsewhere; make it again with usdzip"
+                f"{name}: expected uncompressed files inside of it, got "
+                f"{entry.filename[:80]!r}, which is compressed, encrypted or outside; "
+                "make it again with usdzip"
             )
     for entry in entries:
         archive.open(entry).close()  # this checks local headers
@@ -116,11 +119,10 @@ def _check_without_gaps(name: str, archive: zipfile.ZipFile, content: bytes) -> 
         if entry.header_offset != position:
             raise errors.FileFormatError(
                 f"{name}: expected a .usdz archive with one file after the other, got "
-                "bytes in between; "
-                "make it again with usdzip"
+                "bytes in between; make it again with usdzip"
             )
-        # A local header has 30 bytes, of which bytes 26 to 29 are the lengths of the
-        # name and of the extra field after it.
+        # A local header has 30 bytes. Bytes 26 to 29 are the lengths of the name and of
+        # the extra field, which follow the header.
         lengths = content[entry.header_offset + 26 : entry.header_offset + 30]
         name_size = int.from_bytes(lengths[:2], "little")
         extra_size = int.from_bytes(lengths[2:], "little")
@@ -156,26 +158,26 @@ def read_packaged(path: str) -> bytes:
 
 
 def check_layers(file: Path) -> list[str]:
-    """Return the files of all layers and packages that a file is made of, itself first.
+    """Return the files of all layers and packages that a file needs, itself first.
 
     Raises:
-        FileFormatError: one of them is corrupt, names files elsewhere, or is over a
-            limit.
+        FileFormatError: one of them is corrupt, refers to files outside of the folder,
+            or is over a limit.
     """
     return [str(path) for path in _LayerCheck(file).run()]
 
 
 @dataclass
 class _LayerCheck:
-    """Checks the layers and packages that a file is made of.
+    """Checks the layers and packages that a file needs.
 
     Attributes:
         file: the first layer or package.
     """
 
     file: Path
-    _size: int = 0  # bytes so far
-    _count: int = 0  # layers so far
+    _size: int = 0  # bytes of the files checked so far
+    _count: int = 0  # layers and packages checked so far
     _folder: Path = field(init=False)
 
     def __post_init__(self) -> None:
@@ -184,12 +186,12 @@ class _LayerCheck:
     def run(self) -> list[Path]:
         """Return the files of all layers and packages, the file itself first.
 
-        The layers that a layer names are checked in turn. A package is checked with
-        everything that is in it.
+        The layers to which a layer refers are checked in turn. A package is checked
+        with all layers and packages in it.
 
         Raises:
-            FileFormatError: a file is corrupt, names files elsewhere, or is over a
-                limit.
+            FileFormatError: a file is corrupt, refers to files outside of the folder,
+                or is over a limit.
         """
         pending = [self.file.resolve()]
         checked_files = dict[Path, None]()
@@ -210,18 +212,26 @@ class _LayerCheck:
         return list(checked_files)
 
     def _count_layer(self, size: int) -> None:
-        """Count a layer of a size in bytes against the limits."""
+        """Add a layer or package to the totals, and check their limits.
+
+        Args:
+            size: its bytes; 0 in a package, whose bytes are counted already.
+        """
         self._count += 1
         self._size += size
-        expected = f"at most {stored_files.scale_limit(MAX_LAYERS):,} layers"
-        got = "more, or larger ones"
+        max_layers = stored_files.scale_limit(MAX_LAYERS)
+        max_bytes = stored_files.scale_limit(stored_files.LARGEST_FILE)
+        expected = f"at most {max_layers:,} layers of {max_bytes:,} bytes in all"
+        got = "more"
         stored_files.check_most(self.file.name, self._count, MAX_LAYERS, expected, got)
         stored_files.check_most(
             self.file.name, self._size, stored_files.LARGEST_FILE, expected, got
         )
 
     def _find_layer(self, path: Path, name: str) -> Path:
-        """Return the file that a layer names; for a file in a package, the package.
+        """Return the file to which a layer refers.
+
+        For a file in a package that is the package, all of which is checked.
 
         Args:
             path: the layer, to which the name is relative.
@@ -233,16 +243,18 @@ class _LayerCheck:
         """
         outer, inner = Ar.SplitPackageRelativePathOuter(name)
         suffix = Path(outer).suffix.lower()
-        has_odd_name = any(sign in outer for sign in "`[]:\0")
+        # In USD's paths a backtick begins an expression, brackets enclose a path in a
+        # package, and a colon follows a scheme or precedes arguments.
+        has_special_characters = any(character in outer for character in "`[]:\0")
         is_layer = suffix == PACKAGE_SUFFIX or (suffix in LAYER_SUFFIXES and not inner)
         layer_file = None
-        if is_layer and not has_odd_name:
+        if is_layer and not has_special_characters:
             layer_file = Path(os.path.realpath(path.parent / outer))
         if layer_file is None or not reading.is_inside(layer_file, self._folder):
             raise errors.FileFormatError(
                 f"{self.file.name}: names the layer {name[:100]!r}, which is no USD "
-                "file in its folder and is not "
-                "read; put it there, or make one file of all with usdcat --flatten"
+                "file in its folder and is not read; put it there, or make one file of "
+                "all with usdcat --flatten"
             )
         if not layer_file.is_file():
             raise errors.FileFormatError(
@@ -251,7 +263,7 @@ class _LayerCheck:
             )
         if inner:
             try:
-                # only to check that it is there
+                # only to check that it exists
                 read_packaged(Ar.JoinPackageRelativePath(str(layer_file), inner))
             except KeyError:
                 raise errors.FileFormatError(
@@ -267,13 +279,13 @@ class _LayerCheck:
             name: the package, for messages.
             path: its path as USD writes it.
             content: its bytes.
-            depth: 1 for a file of its own, 2 for a package in a package, and so on.
+            depth: 1 for a package in a folder, 2 for a package in a package, and so on.
         """
         stored_files.check_most(
             self.file.name,
             depth,
             MAX_PACKAGE_DEPTH,
-            "packages in at most {} others",
+            "packages nested at most {} deep",
             "more",
         )
         with open_package(name, content) as archive:
@@ -284,13 +296,14 @@ class _LayerCheck:
             for entry in sorted(entries):
                 suffix = Path(entry).suffix.lower()
                 inner_path = Ar.JoinPackageRelativePath(path, entry)
+                # The bytes of an entry were counted with the outermost package.
                 if suffix == PACKAGE_SUFFIX:
-                    self._count_layer(0)
+                    self._count_layer(size=0)
                     self._check_package(
                         f"{name}[{entry}]", inner_path, archive.read(entry), depth + 1
                     )
                 elif suffix in LAYER_SUFFIXES:
-                    self._count_layer(0)  # its bytes are those of the package
+                    self._count_layer(size=0)
                     label = f"{name}[{reading.format_name(entry, quoted=False)}]"
                     for layer in self._iterate_named_layers(inner_path, label):
                         self._check_packaged(name, entry, layer, entries)
@@ -298,12 +311,12 @@ class _LayerCheck:
     def _check_packaged(
         self, package: str, entry: str, layer: str, entries: set[str]
     ) -> None:
-        """Raise FileFormatError if a layer in a package names one outside of it.
+        """Raise FileFormatError if a layer in a package refers to one outside of it.
 
         Args:
             package: name of the package, for messages.
             entry: path of the layer in the package.
-            layer: path that it names.
+            layer: path to which it refers.
             entries: all paths in the package.
         """
         outer, _ = Ar.SplitPackageRelativePathOuter(layer)
@@ -317,13 +330,16 @@ class _LayerCheck:
         if not is_inside or suffix not in (*LAYER_SUFFIXES, PACKAGE_SUFFIX):
             raise errors.FileFormatError(
                 f"{self.file.name}: {package} names the layer {layer[:100]!r}, which "
-                "is no USD file in that package "
-                "and is not read; make the package again with usdzip, or one file of "
-                "all with usdcat --flatten"
+                "is no USD file in that package and is not read; make the package again "
+                "with usdzip, or one file of all with usdcat --flatten"
             )
 
     def _iterate_named_layers(self, path: str, name: str) -> Iterator[str]:
-        """Yield the layers that a layer names, and reject value clips."""
+        """Yield the layers to which a layer refers.
+
+        After the last one, value clips (animation in other files, to which
+        `GetCompositionAssetDependencies` does not refer) are rejected.
+        """
         try:
             layer = Sdf.Layer.FindOrOpen(path)
         except Exception as error:  # Tf.ErrorException, of which there are many kinds
@@ -337,7 +353,7 @@ class _LayerCheck:
         yield from filter(None, layer.GetCompositionAssetDependencies())
 
         def check_clips(spec_path: Any) -> None:
-            """Raise FileFormatError if a prim has value clips, which name files too."""
+            """Raise FileFormatError if a prim has value clips."""
             if not spec_path.IsPrimPath():
                 return
             spec = layer.GetObjectAtPath(spec_path)
@@ -353,14 +369,15 @@ class _LayerCheck:
 def format_error(error: Exception) -> str:
     """Return the message of an error of usd-core in one line.
 
-    It is the last line with a position ("12:5: ..."), or else the last text in
-    quotation marks, or else the last line.
+    It is the last text with a position ("12:5: ..."), or else the last text after a
+    colon and an opening quotation mark, or else the last line of more than three
+    characters. All are cut to 200 characters.
     """
     text = str(error)
-    lines = (
-        re.findall(r":(\d+:\d+: .+)", text)
-        or re.findall(r" : '(.+)", text)
-        or [line.strip() for line in text.splitlines() if len(line.strip()) > 3]
-    )
-    message: str = lines[-1] if lines else type(error).__name__
+    texts_with_position = re.findall(r":(\d+:\d+: .+)", text)
+    quoted_texts = re.findall(r" : '(.+)", text)
+    # Shorter lines are separators.
+    long_lines = [line.strip() for line in text.splitlines() if len(line.strip()) > 3]
+    candidates = texts_with_position or quoted_texts or long_lines
+    message: str = candidates[-1] if candidates else type(error).__name__
     return message[:200]

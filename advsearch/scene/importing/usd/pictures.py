@@ -1,4 +1,4 @@
-"""Decoding of image files to linear values, as textures of OpenUSD use them."""
+"""Decoder of image files to linear values, for textures of OpenUSD."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from PIL import Image
 from advsearch.extend import color, reading
 
 Array = npt.NDArray[Any]
-# First bytes of files.
+# First bytes of image files.
 EXR = b"\x76\x2f\x31\x01"
 RADIANCE = b"#?"
 PNG = b"\x89PNG"
-MAX_SIDE = 1024  # limit of the sides of an image that is computed anew, texels
+MAX_SIDE = 1024  # largest width and height of a decoded image, texels
 MODES_OF_8_BITS = ("1", "L", "LA", "P", "RGB", "RGBA", "CMYK", "YCbCr")
 GREY_MODES = ("1", "L", "LA")
 GAMMA_OF_SRGB = 0.45455
-CHANNELS_OF_PNG = {0: 1, 2: 3, 4: 2, 6: 4}  # by the color type
+CHANNELS_OF_PNG = {0: 1, 2: 3, 4: 2, 6: 4}  # number of channels by color type
 
 
 def is_of_8_bits(data: bytes) -> bool:
@@ -45,7 +45,8 @@ def has_colors_of_8_bits(data: bytes) -> bool:
 def is_marked_srgb(data: bytes) -> bool:
     """Return whether an image is sRGB for the sourceColorSpace auto.
 
-    It is if its file says so, or else if it has colors of 8 bits.
+    It is if its file states so. If the file states nothing, it is if the image has
+    colors of 8 bits.
     """
     try:
         with Image.open(io.BytesIO(data), formats=reading.FORMATS) as image:
@@ -68,7 +69,8 @@ def decode_image(data: bytes, path: str, *, is_srgb: bool) -> Array:
     Args:
         data: the file.
         path: its path, for messages.
-        is_srgb: whether its values are sRGB, and not linear.
+        is_srgb: whether its values are sRGB, and not linear. This holds for all
+            formats, also for .exr, which is usually linear.
 
     Raises:
         OSError, ValueError, SyntaxError, EOFError, FileFormatError: it is no image,
@@ -95,7 +97,7 @@ def decode_image(data: bytes, path: str, *, is_srgb: bool) -> Array:
 def _decode_image(data: bytes, path: str, is_srgb: bool) -> Array:
     """Return the stored values (H, W, 4) in [0, 1] of an image file.
 
-    Grey integers are taken for 16 bits, and divided by 65535. Grey floats stay as they
+    Grey integers of more than 8 bits are divided by 65535. Grey floats stay as they
     are.
 
     Args:
@@ -105,14 +107,18 @@ def _decode_image(data: bytes, path: str, is_srgb: bool) -> Array:
     """
     with Image.open(io.BytesIO(data), formats=reading.FORMATS) as image:
         reading.check_decodable(image, path)
-        if image.mode == "F" or image.mode.startswith("I"):
+        # Pillow opens an image of 16-bit grey as "I;16" or "I", and of floats as "F".
+        is_float = image.mode == "F"
+        is_integer = image.mode.startswith("I")
+        if is_float or is_integer:
             grey = np.nan_to_num(np.asarray(image, np.float32))
-            if image.mode != "F":
+            if is_integer:
                 grey = grey / np.float32(65535.0)
             return np.stack([grey, grey, grey, np.ones_like(grey)], axis=2)
         if _is_png_of_16_bits(data):
             return _decode_png_of_16_bits(data, image.size)
-        # Numbers are averaged down later, as they are.
+        # Colors are averaged down here, since this needs less memory. `decode_image`
+        # averages numbers down in float.
         limit = MAX_SIDE if is_srgb else None
         return reading.pictures.load_display_image(
             image, limit, path, keep_alpha=True, is_raw=not is_srgb
@@ -131,7 +137,7 @@ def _decode_radiance(data: bytes, path: str) -> Array:
     return np.concatenate([colors, np.ones_like(colors[:, :, :1])], axis=2)
 
 
-# ---- PNG with 16 bits a channel, of which Pillow reads 8 ----
+# ---- PNG with 16 bits a channel, which Pillow reduces to 8 bits ----
 
 
 def _is_png_of_16_bits(data: bytes) -> bool:
@@ -176,9 +182,7 @@ def _decode_png_of_16_bits(data: bytes, size: tuple[int, int]) -> Array:
 
 
 def _expand_to_rgba(values: Array) -> Array:
-    """Return values (H, W, 4) of an image with 1 to 4 channels: grey or color,
-    alpha.
-    """
+    """Return values (H, W, 4) of an image with grey or color, and perhaps alpha."""
     (height, width, channels) = values.shape
     alpha = np.ones((height, width, 1), np.float32)
     if channels in (2, 4):
@@ -231,9 +235,11 @@ def _unfilter(filters: Array, filtered: Array) -> Array:
     # With zeros above and to the left; 16 bits hold the sum of two bytes.
     pixels = np.zeros((height + 1, width + 1, pixel_size), np.int16)
     for diagonal in range(height + width - 1):
-        # the rows that the diagonal row + column = diagonal crosses
-        row = np.arange(max(0, diagonal - width + 1), min(height, diagonal + 1))
+        # the pixels of the image with row + column == diagonal
+        first_row = max(0, diagonal - width + 1)
+        row = np.arange(first_row, min(height, diagonal + 1))
         column = diagonal - row
+        # `pixels` has one more row and column in front.
         left = pixels[row + 1, column]
         above = pixels[row, column + 1]
         kind = filters[row][:, None]
@@ -251,9 +257,9 @@ def _unfilter(filters: Array, filtered: Array) -> Array:
 
 
 def _paeth(left: Array, above: Array, corner: Array) -> Array:
-    """Return the Paeth predictor: the neighbour closest to left + above - corner.
+    """Return the Paeth predictor: the neighbor closest to left + above - corner.
 
-    Of equally close ones that to the left comes first, then the one above.
+    If several are equally close, the left one is preferred, then the one above.
     """
     estimate = left + above - corner
     to_left = np.abs(estimate - left)

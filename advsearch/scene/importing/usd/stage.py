@@ -1,8 +1,8 @@
 """Converter of OpenUSD stages to binary glTF, with `usd-core`.
 
-This module runs in a separate process. Layers are checked before they are composed: all
-that they name has to be a layer in the folder of the first one or below. What our
-reader of glTF cannot represent is named in `asset.extras` of the file.
+This module runs in a separate process. Layers are checked before they are composed:
+they may only refer to layers in or below the folder of the first one. Notes on prims and
+inputs that are not converted are in `asset.extras` of the file.
 """
 
 from __future__ import annotations
@@ -31,10 +31,12 @@ from advsearch.scene.importing.usd.surface import (
     UsdSurfaces,
 )
 
-# Limit of the colors, and of the opacities, of faces that become materials.
+# Limit of the different colors, and of the different opacities, of a mesh's faces that
+# become materials.
 MAX_TINTS = 16
+NO_TINT = -1.0  # entry of a tint without a color or an opacity
 PARTICLES_PREFIX = "ParticleField"  # prefix of the types of Gaussian splats
-PURPOSES = ("default", "render")
+PURPOSES = ("default", "render")  # purposes of prims that are converted
 Array = npt.NDArray[Any]
 
 
@@ -43,8 +45,9 @@ class MeshValues(NamedTuple):
 
     Attributes:
         values: (N, width).
-        interpolation: what a value is of, as USD calls it: the mesh ("constant"), a
-            face ("uniform"), a point ("vertex", "varying") or a corner ("faceVarying").
+        interpolation: USD's word for the elements that have a value each: the mesh
+            ("constant"), faces ("uniform"), points ("vertex", "varying") or corners
+            ("faceVarying").
     """
 
     values: Array
@@ -55,11 +58,11 @@ class MeshFaces(NamedTuple):
     """The faces of a mesh.
 
     Attributes:
-        points: (P, 3).
+        points: (P, 3) positions.
         counts: (F,) the number of corners of each face.
-        corners: (C,) the points of the corners of all faces.
-        triangles: (T, 3) what faces are divided into, as rows of `corners`.
-        face: (T,) of each triangle.
+        corners: (C,) indices of the points of the corners of all faces.
+        triangles: (T, 3) triangles of the faces, as indices into `corners`.
+        face: (T,) the face of each triangle.
     """
 
     points: Array
@@ -75,7 +78,7 @@ def main(source: str, target: str, folder: str) -> None:
     Args:
         source: the USD file.
         target: the glTF file.
-        folder: where a package is unpacked.
+        folder: the folder in which a package is unpacked.
 
     Raises:
         FileFormatError: the file cannot be converted; the message begins with its name.
@@ -85,11 +88,16 @@ def main(source: str, target: str, folder: str) -> None:
         file = unpack_package(file, Path(folder))
     layers = check_layers(file)
     stage = Usd.Stage.Open(str(file))
-    conversion = Conversion(stage, file.parent.resolve(), Path(source).name, layers)
+    conversion = Conversion(
+        stage,
+        folder=file.parent.resolve(),
+        source=Path(source).name,
+        files_read=layers,  # images are added
+    )
     Path(target).write_bytes(conversion.convert())
-    # Files of a package are temporary.
-    files_read = conversion.files_read if file == Path(source) else []
-    print(json.dumps(files_read))
+    # Files of a package are temporary, and the caller knows the package itself.
+    is_unpacked = file != Path(source)
+    print(json.dumps([] if is_unpacked else conversion.files_read))
 
 
 # ---- The stage ----
@@ -99,21 +107,20 @@ def main(source: str, target: str, folder: str) -> None:
 class Conversion:
     """Converts a stage to glTF.
 
-    Attributes beside the fields:
-        header: the JSON part of the file.
+    Attributes that are no fields:
+        header: the JSON part of the glTF file.
         lights: entries of its lights.
-        unit: unit of the stage in metres, once `convert` has begun.
+        unit: unit of the stage in meters; `convert` sets it.
     """
 
-    stage: Any
-    folder: Path  # where its files are
+    stage: Any  # the `Usd.Stage`
+    folder: Path  # folder of its files
     source: str  # name of the file, for messages
     files_read: list[str]  # files that were read
-    note_counts: Counter[str] = field(
-        default_factory=Counter
-    )  # notes on what is left out
+    # Notes on what is left out, and how often each occurs.
+    note_counts: Counter[str] = field(default_factory=Counter)
     buffer: reading.GlbBuffer = field(default_factory=reading.GlbBuffer)
-    triangles: int = 0
+    triangles: int = 0  # number of triangles so far
 
     def __post_init__(self) -> None:
         """Start an empty document, and find the skeletons of the stage."""
@@ -158,8 +165,8 @@ class Conversion:
     def convert(self) -> bytes:
         """Return the stage as a binary glTF file.
 
-        Node 0 turns and scales the stage to glTF's axes and metres; all prims are below
-        it.
+        Node 0 rotates and scales the stage to glTF's axes and meters. All prims are
+        below it.
 
         Raises:
             FileFormatError: there is no mesh, only Gaussian splats, or a prim cannot be
@@ -167,31 +174,28 @@ class Conversion:
         """
         self.unit = self._read_unit()
         if self.stage.HasAuthoredTimeCodeRange():
-            self._note("is animated; what is there first is read")
+            self._note("is animated; its first frame is read")
         header = self.header
         header["nodes"].append(self._make_stage_node())
         self._add_nodes()
-        has_splats = any(
-            str(prim.GetTypeName()).startswith(PARTICLES_PREFIX)
-            for prim in self._iterate_prims()
-        )
+        has_splats = any(map(_is_splats, self._iterate_prims()))
         header["scenes"] = [{"nodes": [0]}]
-        header["scene"] = 0
         if has_splats and not header["meshes"]:
             raise errors.FileFormatError(
-                f"{self.source}: expected a mesh with faces, got Gaussian splats, a "
-                f"model that {reading.SPLATS_ADVICE}"
+                f"{self.source}: expected a mesh with faces, got Gaussian splats: "
+                f"{reading.SPLATS_ADVICE}"
             )
         if self.lights:
             header["extensions"] = {"KHR_lights_punctual": {"lights": self.lights}}
-        header["asset"]["extras"] = {"left_out": self._format_notes(has_splats)}
-        # glTF has no empty lists
+        notes = self._format_notes(has_splats)
+        header["asset"]["extras"] = {"left_out": notes}
+        # glTF has no empty lists.
         return self.buffer.to_bytes(
-            {key: value for key, value in header.items() if value or key == "asset"}
+            {key: value for key, value in header.items() if value}
         )
 
     def _add_nodes(self) -> None:
-        """Add the prims below the stage's node, and note what is left out of them."""
+        """Add the prims below the stage's node, and note those that are left out."""
         name_counts = Counter(prim.GetName() for prim in self._iterate_prims())
         node_of_path: dict[Any, int] = {}
         for prim in self._iterate_prims():
@@ -204,7 +208,7 @@ class Conversion:
                 del node["children"]
 
     def _make_stage_node(self) -> dict[str, Any]:
-        """Return the node that turns and scales the stage to glTF's axes and metres."""
+        """Return the node that rotates and scales the stage to glTF's axes and meters."""
         up_rotation = _TO_Y_UP
         if UsdGeom.GetStageUpAxis(self.stage) == "Y":
             up_rotation = np.eye(4)
@@ -213,26 +217,27 @@ class Conversion:
         return {"name": "stage", "matrix": matrix.T.ravel().tolist(), "children": []}
 
     def _read_unit(self) -> float:
-        """Return the unit of the stage in metres."""
+        """Return the unit of the stage in meters."""
         unit = float(UsdGeom.GetStageMetersPerUnit(self.stage))
         if not 0.0 < unit < math.inf:
             raise errors.FileFormatError(
                 f"{self.source}: expected metersPerUnit greater than 0, got {unit}"
             )
         if not UsdGeom.StageHasAuthoredMetersPerUnit(self.stage):
-            self._note("does not say its unit, which USD takes for centimetres")
+            self._note("does not state its unit; USD's default is centimetres")
         return unit
 
     def _note_left_out(self, prim: Any) -> None:
-        """Note what is left out of a prim."""
+        """Note geometry, blend shapes and animation of a prim that are left out."""
         kind = str(prim.GetTypeName())
         is_other_geometry = prim.IsA(UsdGeom.Gprim) and not prim.IsA(UsdGeom.Mesh)
-        if not kind.startswith(PARTICLES_PREFIX):
-            if is_other_geometry or kind == "PointInstancer":
-                self._note(
-                    f"has a {kind}, which is no mesh: left out; make meshes of "
-                    "it where the file is from"
-                )
+        is_left_out = is_other_geometry or kind == "PointInstancer"
+        # Splats have one note for the file, which `_format_notes` adds.
+        if is_left_out and not _is_splats(prim):
+            self._note(
+                f"has a {kind}, which is no mesh: left out; convert it to meshes in "
+                "the program that made the file"
+            )
         if prim.HasAPI(UsdSkel.BindingAPI):
             blend_shapes = UsdSkel.BindingAPI(prim).GetBlendShapesAttr()
             if blend_shapes.HasAuthoredValue():
@@ -243,21 +248,22 @@ class Conversion:
     def _add_node(
         self, prim: Any, is_unique: bool, node_of_path: dict[Any, int]
     ) -> None:
-        """Add a prim as a node, with its transform and what it draws.
+        """Add a prim as a node, with its transform and its mesh, camera or light.
 
-        Its parent is the nearest ancestor that is a node; the stage's own node if the
+        Its parent is the nearest ancestor that is a node, or the stage's node if the
         prim resets its transform, or if a skeleton poses it in the world.
 
         Args:
             prim: the prim.
-            is_unique: whether its name is; otherwise the node is named by its path.
+            is_unique: whether its name is unique; otherwise the node is named by its
+                path.
             node_of_path: nodes of prims so far, by path; the prim is added.
         """
         nodes = self.header["nodes"]
         path = prim.GetPath()
         name = prim.GetName() if is_unique else str(path).lstrip("/")
         node: dict[str, Any] = {"name": name, "children": []}
-        parent = 0
+        parent = 0  # the stage's node
         xformable = UsdGeom.Xformable(prim)
         if xformable:
             # USD's rows are glTF's columns.
@@ -273,7 +279,7 @@ class Conversion:
                 (node_of_path[at] for at in ancestors if at in node_of_path), 0
             )
         skeleton_matrix = self._add_content(prim, node)
-        if skeleton_matrix is not None:  # it poses the mesh in the world
+        if skeleton_matrix is not None:  # a skeleton poses the mesh in the world
             node["matrix"] = skeleton_matrix.ravel().tolist()
             parent = 0
         node_of_path[path] = len(nodes)
@@ -281,7 +287,7 @@ class Conversion:
         nodes.append(node)
 
     def _format_notes(self, has_splats: bool) -> list[str]:
-        """Return the sentences about what is left out, at most 100."""
+        """Return at most 100 notes on what is left out, whose subject is the file."""
         notes = [
             sentence if count == 1 else f"{sentence} ({count:,} times)"
             for sentence, count in self.note_counts.items()
@@ -289,13 +295,12 @@ class Conversion:
         if has_splats:
             notes.insert(
                 0,
-                "has Gaussian splats, which are left out: a model that "
-                f"{reading.SPLATS_ADVICE}",
+                f"has Gaussian splats, which are left out: {reading.SPLATS_ADVICE}",
             )
         return notes[:100]
 
     def _note(self, what: str) -> None:
-        """Note something that is left out."""
+        """Count a note on something that is left out: a predicate of the file."""
         self.note_counts[what] += 1
 
     def _add_content(self, prim: Any, node: dict[str, Any]) -> Array | None:
@@ -313,11 +318,11 @@ class Conversion:
             return None
         imageable = UsdGeom.Imageable(prim)
         if imageable.ComputeVisibility(FIRST_TIME) == UsdGeom.Tokens.invisible:
-            self._note("has something invisible, which is left out")
+            self._note("has invisible prims, which are left out")
         elif imageable.ComputePurpose() not in PURPOSES:
             self._note(
-                "has something for the purpose "
-                f"{imageable.ComputePurpose()!r}, which is left out"
+                f"has prims with the purpose {imageable.ComputePurpose()!r}, which are "
+                "left out"
             )
         elif is_mesh:
             return self._add_mesh(prim, node)
@@ -386,11 +391,11 @@ class Conversion:
             entry = _make_point_light(prim)
             # the radius is in the stage's unit
             intensity = _integrate_over_sphere(prim, radiance) * self.unit**2
-            self._note("has a SphereLight, which shines from its middle here")
+            self._note("has a SphereLight, which is a point light at its center here")
         else:
             self._note(
-                f"has a {kind}, which is left out; `environment` and "
-                "`controls=light` light a scene"
+                f"has a {kind}, which is left out; light the scene with `environment` "
+                "or `controls=light`"
             )
             return
         if not _is_valid_power(np.array([*color, intensity])):
@@ -445,7 +450,8 @@ class Conversion:
     ) -> list[dict[str, Any]]:
         """Return one glTF primitive for each material and tint of a mesh.
 
-        A tint is a color and opacity that faces have from the mesh's own values.
+        A tint is a color and opacity of faces from primvars, which are values of the
+        mesh.
 
         Args:
             prim: prim of the mesh.
@@ -458,18 +464,16 @@ class Conversion:
         )
         primitives = []
         n_faces = len(mesh_faces.counts)
-        for bound, bound_faces in self._iterate_materials(prim, mesh, n_faces):
+        for bound, faces in self._iterate_materials(prim, mesh, n_faces):
+            # The faces of a material are divided further by their tint.
             for material, colors, tinted_faces in self._split_by_tint(
-                bound, primvars, bound_faces, mesh_faces
+                bound, primvars, faces, mesh_faces
             ):
                 is_selected = np.isin(mesh_faces.face, tinted_faces)
                 if not is_selected.any():
-                    continue
-                attributes = {
-                    "NORMAL": normals,
-                    "COLOR_0": colors,
-                    **self._read_layouts(primvars, bound.layouts),
-                }
+                    continue  # all are holes, or have fewer than 3 corners
+                uvs_by_name = self._read_layouts(primvars, bound.layouts)
+                attributes = {"NORMAL": normals, "COLOR_0": colors, **uvs_by_name}
                 entry = self._make_primitive(
                     str(prim.GetPath()), mesh_faces, is_selected, attributes
                 )
@@ -479,11 +483,11 @@ class Conversion:
     def _check_corners(
         self, prim: Any, n_points: int, counts: Array, corners: Array
     ) -> None:
-        """Raise FileFormatError if faces refer to points that are not there.
+        """Raise FileFormatError if faces refer to points that do not exist.
 
         Args:
             prim: prim of the mesh, for messages.
-            n_points: how many points the mesh has.
+            n_points: number of points of the mesh.
             counts: (F,) number of corners of each face.
             corners: (C,) the points of the corners of all faces.
         """
@@ -543,8 +547,8 @@ class Conversion:
                 normals = MeshValues(values, str(mesh.GetNormalsInterpolation()))
         if _get_first(mesh, "SubdivisionScheme") != UsdGeom.Tokens.none:
             self._note(
-                "has a mesh that is to be subdivided, which is shown as it is, "
-                "and smooth"
+                "has a mesh with a subdivision scheme, which is not subdivided, but "
+                "shaded smooth"
             )
             normals = MeshValues(_compute_smooth_normals(points, triangles), "vertex")
         return normals
@@ -566,26 +570,26 @@ class Conversion:
             path: path of the prim, for messages.
             mesh_faces: the faces of the mesh.
             is_selected: (T,) which triangles the primitive has, one at least.
-            attributes: attributes by the names of glTF; None for none.
+            attributes: attributes by the names of glTF; None if the mesh lacks one.
 
         Raises:
             FileFormatError: an attribute has fewer values than the mesh needs.
         """
-        index_columns = self._index_values(path, mesh_faces, is_selected, attributes)
-        # Corners with the same values become one vertex.
-        vertices, vertex_of_corner = np.unique(
-            index_columns, axis=0, return_inverse=True
+        # For each corner a row with the index of its point, and the index of its value
+        # in each attribute.
+        corner_indices = self._index_values(path, mesh_faces, is_selected, attributes)
+        vertex_indices, vertex_of_corner = np.unique(
+            corner_indices, axis=0, return_inverse=True
         )
+        positions = mesh_faces.points[vertex_indices[:, 0]].astype(np.float32)
         accessors = {
-            "POSITION": self.buffer.add_accessor(
-                mesh_faces.points[vertices[:, 0]].astype(np.float32),
-                "VEC3",
-                bounds=True,
-            )
+            "POSITION": self.buffer.add_accessor(positions, "VEC3", bounds=True)
         }
-        for column, (name, attribute) in enumerate(attributes.items(), 1):
+        # The columns after the first are those of all attributes, also of missing ones.
+        for column, (name, attribute) in enumerate(attributes.items(), start=1):
             if attribute is not None:
-                values = attribute.values[vertices[:, column]].astype(np.float32)
+                value_index = vertex_indices[:, column]
+                values = attribute.values[value_index].astype(np.float32)
                 accessor_type = f"VEC{values.shape[1]}"
                 accessors[name] = self.buffer.add_accessor(values, accessor_type)
         index_accessor = self.buffer.add_accessor(
@@ -605,16 +609,17 @@ class Conversion:
         is_selected: Array,
         attributes: dict[str, MeshValues | None],
     ) -> Array:
-        """Return which values the corners of selected triangles have, (3 T, columns).
+        """Return the indices of the values of selected triangles' corners.
 
-        The first column is the index of the point. Each attribute has a column with the
-        index of its value. It is 0 if the attribute has one value for all, or none.
+        The result is (3 T, columns). The first column is the index of the point. Then
+        each attribute has a column with the index of its value. The index is 0 if the
+        attribute is constant, or missing.
 
         Args:
             path: path of the prim, for messages.
             mesh_faces: the faces of the mesh.
             is_selected: (T,) which triangles are selected.
-            attributes: attributes by the names of glTF; None for none.
+            attributes: attributes by the names of glTF; None if the mesh lacks one.
 
         Raises:
             FileFormatError: an attribute has fewer values than the mesh needs.
@@ -647,7 +652,8 @@ class Conversion:
         """Return texture coordinates (N, 2) as glTF has them, v down, or None.
 
         The material's transform of texture coordinates is applied. If the mesh lacks
-        the primvar, the fallback is used for all of it; without one the result is None.
+        the primvar, the layout's fallback is used everywhere. Without a fallback the
+        result is None.
 
         Args:
             primvars: primvars of the mesh.
@@ -664,8 +670,8 @@ class Conversion:
             if layout.primvar:
                 name = layout.primvar[:50]
                 self._note(
-                    f"has a mesh without the primvar {name!r} of a texture, of "
-                    "which one texel is shown"
+                    f"has a mesh without the primvar {name!r} of a texture, which has "
+                    "the color of one texel"
                 )
             values = MeshValues(np.array([layout.fallback]), "constant")
         transformed = layout.transform(values.values)
@@ -675,9 +681,7 @@ class Conversion:
     def _read_layouts(
         self, primvars: Any, layouts: Iterable[TextureLayout]
     ) -> dict[str, MeshValues | None]:
-        """Return the texture coordinates of layouts, by the names that glTF has for
-        them.
-        """
+        """Return the texture coordinates of layouts by glTF's names: "TEXCOORD_0"."""
         return {
             f"TEXCOORD_{index}": self._read_uvs(primvars, layout)
             for index, layout in enumerate(layouts)
@@ -692,15 +696,15 @@ class Conversion:
     ) -> Iterator[tuple[int, MeshValues | None, Array]]:
         """Split faces with a material by their colors and opacities.
 
-        A material may take both from primvars, values of the mesh. If faces have at
-        most `MAX_TINTS` different colors, each color becomes a glTF material. If there
-        are more, or if colors change within a face, they become vertex colors.
+        A material may take both from primvars, which are values of the mesh. If faces
+        have at most `MAX_TINTS` different colors, each color becomes a glTF material.
+        If there are more, or if colors change within a face, they become vertex colors.
         Opacities always become materials, since our reader ignores the opacity of
         glTF's vertex colors.
 
         Args:
             bound: the material.
-            primvars: those of the mesh.
+            primvars: primvars of the mesh.
             faces: (F,) faces with the material.
             mesh_faces: all faces of the mesh.
 
@@ -714,44 +718,40 @@ class Conversion:
             self._note_default_material(primvars)
         colors = _read_primvar(primvars, bound.color)
         opacities = _read_primvar(primvars, bound.opacity)
-        opacity = self._compute_face_opacities(opacities, faces, mesh_faces)
-        # (F, 3) the color of each face that its material gets; NaN: it gets none
-        tints = np.full((len(faces), 3), np.nan)
-        vertex_colors = colors
-        if colors is not None and colors.interpolation in ("constant", "uniform"):
-            face_colors = _compute_face_values(colors, faces, mesh_faces)
-            if len(np.unique(face_colors, axis=0)) <= MAX_TINTS:
-                tints = face_colors
-                vertex_colors = None
-        # (F, 4) color and opacity of each face; -1 where the material's hold
-        tint_keys = np.nan_to_num(np.concatenate([tints, opacity], axis=1), nan=-1.0)
-        for key in np.unique(tint_keys, axis=0):
-            is_selected = (tint_keys == key).all(axis=1)
-            color = None if colors is None else key[:3]
-            if vertex_colors is not None:
-                color = np.ones(3)  # it is multiplied by vertex colors
-            key_opacity = None if key[3] < 0.0 else key[3]
-            material = self._surfaces.make_tinted(bound, color, key_opacity)
-            yield material, vertex_colors, faces[is_selected]
+        # (F, 3) and (F, 1), or full of `NO_TINT`
+        face_colors = _find_face_colors(colors, faces, mesh_faces)
+        face_opacities = self._compute_face_opacities(opacities, faces, mesh_faces)
+        vertex_colors = None
+        if face_colors is None:
+            vertex_colors = colors
+            face_colors = np.full((len(faces), 3), NO_TINT)
+        face_tints = np.concatenate([face_colors, face_opacities], axis=1)
+        for tint in np.unique(face_tints, axis=0):
+            material = self._surfaces.make_tinted(
+                bound,
+                color=_select_tint_color(tint, colors, vertex_colors),
+                opacity=None if opacities is None else tint[3],
+            )
+            has_tint = (face_tints == tint).all(axis=1)
+            yield material, vertex_colors, faces[has_tint]
 
     def _note_default_material(self, primvars: Any) -> None:
         """Note that a mesh has no material, and the color that it has instead."""
         has_color = primvars.FindPrimvarWithInheritance("displayColor").HasValue()
-        color_text = " and displayColor: grey (0.18)"
-        if has_color:
-            color_text = ": of its displayColor"
+        lacking = "material" if has_color else "material and displayColor"
+        color_text = "its displayColor" if has_color else "grey (0.18)"
         self._note(
-            f"has a mesh without material{color_text}, with roughness 0.5 "
-            "and no metal, as USD's default"
+            f"has a mesh without {lacking}: it has USD's default material, {color_text} "
+            "with roughness 0.5 and no metal"
         )
 
     def _compute_face_opacities(
         self, opacities: MeshValues | None, faces: Array, mesh_faces: MeshFaces
     ) -> Array:
-        """Return the opacity of each face, (F, 1); NaN where the material's holds.
+        """Return the opacity of each face, (F, 1); `NO_TINT` if there is no primvar.
 
-        They are rounded to 1/255, so that few are different. If there are more than
-        `MAX_TINTS`, they are replaced by their mean, with a note.
+        Opacities are rounded to 1/255, so that few are different. If there are more
+        than `MAX_TINTS`, they are replaced by their mean, with a note.
 
         Args:
             opacities: opacities of the primvar, or None.
@@ -759,16 +759,16 @@ class Conversion:
             mesh_faces: all faces of the mesh.
         """
         if opacities is None:
-            return np.full((len(faces), 1), np.nan)
+            return np.full((len(faces), 1), NO_TINT)
         face_values = _compute_face_values(opacities, faces, mesh_faces)
         opacity = np.round(face_values.clip(0.0, 1.0) * 255.0) / 255.0
         is_of_vertices = opacities.interpolation not in ("constant", "uniform")
         if is_of_vertices and len(np.unique(opacities.values)) > 1:
-            self._note("has an opacity of vertices, of which faces have the mean")
+            self._note("has an opacity of vertices; faces have its mean")
         if len(np.unique(opacity)) > MAX_TINTS:
             self._note(
-                f"has more than {MAX_TINTS} opacities of faces, of which the "
-                "mean is read"
+                f"has more than {MAX_TINTS} opacities of faces, which are replaced by "
+                "their mean"
             )
             opacity = np.full_like(opacity, opacity.mean())
         return opacity
@@ -778,13 +778,13 @@ class Conversion:
     ) -> Iterator[tuple[BoundMaterial, Array]]:
         """Yield the materials of a mesh and their faces.
 
-        A face has the material of the first subset that contains it, or else the mesh's
-        own material.
+        A face has the material of the first subset that contains it, or else the
+        material of the mesh.
 
         Args:
             prim: prim of the mesh.
             mesh: the same as USD's mesh.
-            faces: how many faces the mesh has.
+            faces: number of faces of the mesh.
 
         Yields:
             A material, and the indices of its faces.
@@ -805,8 +805,8 @@ class Conversion:
 
         Returns:
             The matrix (4, 4) from the skeleton to the world, for row vectors, and the
-            points (P, 3) in the skeleton's coordinates. If the mesh has no skeleton, or
-            one that cannot be posed, None and the points as they are.
+            points (P, 3) in the skeleton's coordinates. If the mesh has no skeleton
+            that can be posed: None, and the points as they are.
         """
         skinning = self._skins.GetSkinningQuery(prim)
         if not skinning or not skinning.HasJointInfluences():
@@ -828,13 +828,14 @@ class Conversion:
 
 
 def _compute_joint_transforms(skinning: Any, skeleton_query: Any) -> list[Any] | None:
-    """Return how each joint of a skin moves points at rest, or None if that is unknown.
+    """Return the matrix by which each joint of a skin moves points at rest, or None.
 
-    A joint moves points by the inverse of its bind transform, followed by its rest
-    transform. USD's matrices multiply row vectors, so the first one is on the left.
+    It is None if the skeleton lacks transforms. A joint moves points by the inverse of
+    its bind transform, followed by its rest transform. USD's matrices multiply row
+    vectors, so the first one is on the left.
 
     Args:
-        skinning: query of the skin, which may have its joints in an order of its own.
+        skinning: query of the skin, which may have another order of joints.
         skeleton_query: query of the skeleton.
     """
     rest_transforms = skeleton_query.ComputeJointSkelTransforms(FIRST_TIME, atRest=True)
@@ -851,13 +852,56 @@ def _compute_joint_transforms(skinning: Any, skeleton_query: Any) -> list[Any] |
     return list(transforms)
 
 
+def _is_splats(prim: Any) -> bool:
+    """Return whether a prim has Gaussian splats."""
+    return str(prim.GetTypeName()).startswith(PARTICLES_PREFIX)
+
+
+def _find_face_colors(
+    colors: MeshValues | None, faces: Array, mesh_faces: MeshFaces
+) -> Array | None:
+    """Return the color of each face, (F, 3), if they can become materials.
+
+    The result is None if there are no colors, if they may change within a face, or if
+    more than `MAX_TINTS` are different.
+
+    Args:
+        colors: colors of the primvar, or None.
+        faces: (F,) the faces.
+        mesh_faces: all faces of the mesh.
+    """
+    if colors is None or colors.interpolation not in ("constant", "uniform"):
+        return None
+    face_colors = _compute_face_values(colors, faces, mesh_faces)
+    if len(np.unique(face_colors, axis=0)) > MAX_TINTS:
+        return None
+    return face_colors
+
+
+def _select_tint_color(
+    tint: Array, colors: MeshValues | None, vertex_colors: MeshValues | None
+) -> list[float] | None:
+    """Return the color (3,) of a material with a tint (4,); None for its own color.
+
+    Args:
+        tint: color and opacity.
+        colors: colors of the primvar, or None.
+        vertex_colors: the same colors, if they become vertex colors.
+    """
+    if colors is None:
+        return None
+    if vertex_colors is not None:
+        return [1.0, 1.0, 1.0]  # it is multiplied by the vertex colors
+    return list(map(float, tint[:3]))
+
+
 def _is_valid_power(powers: Array) -> bool:
-    """Return whether all of some powers (N,) are finite and at least 0."""
+    """Return whether all powers (N,) are finite and at least 0."""
     return bool((np.isfinite(powers) & (powers >= 0.0)).all())
 
 
 def _read_light_color(light: Any) -> Array:
-    """Return the linear color (3,) of a light: its own times that of its temperature."""
+    """Return the linear color (3,) of a light: its color times that of its temperature."""
     color = np.array(_get_first(light, "Color"), np.float64)
     if _get_first(light, "EnableColorTemperature"):
         temperature = _get_first(light, "ColorTemperature")
@@ -885,40 +929,42 @@ def _make_point_light(prim: Any) -> dict[str, Any]:
 def _compute_face_values(
     primvar: MeshValues, faces: Array, mesh_faces: MeshFaces
 ) -> Array:
-    """Return one value (C,) for each of some faces, as (F, C).
+    """Return the value (C,) of each of F faces, as (F, C).
 
-    Values of points or corners are averaged over the face. If there are too few values,
-    the last one is repeated.
+    Values of points or corners are averaged over the face. If a corrupt mesh has too
+    few values, the last one is repeated.
 
     Args:
         primvar: values (N, C) of the mesh.
         faces: (F,) faces.
         mesh_faces: all faces of the mesh.
     """
-    values, interpolation = primvar
-    counts = mesh_faces.counts
-    if interpolation in ("constant", "uniform"):
-        value_index = np.zeros(len(faces), np.int64)
-        if interpolation == "uniform":
-            value_index = faces
-        return np.asarray(values[np.minimum(value_index, len(values) - 1)])
+    values = primvar.values
+    last_index = len(values) - 1
+    if primvar.interpolation == "constant":
+        return np.asarray(values[np.zeros(len(faces), np.int64)])
+    if primvar.interpolation == "uniform":
+        return np.asarray(values[np.minimum(faces, last_index)])
     corner_index = np.arange(len(mesh_faces.corners))
-    if interpolation in ("vertex", "varying"):
+    if primvar.interpolation in ("vertex", "varying"):
         corner_index = mesh_faces.corners
-    corner_values = values[np.minimum(corner_index, len(values) - 1)]
-    # A row of zeros is appended: the last faces may have no corners, so that they begin
-    # past the last row, where `reduceat` needs one.
+    corner_values = values[np.minimum(corner_index, last_index)]
+    # `reduceat` sums the rows from the start of a face to that of the next one. A row of
+    # zeros is appended, since faces without corners at the end begin after the last
+    # row. Other faces without corners get a wrong value, but have no triangles.
     padded_values = np.concatenate([corner_values, np.zeros((1, values.shape[1]))])
+    counts = mesh_faces.counts
     starts = np.cumsum(counts) - counts
     sums = np.add.reduceat(padded_values, starts)
-    return np.asarray((sums / np.maximum(counts, 1)[:, None])[faces])
+    means = sums / np.maximum(counts, 1)[:, None]
+    return np.asarray(means[faces])
 
 
 def _compute_illuminance(prim: Any, radiance: float) -> float:
-    """Return the lux of a distant light on what faces it.
+    """Return the lux of a distant light on a surface that faces it.
 
     Its radiance is integrated over the cone of directions that it covers: L pi sin^2 of
-    the half angle. A "normalised" light of USD states its illuminance directly.
+    the half angle. A "normalized" light of USD states its illuminance directly.
     """
     angle = _get_first(UsdLux.DistantLight(prim), "Angle")
     half_angle = math.radians(angle) / 2.0
@@ -928,9 +974,9 @@ def _compute_illuminance(prim: Any, radiance: float) -> float:
 
 
 def _integrate_over_sphere(prim: Any, radiance: float) -> float:
-    """Return the radiance of a spherical light times the disk that it is seen as.
+    """Return the radiance of a spherical light times the area of its visible disk.
 
-    The disk is pi r^2. A "normalised" light of USD has a power that does not depend on
+    The area is pi r^2. A "normalized" light of USD has a power that does not depend on
     its size: its radiance is divided by the area of the sphere, 4 pi r^2.
     """
     if _get_first(UsdLux.LightAPI(prim), "Normalize"):
@@ -939,7 +985,7 @@ def _integrate_over_sphere(prim: Any, radiance: float) -> float:
     return radiance * (math.pi * radius**2)
 
 
-# From a stage whose z is up to glTF, whose y is.
+# Rotation from a stage with z up to glTF, where y is up.
 _TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, -1.0, 0, 0], [0, 0, 0, 1.0]])
 
 
@@ -957,9 +1003,9 @@ def _flatten_primvar(primvar: Any, width: int) -> MeshValues | None:
 
 
 def _read_primvar(primvars: Any, use: PrimvarUse | None) -> MeshValues | None:
-    """Return the values (N, C) of a primvar that a surface uses, or of its fallback.
+    """Return the values (N, C) of a primvar that a surface uses, or its fallback.
 
-    None if the surface uses none.
+    The result is None if the surface uses no primvar.
     """
     if use is None:
         return None

@@ -59,20 +59,20 @@ NO_BIAS = (0.0, 0.0, 0.0, 0.0)
 NORMAL_SCALE = (2.0, 2.0, 2.0, 1.0)
 NORMAL_BIAS = (-1.0, -1.0, -1.0, 0.0)
 """Scale and bias that convert texels of 8 bits to normals."""
-UPRIGHT = (0.0, 0.0, 1.0)  # default normal of a surface
+UPRIGHT = (0.0, 0.0, 1.0)  # default of the input "normal"
 NEUTRAL_VALUES: Mapping[str, float | tuple[float, ...]] = {
     **{"clearcoat": 0.0, "displacement": 0.0, "occlusion": 1.0, "ior": 1.5},
     **{"specularColor": (0.0, 0.0, 0.0)},
 }
-"""Values of inputs that change nothing: they need no note if they are not read."""
-MAX_SHADERS = 32  # limit of the shaders in a row
+"""Values of inputs that change nothing: with these, unread inputs need no note."""
+MAX_SHADERS = 32  # limit of the shaders that are connected one after the other
 
 
 @dataclass(frozen=True)
 class TextureLayout:
     """The texture coordinates of an image: a primvar and its transform."""
 
-    primvar: str = "st"  # empty: the same texture coordinates everywhere
+    primvar: str = "st"  # "" for the same texture coordinates everywhere
     # Texture coordinates if a mesh has no such primvar.
     fallback: tuple[float, float] | None = None
     matrix: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)  # two rows for (s, t, 1)
@@ -85,9 +85,7 @@ class TextureLayout:
 
 @dataclass(frozen=True)
 class PrimvarUse:
-    """A primvar that replaces a number or a color, and the fallback if it is
-    missing.
-    """
+    """A primvar that replaces a number or a color, and the fallback without it."""
 
     name: str
     fallback: tuple[float, ...]
@@ -95,13 +93,13 @@ class PrimvarUse:
 
 @dataclass(frozen=True)
 class BoundMaterial:
-    """The material of some faces."""
+    """The material of a mesh or a subset of its faces."""
 
     index: int  # index of the glTF material
     # Texture coordinates by their index in glTF.
     layouts: tuple[TextureLayout, ...] = (TextureLayout(),)
-    color: PrimvarUse | None = None
-    opacity: PrimvarUse | None = None
+    color: PrimvarUse | None = None  # primvar that replaces the base color
+    opacity: PrimvarUse | None = None  # primvar that replaces the opacity
     is_default: bool = False  # whether the prim has no material
 
 
@@ -142,7 +140,7 @@ class Shader:
         return producers
 
     def find_source(self, name: str) -> tuple[Shader, str] | None:
-        """Return the shader, and its output, that an input is connected to, or None."""
+        """Return the shader to which an input is connected, and its output, or None."""
         for attribute in self._find_producers(name):
             prim = UsdShade.Shader(attribute.GetPrim())
             if prim and _is_output(attribute):
@@ -160,10 +158,10 @@ class Shader:
         )
 
     def get_numbers(self, name: str, default: Sequence[float]) -> tuple[float, ...]:
-        """Return the finite numbers of an input, or `default`, which has as many.
+        """Return as many finite numbers of an input as `default` has, or `default`.
 
-        Numbers beyond the length of the default are left out. If there are too few, or
-        some are not finite, the default is returned.
+        Further numbers are left out. If there are too few, or some are not finite, the
+        default is returned.
         """
         value = self.get_value(name)
         if value is None:
@@ -197,20 +195,20 @@ def _is_output(attribute: Any) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class UsdTextureUse:
-    """An image that an input is connected to."""
+    """An image to which an input is connected."""
 
-    path: str  # as the file has it
+    path: str  # path as it is written in the USD file
     data: bytes  # the image file
     is_srgb: bool  # whether its colors are decoded from sRGB
-    channels: Sequence[int]  # channels of the image, that the input takes
+    channels: Sequence[int]  # channels of the image that the input uses
     scale: tuple[float, ...]  # (4,) factors of the channels
-    bias: tuple[float, ...]  # (4,) what is added after scaling
+    bias: tuple[float, ...]  # (4,) numbers that are added after scaling
     layout: TextureLayout  # layout of its texture coordinates
     wraps: tuple[int, int]  # wrap modes along s and t, as in glTF
 
     @property
     def is_plain(self) -> bool:
-        """Whether values are those of the image."""
+        """Whether values are those of the image, without scale and bias."""
         return self.bias == NO_BIAS and self.scale == NO_SCALE
 
     @property
@@ -226,13 +224,15 @@ class UsdSurfaces:
     folder: Path
     header: dict[str, Any]
     buffer: reading.GlbBuffer
-    note_counts: Counter[str]  # notes on what is left out
+    note_counts: Counter[str]  # notes on what is left out, and how often each occurs
     files_read: list[str]  # files that were read
+    # Materials by path; "" for prims without one.
     _materials: dict[str, BoundMaterial] = field(default_factory=dict)
+    # Decoded images by file content and whether it is sRGB.
     _texels: dict[tuple[bytes, bool], Array] = field(default_factory=dict)
 
     def note(self, what: str) -> None:
-        """Note something that is left out."""
+        """Count a note on something that is left out: a predicate of the file."""
         self.note_counts[what] += 1
 
     def find_material(self, prim: Any) -> BoundMaterial:
@@ -264,7 +264,7 @@ class UsdSurfaces:
             "metallicFactor": 0.0,
             "roughnessFactor": DEFAULT_ROUGHNESS,
         }
-        index = self._add_material(
+        index = self.add_material(
             {"name": "displayColor", "pbrMetallicRoughness": surface}
         )
         color = PrimvarUse("displayColor", DEFAULT_COLOR)
@@ -275,7 +275,7 @@ class UsdSurfaces:
             is_default=True,
         )
 
-    def _add_material(self, entry: dict[str, Any]) -> int:
+    def add_material(self, entry: dict[str, Any]) -> int:
         """Add a two-sided material to the header, and return its index."""
         self.header["materials"].append({**entry, "doubleSided": True})
         return len(self.header["materials"]) - 1
@@ -285,13 +285,13 @@ class UsdSurfaces:
     ) -> int:
         """Return the index of a glTF material with another color and opacity.
 
-        It is a copy of the bound material's entry, which is added unless there is an
-        equal one; it is blended if its opacity is below 1.
+        It is a changed copy of the bound material's entry, which is added unless there
+        is an equal one. It is blended if its opacity is below 1.
 
         Args:
             bound: the material.
-            color: (3,) linear, clipped to [0, 1]; None: the material's.
-            opacity: clipped to [0, 1]; None: the material's.
+            color: (3,) linear, clipped to [0, 1]; None for the color of the material.
+            opacity: clipped to [0, 1]; None for the opacity of the material.
         """
         entry = dict(self.header["materials"][bound.index])
         surface = dict(entry["pbrMetallicRoughness"])
@@ -306,9 +306,10 @@ class UsdSurfaces:
         return self._find_or_add("materials", entry)
 
     def _convert(self, material: Any) -> BoundMaterial:
-        """Convert a material; one that is no preview surface becomes grey, with a note.
+        """Convert a material.
 
-        The decoded images of the material before it are released.
+        A material that is no preview surface becomes grey, with a note. The decoded
+        images of the previous material are released.
         """
         name = str(material.GetPrim().GetName())
         self._texels.clear()  # they take memory
@@ -322,18 +323,17 @@ class UsdSurfaces:
                 "roughnessFactor": DEFAULT_ROUGHNESS,
             }
             return BoundMaterial(
-                self._add_material({"name": name, "pbrMetallicRoughness": surface})
+                self.add_material({"name": name, "pbrMetallicRoughness": surface})
             )
         return PreviewSurface(self, Shader.from_prim(shader), name).convert()
 
     # ---- Images ----
 
     def load_image(self, asset: Any, name: str) -> bytes | None:
-        """Return the bytes of an image in the folder; None, and a note, if it is
-        missing.
+        """Return the bytes of an image in the folder; None, with a note, if missing.
 
-        Links are followed before a path is tested: an image outside of the folder is
-        not read. It may be inside of a package (`.usdz`) there.
+        Links are followed before a path is tested, so that an image outside of the
+        folder is not read. It may be in a package (`.usdz`) in the folder.
 
         Args:
             asset: the asset path.
@@ -389,7 +389,7 @@ class UsdSurfaces:
         return self._texels[key]
 
     def compute_values(self, use: UsdTextureUse) -> Array | None:
-        """Return what an image yields after scale and bias, (H, W, C), or None."""
+        """Return the values (H, W, C) of an image after scale and bias, or None."""
         texels = self.load_texels(use)
         if texels is None:
             return None
@@ -434,10 +434,10 @@ class _TextureInputs(NamedTuple):
         asset: asset path of the image, or None.
         color_space: "raw", "sRGB", or "auto".
         scale: (4,) factors of the channels.
-        bias: (4,) what is added after scaling.
+        bias: (4,) numbers that are added after scaling.
         layout: its texture coordinates.
         wraps: wrap modes along s and t, as in glTF.
-        fallback: the color that stands in for a missing image, or None.
+        fallback: (4,) the color that replaces a missing image, or None.
     """
 
     asset: Any
@@ -450,7 +450,7 @@ class _TextureInputs(NamedTuple):
 
 
 def _read_fallback(node: Shader) -> tuple[float, ...] | None:
-    """Return the color that stands in for a missing image; None if there is none."""
+    """Return the color (4,) that replaces a missing image; None if there is none."""
     if node.get_value("fallback") is None:
         return None
     return node.get_numbers("fallback", NO_SCALE)
@@ -477,51 +477,54 @@ class PreviewSurface:
     def convert(self) -> BoundMaterial:
         """Write the material, and note the inputs that are not read.
 
-        A specular workflow is read as if it were metallic, without metal.
+        A specular workflow is read as a metallic one without metal.
         """
         shader = self.shader
         is_specular = bool(shader.get_number("useSpecularWorkflow", 0.0))
         surface: dict[str, Any] = {}
         entry: dict[str, Any] = {"name": self.name, "pbrMetallicRoughness": surface}
-        color, opacity = self._add_base(entry, surface)
+        color_primvar, opacity_primvar = self._add_base(entry, surface)
         self._add_roughness_and_metallic(surface, is_specular=is_specular)
         self._add_normal(entry)
         self._add_emission(entry)
         if is_specular:
             self.surfaces.note(
-                "has materials with a specular workflow, of which the "
-                "diffuse colour is read"
+                "has materials with a specular workflow, of which only the diffuse "
+                "colour is read"
             )
-        shader.inputs.mark_read("clearcoatRoughness")  # named with the clearcoat
+        # The note about a clearcoat that is left out includes its roughness.
+        shader.inputs.mark_read("clearcoatRoughness")
         opacity_mode = str(shader.get_value("opacityMode") or "presence")
         if opacity_mode != "presence" and entry.get("alphaMode") == "BLEND":
             self.surfaces.note(
-                "has materials with opacityMode transparent; here "
-                "highlights fade with the opacity too"
+                "has materials with opacityMode transparent; here the opacity also "
+                "reduces highlights"
             )
         self._note_unread(is_specular=is_specular)
-        index = self.surfaces._add_material(entry)
+        index = self.surfaces.add_material(entry)
+        # `_make_slot` has added the layouts of all textures.
+        layouts = tuple(self.layouts) or (TextureLayout(),)
         return BoundMaterial(
-            index, tuple(self.layouts) or (TextureLayout(),), color, opacity
+            index, layouts=layouts, color=color_primvar, opacity=opacity_primvar
         )
 
     def _note_unread(self, *, is_specular: bool) -> None:
         """Note the inputs that are not read, of the surface and of its shaders.
 
-        Those of the surface with a neutral value need no note.
+        Inputs of the surface need no note if they have no value or a neutral one.
         """
 
-        def is_quiet(name: str, shader_input: Any) -> bool:
+        def is_without_effect(name: str, shader_input: Any) -> bool:
             """Return whether an input changes nothing."""
             if name == "specularColor" and not is_specular:
-                return True
+                return True  # only a specular workflow uses it
             producers = UsdShade.Utils.GetValueProducingAttributes(shader_input)
             if name not in NEUTRAL_VALUES:
-                return len(producers) == 0
+                return len(producers) == 0  # it has no value
             neutral = NEUTRAL_VALUES[name]
             return all(_is_neutral(attribute, neutral) for attribute in producers)
 
-        for name in self.shader.inputs.find_unread(is_quiet):
+        for name in self.shader.inputs.find_unread(is_without_effect):
             label = "an ior other than 1.5" if name == "ior" else name
             self.surfaces.note(f"has materials with {label[:100]}, which is left out")
         for node in self.nodes.values():
@@ -536,19 +539,23 @@ class PreviewSurface:
     # ---- Connections of inputs ----
 
     def _track_shader(self, source: Shader) -> Shader:
-        """Return the shader that stands for a prim, the same one each time."""
+        """Return the tracked shader of the same prim, which is `source` at first.
+
+        So the inputs that are read are recorded in one place, and `_note_unread` notes
+        the others.
+        """
         return self.nodes.setdefault(str(source.prim.GetPath()), source)
 
     def _find_primvar(
         self, name: str, kinds: Sequence[str], default: tuple[float, ...]
     ) -> PrimvarUse | None:
-        """Return the primvar that an input is connected to, or None.
+        """Return the primvar to which an input is connected, or None.
 
         Args:
             name: the input.
-            kinds: ids of the shaders that read primvars of the right type, such as
-                "UsdPrimvarReader_float3"; others do not count.
-            default: the default of the input, for its number of channels.
+            kinds: ids of shaders that read primvars of the right type, such as
+                "UsdPrimvarReader_float3"; for other shaders the result is None.
+            default: the default of the input, which has its number of channels.
         """
         source = self.shader.find_source(name)
         if source is None:
@@ -563,23 +570,23 @@ class PreviewSurface:
     def _is_srgb(self, color_space: str, data: bytes) -> bool:
         """Return whether an image is in sRGB, by the shader or else by the image.
 
-        `color_space` is the shader's: "raw", "sRGB", or "auto", where the file decides.
+        `color_space` is the shader's: "raw", "sRGB", or "auto" if the file decides.
         """
         if color_space not in ("auto", "raw", "sRGB"):
             self.surfaces.note(
                 f"has a texture with the sourceColorSpace {color_space[:50]!r}, which "
-                "is taken for auto"
+                "is read as auto"
             )
         if color_space in ("raw", "sRGB"):
             return color_space == "sRGB"
         return is_marked_srgb(data)
 
     def _find_texture(self, name: str) -> UsdTextureUse | tuple[float, ...] | None:
-        """Return the texture that an input is connected to.
+        """Return the texture to which an input is connected.
 
         Returns:
-            The texture; or the numbers, one for each channel, that stand in for an
-            image that is missing; or None, with a note unless nothing is connected.
+            The texture; or the numbers, one for each channel, that replace a missing
+            image; or None. If the input is connected, None has a note.
         """
         source = self.shader.find_source(name)
         if source is None:
@@ -589,7 +596,8 @@ class PreviewSurface:
         if node.kind != UV_TEXTURE:
             self.surfaces.note(f"has a {name} of {node.kind[:100]}, which is left out")
             return None
-        # All inputs are read first: they are known, whatever follows.
+        # All inputs are read, also if the texture is left out below: then they need no
+        # note as unread inputs.
         inputs = _TextureInputs(
             asset=node.get_value("file"),
             color_space=str(node.get_value("sourceColorSpace") or "auto"),
@@ -613,9 +621,9 @@ class PreviewSurface:
         """Return a texture with the bytes of its image.
 
         Args:
-            name: the input of the surface that it is connected to.
-            inputs: inputs of its shader.
-            channels: channels of the image that the input takes.
+            name: the input of the surface.
+            inputs: inputs of the texture's shader.
+            channels: channels of the image that the surface uses.
 
         Returns:
             The texture; or the numbers, one for each channel, that replace a missing
@@ -623,7 +631,7 @@ class PreviewSurface:
         """
         path = "" if inputs.asset is None else str(inputs.asset.path)
         data = self._load_image(inputs.asset, path, name)
-        if data is None:
+        if data is None:  # `_load_image` has noted why
             if inputs.fallback is None:
                 return None
             return tuple(inputs.fallback[channel] for channel in channels)
@@ -646,23 +654,27 @@ class PreviewSurface:
     def _find_texture_or_value(
         self, name: str, value: tuple[float, ...]
     ) -> tuple[UsdTextureUse | None, tuple[float, ...]]:
-        """Return the texture that an input is connected to, if any, and its value.
+        """Return the texture to which an input is connected, if any, and a value.
 
-        The value is `value`, or that which stands in for a missing image.
+        Args:
+            name: the input.
+            value: its value without a texture.
+
+        Returns:
+            The texture or None; and `value`, or the numbers that replace a missing
+            image. A texture replaces the value.
         """
-        use = self._find_texture(name)
-        if isinstance(use, tuple):
-            return None, use
-        return use, value
+        texture_or_numbers = self._find_texture(name)
+        if isinstance(texture_or_numbers, tuple):
+            return None, texture_or_numbers
+        return texture_or_numbers, value
 
     def _load_image(self, asset: Any, path: str, name: str) -> bytes | None:
-        """Return the bytes of the image of an input; None, and a note, if there is
-        none.
-        """
+        """Return the bytes of the image of an input; None, with a note, if missing."""
         if "<UDIM>" in path:
             self.surfaces.note(
-                "has UDIM textures, which are left out; make .obj or one texture of "
-                "them"
+                "has UDIM textures, which are left out; export .obj, or join them to "
+                "one texture"
             )
             return None
         if not path:
@@ -677,8 +689,8 @@ class PreviewSurface:
             mode = str(node.get_value(axis) or "useMetadata")
             if mode not in WRAP_MODES:
                 self.surfaces.note(
-                    f"has a texture with the {axis} {mode[:50]!r}, "
-                    "which is taken for repeat"
+                    f"has a texture with the {axis} {mode[:50]!r}, which is read as "
+                    "repeat"
                 )
             wraps.append(WRAP_MODES.get(mode, reading.gltf_entries.REPEAT))
         return wraps[0], wraps[1]
@@ -688,32 +700,35 @@ class PreviewSurface:
 
         The shaders are followed from the texture back to the primvar. Texture
         coordinates go the other way, so the transform that is found last is applied
-        first. A shader of another kind is replaced by the primvar "st", with a note.
+        first. A shader of another kind is replaced by a reader of the primvar "st", with
+        a note; transforms stay.
 
         Raises:
-            FileFormatError: there are more than `MAX_SHADERS` shaders in a row.
+            FileFormatError: more than `MAX_SHADERS` shaders are connected one after the
+                other.
         """
         matrix = np.eye(3)
         input_name = "st"
         for _ in range(MAX_SHADERS):
             source = node.find_source(input_name)
-            if source is None:
+            if source is None:  # the input has a constant value
                 return self._make_constant_layout(node, input_name, matrix)
-            node = self._track_shader(source[0])
-            rows = tuple(map(float, matrix[:2].ravel()))
+            source_shader, _output = source
+            node = self._track_shader(source_shader)
             if node.kind == TRANSFORM:
                 matrix = matrix @ _compute_transform(node)
                 input_name = "in"
-            elif node.kind in READERS_OF_COORDINATES:
+                continue
+            matrix_rows = tuple(map(float, matrix[:2].ravel()))
+            if node.kind in READERS_OF_COORDINATES:
                 primvar = str(node.get_value("varname") or "st")
-                fallback = node.get_numbers("fallback", (0.0, 0.0))
-                return TextureLayout(primvar, (fallback[0], fallback[1]), rows)
-            else:
-                self.surfaces.note(
-                    "has a texture that is looked up by "
-                    f"{node.kind[:100]}; st is taken for it"
-                )
-                return TextureLayout("st", fallback=None, matrix=rows)
+                s, t = node.get_numbers("fallback", (0.0, 0.0))
+                return TextureLayout(primvar, fallback=(s, t), matrix=matrix_rows)
+            self.surfaces.note(
+                f"has a texture whose coordinates are from {node.kind[:100]}; st is "
+                "used instead"
+            )
+            return TextureLayout("st", fallback=None, matrix=matrix_rows)
         raise errors.FileFormatError(
             f"the material {self.name}: expected at most {MAX_SHADERS} shaders in a "
             "row, got more"
@@ -722,7 +737,7 @@ class PreviewSurface:
     def _make_constant_layout(
         self, node: Shader, input_name: str, matrix: Array
     ) -> TextureLayout:
-        """Return the layout of a texture whose coordinates are a value, with a note.
+        """Return the layout of a texture with constant coordinates, with a note.
 
         Its matrix ignores the texture coordinates, and yields the transformed value.
 
@@ -732,8 +747,8 @@ class PreviewSurface:
             matrix: (3, 3) the transforms after it.
         """
         self.surfaces.note(
-            "has a texture without texture coordinates (st), of which "
-            "one texel is shown"
+            "has a texture without texture coordinates (st), which has the color of "
+            "one texel"
         )
         s, t = node.get_numbers(input_name, (0.0, 0.0))
         u, v, _ = matrix @ np.array([s, t, 1.0])
@@ -744,9 +759,7 @@ class PreviewSurface:
         )
 
     def _make_slot(self, texture: int, layout: TextureLayout) -> dict[str, int]:
-        """Return the entry that refers to a texture, by its index, with some
-        coordinates.
-        """
+        """Return the entry that refers to a texture by its index, with a layout."""
         if layout not in self.layouts:
             self.layouts.append(layout)
         return {"index": texture, "texCoord": self.layouts.index(layout)}
@@ -758,17 +771,19 @@ class PreviewSurface:
     ) -> tuple[PrimvarUse | None, PrimvarUse | None]:
         """Fill in color and opacity.
 
-        Each comes from a primvar (numbers on the mesh), a texture or a value. glTF has
-        one texture for both, so an opacity texture with other texture coordinates than
-        the color's is left out. If the material has an opacity threshold, the opacity
-        is a mask; otherwise it is blended.
+        Each comes from a primvar (values of the mesh), a texture or a value. If a
+        primvar replaces it, the value is written to the glTF material, and faces get
+        copies of the material with the primvar's values. glTF has one texture for both,
+        so an opacity texture with other texture coordinates than the color's is left
+        out. If the material has an opacity threshold, the opacity is a mask; otherwise
+        it is blended.
 
         Args:
             entry: the glTF material.
             surface: its pbrMetallicRoughness.
 
         Returns:
-            The primvars that replace color and opacity; None where there is none.
+            The primvars that replace color and opacity, or None.
         """
         color_primvar = self._find_primvar(
             "diffuseColor", READERS_OF_COLORS, DEFAULT_COLOR
@@ -784,16 +799,19 @@ class PreviewSurface:
         if opacity_primvar is None:
             opacity_use, opacity = self._find_texture_or_value("opacity", opacity)
         opacity_use = self._drop_other_layout(opacity_use, color_use)
-        # one number, in place of a missing image, is a grey
+        # If the color is connected to one channel of a missing image, the fallback has
+        # one number, a grey.
         color = tuple(map(float, np.broadcast_to(color, 3)))
-        texture, factor = self._add_base_texture(color_use, opacity_use, [*color])
+        texture, color_factor = self._add_base_texture(
+            color_use, opacity_use, list(color)
+        )
         if texture is not None:
             first_use = color_use or opacity_use
             assert first_use is not None
             surface["baseColorTexture"] = self._make_slot(texture, first_use.layout)
         has_opacity_map = texture is not None and opacity_use is not None
-        factor.append(1.0 if has_opacity_map else opacity[0])
-        factor = [min(max(channel, 0.0), 1.0) for channel in factor]
+        opacity_factor = 1.0 if has_opacity_map else opacity[0]
+        factor = [min(max(part, 0.0), 1.0) for part in (*color_factor, opacity_factor)]
         surface["baseColorFactor"] = factor
         if has_opacity_map or factor[3] < 1.0 or opacity_primvar is not None:
             _set_alpha_mode(entry, threshold)
@@ -802,8 +820,9 @@ class PreviewSurface:
     def _drop_other_layout(
         self, opacity_use: UsdTextureUse | None, color_use: UsdTextureUse | None
     ) -> UsdTextureUse | None:
-        """Return the texture of the opacity; None, and a note, if its texture
-        coordinates are not those of the color's texture.
+        """Return the texture of the opacity if it has the coordinates of the color's.
+
+        Otherwise the result is None, with a note.
         """
         if opacity_use is None or color_use is None:
             return opacity_use
@@ -829,11 +848,11 @@ class PreviewSurface:
         Args:
             color_use: the texture of the color, or None.
             opacity_use: the texture of the opacity, or None.
-            color: (3,) linear color where there is no texture of it.
+            color: (3,) linear color if there is no texture of it.
 
         Returns:
-            The index of the texture, or None; and the color that it is multiplied by,
-            which is 1 for a baked one.
+            The index of the texture, or None; and the factor (3,) of its color, which
+            is 1 for a baked one.
         """
         first_use = color_use or opacity_use
         if first_use is None:
@@ -893,29 +912,29 @@ class PreviewSurface:
     ) -> None:
         """Fill in roughness and metallic of the glTF material.
 
-        glTF has one image for both, in which each is a channel; a number without an
-        image fills its channel.
+        glTF has one image for both, in which each is a channel. If only one of them has
+        an image, the number of the other one fills its channel.
 
         Args:
             surface: its pbrMetallicRoughness.
             is_specular: whether the material has the workflow without metals.
         """
-        factor_by_name, plane_by_name, packed_use = self._find_planes()
+        factor_by_name, plane_by_name, texture_use = self._find_planes()
         if is_specular:  # this workflow has no metals
             factor_by_name["metallic"] = 0.0
             plane_by_name.pop("metallic", None)
-        if not plane_by_name or packed_use is None:
+        if not plane_by_name or texture_use is None:
             surface["metallicFactor"] = factor_by_name["metallic"]
             surface["roughnessFactor"] = factor_by_name["roughness"]
             return
         texture = self.surfaces.add_image(
-            _pack_planes(plane_by_name, factor_by_name), packed_use.sampler
+            _pack_planes(plane_by_name, factor_by_name), texture_use.sampler
         )
-        # The image has the numbers, which the factors multiply.
+        # The image has the numbers already.
         surface["metallicFactor"] = 1.0
         surface["roughnessFactor"] = 1.0
         surface["metallicRoughnessTexture"] = self._make_slot(
-            texture, packed_use.layout
+            texture, texture_use.layout
         )
 
     def _find_planes(
@@ -927,35 +946,36 @@ class PreviewSurface:
         and a primvar by its fallback, with a note.
 
         Returns:
-            The numbers by name; the values (H, W) of images by name; and the texture
-            whose coordinates these have, None if there are none.
+            The numbers by name; the values (H, W) of images by name; and a texture with
+            the coordinates and the wrap modes for these, None if there are no images.
+            If both have an image, it is that of metallic.
         """
         factor_by_name: dict[str, float] = {}
         plane_by_name: dict[str, Array] = {}
-        packed_use: UsdTextureUse | None = None
+        texture_use: UsdTextureUse | None = None
         for name, default in (("roughness", DEFAULT_ROUGHNESS), ("metallic", 0.0)):
-            factor_by_name[name], image = self._read_number_or_image(name, default)
+            number, image = self._read_number_or_image(name, default)
+            factor_by_name[name] = number
             if image is None:
                 continue
             use, plane = image
-            if packed_use is not None and use.layout != packed_use.layout:
+            if texture_use is not None and use.layout != texture_use.layout:
                 factor_by_name[name] = float(plane.mean())
                 self.surfaces.note(
-                    f"has a {name} with other texture coordinates, "
-                    "of which the mean is read"
+                    f"has a {name} with other texture coordinates, which is replaced by "
+                    "its mean"
                 )
             else:
                 plane_by_name[name] = plane
-                packed_use = use
-        return factor_by_name, plane_by_name, packed_use
+                texture_use = use
+        return factor_by_name, plane_by_name, texture_use
 
     def _read_number_or_image(
         self, name: str, default: float
     ) -> tuple[float, tuple[UsdTextureUse, Array] | None]:
-        """Return the number of an input, and the image that it is connected to, if any.
+        """Return the number of an input, and the image to which it is connected, if any.
 
-        A primvar is replaced by its fallback, with a note, and a missing image by its
-        own fallback.
+        A primvar is replaced by its fallback, with a note. So is a missing image.
 
         Args:
             name: the input, "roughness" or "metallic".
@@ -968,9 +988,8 @@ class PreviewSurface:
         primvar = self._find_primvar(name, (READER_OF_NUMBERS,), (0.0,))
         if primvar is not None:
             self.surfaces.note(
-                f"has a {name} of the primvar "
-                f"{primvar.name[:50]!r}, of which the fallback is "
-                "read"
+                f"has a {name} of the primvar {primvar.name[:50]!r}, which is replaced "
+                "by its fallback"
             )
             return primvar.fallback[0], None
         use = self._find_texture(name)
@@ -983,11 +1002,11 @@ class PreviewSurface:
         return number, (use, np.clip(values[:, :, 0], 0.0, 1.0))
 
     def _note_srgb(self, name: str, use: UsdTextureUse) -> None:
-        """Note that numbers are decoded from sRGB; an alpha never is."""
+        """Note that numbers are decoded from sRGB, unless they are an alpha."""
         if use.is_srgb and use.channels != CHANNELS["a"]:
             self.surfaces.note(
                 f"has a {name} that is decoded from sRGB, as its sourceColorSpace "
-                "says; write raw if it holds numbers"
+                "states; write raw if it holds numbers"
             )
 
     def _note_constant_normal(self) -> None:
@@ -1040,32 +1059,34 @@ class PreviewSurface:
         """Return a normal map with the scale and bias that texels of 8 bits need.
 
         USD requires them, and many exporters leave them out. They are added, with a
-        note, if there are none and the texels look like normals.
+        note, if there are none and the stored numbers are normals. Then the image is
+        not sRGB, whatever the file states.
         """
         if not use.is_plain or not is_of_8_bits(use.data):
             return use
-        texels = self.surfaces.load_texels(replace(use, is_srgb=False))
+        raw_use = replace(use, is_srgb=False)
+        texels = self.surfaces.load_texels(raw_use)
         if texels is None or not reading.has_normals(texels[:, :, :3]):
             return use
         self.surfaces.note(
             "has a normal map of 8 bits without scale (2, 2, 2, 1) and bias "
             "(-1, -1, -1, 0), which are added"
         )
-        return replace(use, scale=NORMAL_SCALE, bias=NORMAL_BIAS, is_srgb=False)
+        return replace(raw_use, scale=NORMAL_SCALE, bias=NORMAL_BIAS)
 
     def _add_emission(self, entry: dict[str, Any]) -> None:
         """Fill in the emission, whose factor may be larger than 1.
 
         An image whose sRGB texels are only scaled is copied; another one is written
-        anew.
+        anew. An image that cannot be decoded, which is noted, leaves no emission.
 
         Args:
             entry: the glTF material.
         """
         black = (0.0, 0.0, 0.0)
-        use, value = self._find_texture_or_value(
-            "emissiveColor", self.shader.get_numbers("emissiveColor", black)
-        )
+        stated_value = self.shader.get_numbers("emissiveColor", black)
+        use, value = self._find_texture_or_value("emissiveColor", stated_value)
+        # The factor without a texture. A fallback of one channel is a grey.
         factor: Sequence[float] = list(map(float, np.broadcast_to(value, 3)))
         if use is not None and _is_scaled_texel(use, max_scale=math.inf):
             texture = self.surfaces.add_texture(use.data, use.sampler)
@@ -1078,7 +1099,7 @@ class PreviewSurface:
             values = np.broadcast_to(
                 np.maximum(np.nan_to_num(values), 0.0), (*values.shape[:2], 3)
             )
-            # divided by its largest value, which becomes the factor
+            # The image is divided by its largest value, which becomes the factor.
             largest = max(float(values.max()), 1e-6)
             levels = color.linear_to_srgb((values / largest).astype(np.float32))
             texture = self.surfaces.add_image(levels, use.sampler)
@@ -1088,7 +1109,7 @@ class PreviewSurface:
 
 
 def _set_alpha_mode(entry: dict[str, Any], threshold: float) -> None:
-    """Let the opacity of a glTF material be a mask if there is a threshold, over 0."""
+    """Make the opacity of a glTF material a mask if there is a threshold above 0."""
     if threshold > 0.0:
         entry.update({"alphaMode": "MASK", "alphaCutoff": threshold})
     else:
@@ -1098,7 +1119,8 @@ def _set_alpha_mode(entry: dict[str, Any], threshold: float) -> None:
 def _write_emission_factor(entry: dict[str, Any], factor: Sequence[float]) -> None:
     """Fill in the factor of the emission of a glTF material, unless it is black.
 
-    glTF's factors are at most 1: the largest one beyond that goes to an extension.
+    glTF's factors are at most 1. If one is larger, all are divided by the largest one,
+    which is written to an extension.
     """
     strength = max(factor)
     if strength <= 0.0:
@@ -1130,9 +1152,7 @@ def _pack_planes(planes: Mapping[str, Array], factors: Mapping[str, float]) -> A
 
 
 def _compute_transform(node: Shader) -> Array:
-    """Return the matrix (3, 3) of a UsdTransform2d: scale, then rotate, then
-    translate.
-    """
+    """Return the matrix (3, 3) of a UsdTransform2d: scale, rotate, then translate."""
     scale = node.get_numbers("scale", (1.0, 1.0))
     shift = node.get_numbers("translation", (0.0, 0.0))
     angle = math.radians(node.get_number("rotation", 0.0))
@@ -1146,9 +1166,9 @@ def _compute_transform(node: Shader) -> Array:
 
 
 def _is_scaled_texel(use: UsdTextureUse, max_scale: float = 1.0) -> bool:
-    """Return whether colors are sRGB texels of 8 bits times factors up to a limit.
+    """Return whether colors are sRGB texels of 8 bits times factors up to `max_scale`.
 
-    glTF has just such textures, so that the image needs no conversion.
+    glTF has such textures, so that the image needs no conversion.
     """
     is_color = use.is_srgb and len(use.channels) == 3 and use.bias[:3] == NO_BIAS[:3]
     return (
