@@ -611,7 +611,7 @@ def transport_text(summary: AttackSummary) -> str:
         parts.append(
             "at the last comparison with a rendered picture its error was "
             f"{_short(transport.error.levels)} of 255 levels of the picture's change "
-            "(root mean square), and "
+            "(root mean square) and "
             f"{_short(transport.error.logits)} of the objective"
         )
     if transport.renewed:
