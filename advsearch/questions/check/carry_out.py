@@ -262,12 +262,7 @@ class GradientCheck:
 
         if not config.all:
             yield from self._plan_search(problem, part, spp)
-        # A group that takes no differences has a step of 0, and no factor.
-        step_factors = {
-            group.name: group.step / steps_before[group.name]
-            for group in renderer.plan.groups
-            if steps_before[group.name] != 0.0
-        }
+        step_factors = _divide_steps(renderer.plan.groups, steps_before)
         derivatives = gradients.measure_derivatives(
             replace(bench, spp=spp),
             reference_spp=planning.CONVERGED_SPP,
@@ -275,9 +270,8 @@ class GradientCheck:
             stage=partial(self._begin_stage, title),
         )
         for row in derivatives:
-            # A coordinate of a vector is "center.0": its index follows the parameter.
-            parameter, _, _ = row.parameter.partition(".")
-            group_name = f"{row.control}.{parameter}"
+            # A coordinate of a vector is "center.0"; its group is the full vector.
+            group_name = f"{row.control}.{row.parameter.partition('.')[0]}"
             yield part.make_row(row, factor=step_factors.get(group_name, 1.0))
 
     def _choose_plan(
@@ -435,6 +429,20 @@ class GradientCheck:
             depth=depth,
             tick=self.progress.advance,
         )
+
+
+def _divide_steps(
+    groups: Sequence[Any], steps_before: dict[str, float]
+) -> dict[str, float]:
+    """Return the factor between the step of each group and the one before, by name.
+
+    A group that takes no differences has a step of 0, and no factor.
+    """
+    return {
+        group.name: group.step / steps_before[group.name]
+        for group in groups
+        if steps_before[group.name] != 0.0
+    }
 
 
 def _select(findings: Sequence[Finding], kind: type[FindingType]) -> list[FindingType]:
