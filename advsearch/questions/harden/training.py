@@ -536,10 +536,9 @@ class GradientComputer:
                 logits[mixed], [right_classes[index] for index in partners]
             )
             losses[mixed] = torch.lerp(losses[mixed], partner_losses, partner_weight)
-        n_plain = len(part)
         loss = (
-            plain_weight * losses[:n_plain].sum()
-            + worst_weight * losses[n_plain:].sum()
+            plain_weight * losses[: len(part)].sum()
+            + worst_weight * losses[len(part) :].sum()
         )
         # The student stays near the original model's predictions on plain images. A
         # `RenderedLesson` is left out: a control has changed even in its plain image,
