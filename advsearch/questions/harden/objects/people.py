@@ -67,9 +67,11 @@ def _patches(person: Any) -> list[Patch]:
     reference = _reference_vertices(data)
     charts = data["charts"].astype(np.float64)
     faces = data["faces"].astype(np.int64)
-    # where the vertices and the faces of each chart begin
+    # Vertices and faces come chart by chart; the data has their counts. These are the
+    # indices of the first ones of each chart.
     first_vertex = np.cumsum([0, *data["points"]])
     first_face = np.cumsum([0, *data["triangles"]])
+    # A point of the body at a seam has a vertex in each of its charts.
     point_of_vertex = data["index"].astype(np.int64)
     normals = _smooth_normals(
         vertices, point_of_vertex, faces, first_vertex, first_face
@@ -85,6 +87,7 @@ def _patches(person: Any) -> list[Patch]:
                 uvs=charts[in_chart],
                 faces=faces[first_face[number] : first_face[number + 1]],
                 size=(float(data["sizes"][number][0]), float(data["sizes"][number][1])),
+                # The paint of a texel depends on its point of the reference body.
                 rest=_interpolate_chart(charts[in_chart], reference[in_chart]),
             )
         )
@@ -94,16 +97,18 @@ def _patches(person: Any) -> list[Patch]:
 def _reference_vertices(data: Any) -> Array:
     """Return the vertices (V, 3) of the reference body, in metres, standing on z = 0.
 
-    It is of one fixed phenotype, and stands as MakeHuman's body does.
+    It has a fixed phenotype, and stands as MakeHuman's body does. A body is the mean of
+    all bodies plus a sum over a basis, weighted by the shares of its phenotype.
 
     Args:
         data: the arrays of the file of bodies.
     """
     point_of_vertex = data["index"].astype(np.int64)
-    # the mean of all bodies, stored in tenths of millimetres, plus what the shares of
-    # the phenotype add
-    mean = data["mean"][point_of_vertex] * 1e-4
+    mean = data["mean"][point_of_vertex] * 1e-4  # stored in tenths of millimetres
+    # The table of shares has an axis for each property of the phenotype. This is the
+    # phenotype with index 1 along each.
     shares = data["shares"][1, 1, 1, 1]
+    # r: index of the basis; p: vertex; c: coordinate
     vertices = mean + np.einsum("r,rpc->pc", shares, data["basis"][:, point_of_vertex])
     vertices[:, 2] -= vertices[:, 2].min()
     return np.asarray(vertices)
@@ -166,10 +171,10 @@ def _woven(t: Texels, color: Array, depth: float) -> Array:
 def _jeans(t: Texels, color: Array) -> Array:
     """Paint woven cloth with seams down the legs and a hem at both ankles."""
     x, _, z = t.xyz.T
+    # On both legs, inside and outside, the seam is where x is 0.005.
     has_seam = (z < 0.88) & (z > 0.08)
-    far = 9.0  # metres; no seam
-    # The seam is in the plane x = 0.005.
-    seam_distance = np.where(has_seam, np.minimum(np.abs(x - 0.005), far), far)
+    far = 9.0  # a distance in metres that stands for no seam
+    seam_distance = np.where(has_seam, np.abs(x - 0.005), far)
     hem_distance = np.abs(z - 0.085)
     line = step(0.004 - np.minimum(seam_distance, hem_distance), 0.0, soft=0.003)
     return mix(_woven(color, depth=0.25)(t), 0.6 * color, 0.8 * line)
