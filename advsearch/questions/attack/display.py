@@ -155,7 +155,7 @@ def _rates_part(summary: AttackSummary) -> ResultPart:
 def _rate_cells(
     outcome: str, rate: VerifiedRate | ControlGroup | None
 ) -> tuple[str, str]:
-    """Return a rate and its interval; `outcome` says what is counted."""
+    """Return a rate and its interval; `outcome` names what is counted, such as "right"."""
     if rate is None:
         return "not verified", ""
     n_counted = rate.correct if isinstance(rate, ControlGroup) else rate.successes
@@ -166,8 +166,8 @@ def _rate_cells(
 def make_ambient_parts(summary: AttackSummary) -> list[ResultPart]:
     """Return the section about ambient light, if it was tried.
 
-    It is about an image from a projector: up to which other light on the object it
-    still makes the model wrong.
+    The adversarial scene is lit by a projector. The section states up to which other
+    light on the object the model is still wrong.
     """
     light = summary.ambient
     if light is None:
@@ -177,8 +177,8 @@ def make_ambient_parts(summary: AttackSummary) -> list[ResultPart]:
         limit = f"no longer at {light.limit_lux:.3g} lux"
     factor = light.holds_to / light.lux
     text = (
-        f"Works up to {light.holds_to:.3g} lux, {factor:.3g} times the light that is "
-        f"there, and {limit}."
+        f"Works up to {light.holds_to:.3g} lux, {factor:.3g} times the light of the "
+        f"scene, and {limit}."
     )
     columns: Mapping[str, Column] = {
         "ambient light": "{0.lux:.3g} lux",
@@ -191,7 +191,8 @@ def make_ambient_parts(summary: AttackSummary) -> list[ResultPart]:
         "": lambda point: "holds" if point.holds else "ends",
     }
     note = (
-        "Exposure follows the ambient light: the projector alone is darker beside it."
+        "Exposure follows the ambient light: in brighter light the projector's image is "
+        "darker."
     )
     return [
         ResultPart.make_table(
@@ -201,12 +202,16 @@ def make_ambient_parts(summary: AttackSummary) -> list[ResultPart]:
 
 
 def failures_text(failures: DifferentFailures) -> str:
-    """Return where different failures were found, and how many hold."""
+    """Return where different failures were found, and how many hold.
+
+    They are counted in cells, into which some policies divide the space, or in draws.
+    """
     where = f"{failures.found} of {words.format_count(failures.examined, 'draw')}"
-    if failures.cells is not None:  # the space was divided into cells
+    has_cells = failures.cells is not None
+    if has_cells:
         where = (
             f"{failures.found} of {failures.cells} cells over "
-            f"{' and '.join(failures.over)} ({failures.examined} were seen)"
+            f"{' and '.join(failures.over)} ({failures.examined} were evaluated)"
         )
     if failures.share is not None:
         where += (
@@ -250,18 +255,19 @@ def _holds_text(failure: DifferentFailure) -> str:
 
 
 def range_text(failure: DifferentFailure) -> str:
-    """Return where a failure lies.
+    """Return the ranges of a failure as text.
 
     ``pose.yaw 36 to 72 degrees, material.kind brass``.
     """
     texts = []
     for name, bounds in failure.ranges.items():
-        if isinstance(bounds, str):
+        if isinstance(bounds, str):  # the option of a discrete choice
             texts.append(f"{name} {bounds}")
             continue
+        unit = ""
         value = failure.configuration.get(name)
-        has_unit = value is not None and value.unit not in words.PLAIN_UNITS
-        unit = f" {value.unit}" if value and has_unit else ""
+        if value is not None and value.unit not in words.PLAIN_UNITS:
+            unit = f" {value.unit}"
         low, high = map(words.format_number, bounds)
         texts.append(f"{name} {low} to {high}{unit}")
     return ", ".join(texts) or "anywhere"

@@ -131,10 +131,10 @@ def make_result(
     if run is not None:
         images = {"clean": clean, "adversarial": adversarial}
         _write_files(run, problem, findings, u, images, artifacts)
-    drive = None  # both scenes along a path, if one varies by chance
+    drive = None  # the result for both scenes along a path, if one varies by chance
     if not findings.interrupted:
-        searched_u = None if search is None else u
-        drive = evaluate_drive(problem, searched_u, findings.spp, run)
+        adversarial_u = None if search is None else u
+        drive = evaluate_drive(problem, adversarial_u, findings.spp, run)
     summary = _summarize(
         findings,
         journal,

@@ -423,8 +423,8 @@ def _plan_part(plan: PlannedGradient) -> ResultPart:
     }
     spp = "" if plan.spp is None else f", {format_count(plan.spp, 'sample')} a pixel"
     renders = (
-        f"{format_count(plan.renders_per_gradient, 'render')} a gradient beside the "
-        "picture itself"
+        f"{format_count(plan.renders_per_gradient, 'render')} per gradient in addition "
+        "to the picture itself"
     )
     title = (
         f"Gradient plan: {format_count(len(plan.groups), 'parameter')}, {renders}{spp}"

@@ -133,7 +133,7 @@ def attack(
         config, scene, model, task, objective, policy, session_controls
     )
     config = config.with_python_only_parts(python_only)
-    _check_single(config)
+    _check_single_attack(config)
 
     # Objects of the caller are used as they are. What is only named is made.
     searched, random_controls = make_attack_controls(config, controls, over)
@@ -365,7 +365,7 @@ def _make_policy(setting: Any) -> Policy[Any]:
     return make_policy(config.policy_name, **config.policy_options)
 
 
-def _check_single(config: AttackConfig) -> None:
+def _check_single_attack(config: AttackConfig) -> None:
     """Check that the settings describe a single attack, which can be made.
 
     Raises:

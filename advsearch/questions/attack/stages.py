@@ -660,9 +660,9 @@ def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
     for the clean scene: its result has a margin near 0, whose sign no count settles.
     Then the clean configuration, the adversarial one, that of the search without print
     terms and that of the random search are tried with equal seeds. If the random search
-    found something worse for the model, that becomes the adversarial configuration. At
-    last, the different failures of the policy are verified, and the ambient light in
-    which an adversarial light holds is found.
+    found something worse for the model, that becomes the adversarial configuration.
+    Finally, different failures of the policy are verified, and it is measured in how
+    bright ambient light an adversarial light still holds.
 
     Args:
         verifier: verifier of the attack, whose state gets the results.

@@ -37,7 +37,7 @@ from advsearch.runs.summary import NAME, make_summary_error, read_result
 
 
 class FoundValue(DescribedValue):
-    """One value of the adversarial configuration, and where it lies."""
+    """A value of the adversarial configuration, with its clean value and its range."""
 
     clean: int | float | str | None = optional_field(
         "value of the clean scene; absent if it is not a single value"

@@ -207,7 +207,7 @@ def _baseline_remark(summary: AttackSummary) -> str:
 
 
 def success_name(summary: AttackSummary) -> str:
-    """Return what counts as a success in the trials, in a word."""
+    """Return a word for the predictions that count as a success, such as "wrong"."""
     if summary.target:
         return "target"
     return "easier" if summary.minimises else "wrong"
@@ -317,7 +317,10 @@ def _within_text(name: str, epsilon: object, norm: object) -> str:
 
 
 def renders_text(summary: AttackSummary) -> str:
-    """Return ``40 of the search, 40 gradients, 21 of the verification``."""
+    """Return how many images were rendered for what.
+
+    ``40 of the search, 40 gradients, 21 of the verification``.
+    """
     spent = [
         f"{number} {_RENDER_KINDS.get(name, f'of {name}')}"
         for name, number in summary.renders.items()

@@ -671,7 +671,7 @@ def check_disjoint(held_out: SceneSplit, training_splits: Sequence[SceneSplit]) 
     if common:
         raise InputError(
             f"held_out_environment: {', '.join(common)} is an environment "
-            "of the training too; name others"
+            "of the training, too; name other environments"
         )
     # the first instance of each object, as objects take turns
     held_out_fingerprints = {
@@ -697,5 +697,6 @@ def check_not_held_out(
     """
     if compute_fingerprint(asset) in held_out_fingerprints:
         raise InputError(
-            f"held_out: {asset.name} is an object of the training too; name others"
+            f"held_out: {asset.name} is an object of the training, too; name other "
+            "objects"
         )

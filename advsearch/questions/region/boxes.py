@@ -82,10 +82,11 @@ def grow_box(
     parameter at the latest.
 
     Then the box is sampled. An exception is a sample with another prediction than the
-    center. For each, the face that cuts off the least of the box moves inwards, so that
-    the exception is outside. Then the box is sampled again with other seeds, at most
-    `ATTEMPTS` times. The last check is reported whatever it shows. The samples of a
-    check are independent of the box, so that a confidence interval from them is valid.
+    center. For each exception a face moves inwards, so that the exception is outside of
+    the box: of all faces, the one that cuts off the smallest part. Then the box is
+    sampled again with other seeds, at most `ATTEMPTS` times. The last check is reported
+    even if it has exceptions. The samples of a check are independent of the box, so
+    that a confidence interval from them is valid.
 
     Args:
         is_same: function that returns whether a point (d,) has the prediction of the

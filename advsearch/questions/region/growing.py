@@ -241,8 +241,8 @@ class RegionSearch:
     def run(self) -> GrownRegion:
         """Find the verdict at the center, grow the box, and draw the map.
 
-        The verdict is whether the model is right or wrong at the center; the box is
-        where it stays so.
+        The verdict is whether the model is right or wrong at the center. In the box the
+        verdict is the same.
         """
         config = self._config
         verifier = self._verifier

@@ -279,7 +279,7 @@ def _hammer_handle(
         length: length from the head to the end.
 
     Returns:
-        Half its thickness where it is held, about; and its patches.
+        Approximately half its thickness where it is held, and its patches.
     """
     t = np.linspace(0.0, 1.0, 30)  # from the head to the end
     swelling = sampler(0.16, low=0.0, high=0.3)
