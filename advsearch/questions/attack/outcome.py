@@ -122,15 +122,10 @@ def make_result(
     u = problem.domain.start  # without a search, the adversarial scene is the clean one
     if search is not None:
         u = problem.domain.project(search.best_u)
-    # The images of both scenes are rendered as in this trial. After Ctrl-C no trial is
-    # repeated.
-    trial = None if findings.interrupted else choose_stored_trial(findings)
-    clean = StoredImage.render(problem, findings, problem.domain.start, trial)
-    adversarial = StoredImage.render(problem, findings, u, trial)
+    scene_images = _render_scenes(problem, findings, u)
     artifacts = problem.searched_space.get_artifact_images(u)
     if run is not None:
-        images = {"clean": clean, "adversarial": adversarial}
-        _write_files(run, problem, findings, u, images, artifacts)
+        _write_files(run, problem, findings, u, scene_images, artifacts)
     drive = None  # the result for both scenes along a path, if one varies by chance
     if not findings.interrupted:
         adversarial_u = None if search is None else u
@@ -138,8 +133,8 @@ def make_result(
     summary = _summarize(
         findings,
         journal,
-        clean,
-        adversarial,
+        scene_images["clean"],
+        scene_images["adversarial"],
         run=None if run is None else str(run.path),
         object=object_name,
         judge=judge,
@@ -162,12 +157,31 @@ def make_result(
         summary=summary,
         run=None if run is None else run.path,
         u=u,
-        clean=clean.image,
-        adversarial=adversarial.image,
+        clean=scene_images["clean"].image,
+        adversarial=scene_images["adversarial"].image,
         artifacts=artifacts,
         search=search,
         in_memory=tuple(journal.rows),
     )
+
+
+def _render_scenes(
+    problem: Problem, findings: RunState, u: Tensor
+) -> dict[str, StoredImage]:
+    """Render the clean scene and the adversarial one, as in a typical trial.
+
+    After Ctrl-C they are rendered with few samples, and not as in a trial.
+
+    Args:
+        problem: problem of the attack.
+        findings: findings of the attack.
+        u: (d,) the adversarial configuration.
+    """
+    trial = None if findings.interrupted else choose_stored_trial(findings)
+    return {
+        "clean": StoredImage.render(problem, findings, problem.domain.start, trial),
+        "adversarial": StoredImage.render(problem, findings, u, trial),
+    }
 
 
 def _find_twins(
@@ -215,7 +229,7 @@ def _write_files(
         problem: problem of the attack.
         findings: findings of the attack.
         u: (d,) the adversarial configuration.
-        images: images of both scenes.
+        images: images of both scenes, by "clean" and "adversarial".
         artifacts: images that the controls make of `u`, by name, such as the texture.
     """
     save_images(run, problem, findings, images)
