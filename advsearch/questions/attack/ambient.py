@@ -78,10 +78,11 @@ def _verify_in_light(
         factor: the ambient light as a multiple of the scene's.
     """
     problem = verifier.problem
-    n_renders = 2 * verifier.n_trials  # of the clean scene, and of the configuration
+    # trials of the clean scene, and as many of the configuration
+    n_renders = 2 * verifier.n_trials
     title = f"trying it in ambient light of {lux:.3g} lux"
     verifier.begin_stage(title, n_renders, name="ambient", at_most=True)
-    # The factor is the key by which workers find the problem in that light.
+    # Workers find the problem in that light by its key, which is the factor.
     evaluator = ParallelEvaluator(
         with_ambient_light(problem, factor),
         verifier.journal.evaluator.executor,

@@ -80,7 +80,7 @@ from advsearch.trust.writing import write_bytes
 from advsearch.viewer.pages import write_result
 
 T = TypeVar("T")
-MAX_LISTED_NUMBERS = 4096  # of a distribution, in a summary
+MAX_LISTED_NUMBERS = 4096  # larger distributions are left out of a summary
 
 
 def make_result(
@@ -801,7 +801,8 @@ def _count_renders(findings: RunState, problem: Problem) -> dict[str, int]:
         ("search", "gradient", "baseline", "verification", "products"), 0
     )
     counts["verification"] = findings.verification_renders + len(findings.first_look)
-    # by the kind of their queries; that of `UNPRINTED` is a longer text than its key
+    # Searches by the kind of their queries. The kind `UNPRINTED` is a sentence; its
+    # count has the shorter key "unprinted".
     searches = {
         "search": findings.search,
         "baseline": findings.baseline,

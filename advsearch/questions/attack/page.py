@@ -37,7 +37,7 @@ from advsearch.viewer.pages import (
     read_object,
 )
 
-FRAME_QUALITY = 85  # of the JPEG frames of the search, from 1 to 95
+FRAME_QUALITY = 85  # JPEG quality of the frames of the search, from 1 to 95
 MAX_TRIAL_IMAGES = 24  # images of trials on a page
 # A value that is this close to the end of its range, as a fraction of the range, is at
 # the end.

@@ -646,7 +646,7 @@ def evaluate_drive(
     # The animation has the paths one after another; a single path has no name.
     total_seconds = seconds * max(1, len(path_names))
     right_counts: dict[str, int] = {}
-    # by the name of the files
+    # the configuration of each scene, by the name of its files
     for name, configuration in (("drive-clean", problem.domain.start), ("drive", u)):
         if configuration is None:  # nothing was searched
             continue

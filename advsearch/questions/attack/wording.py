@@ -173,7 +173,7 @@ def _clean_remark(summary: AttackSummary) -> str:
     not_a_number = ""
     if control.not_a_number:
         not_a_number = f"; in {control.not_a_number} the output is not a number"
-    # over conditions, only trials with a right clean scene count
+    # If conditions vary, only trials with a right clean scene count.
     not_counted = " They do not count." if summary.over else ""
     return (
         f"The clean scene itself fails {n_failures} of its {control.trials} "
@@ -309,7 +309,7 @@ def budget_text(summary: AttackSummary) -> str:
 
 
 def _within_text(name: str, epsilon: object, norm: object) -> str:
-    """Return a control's name with its budget; without an epsilon, the name alone."""
+    """Return a control's name with its budget, if it has an epsilon."""
     if not isinstance(epsilon, (int, float)):
         return name
     text = f"{name} within {format_number(epsilon)}"

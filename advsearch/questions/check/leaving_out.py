@@ -18,7 +18,7 @@ from advsearch.extend import gradients, seeds
 from advsearch.questions.check.result import GainRow, TexelRow
 
 ITEMS = gradients.OMISSIONS
-ALL_ITEMS = frozenset(ITEMS)  # to leave out everything that can be left out
+ALL_ITEMS = frozenset(ITEMS)
 NO_ITEMS = frozenset[str]()
 # Names of the variants of a renderer that are compared, besides those that compute one
 # item: the search's, which computes no item; the one that computes all items; and the

@@ -114,8 +114,8 @@ class SceneJobs:
             hint: text about how to shorten the stage.
         """
         self.progress.stage(title, len(jobs), hint=hint)
-        # Results come in any order. A result has the job object itself, so that its
-        # `id` tells which job it was.
+        # Results come in any order. A result has the job object itself, which is found
+        # by its `id`.
         index_of_job = {id(job): index for index, job in enumerate(jobs)}
         executor = self.executor or workbench.InProcess(self)
         # each job is a batch by itself

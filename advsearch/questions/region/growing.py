@@ -247,8 +247,8 @@ class RegionSearch:
         config = self._config
         verifier = self._verifier
         varied = self._varied
-        # so many samples per pixel that noise does not decide the prediction at the
-        # center
+        # Choose enough samples per pixel that noise does not decide the prediction at
+        # the center.
         verifier.choose_spp({"centre": varied.center})
         self._is_wrong_at_center = find_verdict(verifier, varied.center)
         if config.specialise:

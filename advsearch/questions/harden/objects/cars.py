@@ -553,7 +553,7 @@ def _wells() -> list[Patch]:
 
 
 def _well(axle: float, side: float) -> list[Patch]:
-    """Create the inside of a wheel arch: a curved wall, and a flat one farther in.
+    """Create the inside of a wheel arch: a curved wall, and a flat wall at its inner end.
 
     Args:
         axle: x of the axle.
@@ -563,7 +563,7 @@ def _well(axle: float, side: float) -> list[Patch]:
     angle = np.radians(np.linspace(-30.0, 210.0, 17))
     outwards = np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=1)
     arc = np.array([axle, 0.0, WHEEL]) + ARCH * outwards
-    # the edges of the curved wall: in the car's side, and farther in
+    # the edges of the curved wall: in the side of the car, and at its inner end
     outer_edge = arc + np.array([0.0, side * 0.79, 0.0])
     inner_edge = arc + np.array([0.0, side * 0.56, 0.0])
     edges = np.stack([outer_edge, inner_edge])
@@ -721,7 +721,7 @@ def _lamps(t: Texels) -> Array:
     """Paint headlights: two bright lamps on each side, with dark rings around them."""
     _, y, z = t.xyz.T
     abs_y = np.abs(y)
-    # from the middle of the nearer lamp
+    # distance from the middle of the nearer lamp
     lamp_distance = np.minimum(
         np.hypot(abs_y - 0.58, z - 0.62), np.hypot(abs_y - 0.71, z - 0.64)
     )

@@ -88,7 +88,7 @@ def chair(sampler: ParameterSampler) -> Instance:
     seat_thickness = sampler(3.6, low=2.4, high=5.5)
     leg_radius = sampler(2.1, low=1.5, high=3.0)
     splay = sampler(1.5, low=0.0, high=6.0)
-    lean = sampler(5.0, low=1.0, high=11.0)
+    lean = sampler(5.0, low=1.0, high=11.0)  # how far the back's top is behind the seat
     section = _leg_section(sampler)
     legs = _Legs(
         x=depth / 2 - leg_radius - LEG_INSET,
@@ -249,7 +249,7 @@ class _ChairBack(NamedTuple):
     Attributes:
         bottom, top: heights of the seat, and of the top of the back.
         bottom_x: x at the height of the seat.
-        lean: by how much the top lies farther back (towards -x) than that.
+        lean: how far the top is behind (towards -x) `bottom_x`.
         width: width between the posts.
         board_thickness: thickness of the boards in it.
     """
@@ -307,7 +307,7 @@ def _chair_back(
         legs: legs that the posts continue upwards.
         seat_height: height of the upper side of the seat.
         total_height: height of the top of the back.
-        lean: by how much the top lies farther back than the seat.
+        lean: how far the top is behind the seat.
     """
     style = sampler.pick("slats", "ladder", "panel", "arch")
     back = _ChairBack(

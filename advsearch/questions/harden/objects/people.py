@@ -211,7 +211,7 @@ def _face(t: Texels, color: Array, hair: Array) -> Array:
     skin = mix(skin, cheek_color, 0.5 * step(in_cheeks, 0.0, soft=0.6))
 
     brow_height = 1.659 - 14.0 * (abs_y - 0.034) ** 2  # an arch over each eye
-    has_brow = is_front & (np.abs(abs_y - 0.034) < 0.021)  # over the eye
+    has_brow = is_front & (np.abs(abs_y - 0.034) < 0.021)  # above an eye
     in_brow = np.where(has_brow, 0.0038 - np.abs(z - brow_height), -1.0)
     return mix(skin, hair, 0.8 * step(in_brow, 0.0, soft=0.0015))
 
@@ -238,8 +238,8 @@ def _irises(t: Texels, color: Array) -> Array:
     metres.
     """
     x, y, z = t.xyz.T
-    middle_z = float(0.5 * (z.min() + z.max()))  # of the eyes
-    # from the nearest pupil; all that is not at the front is white
+    middle_z = float(0.5 * (z.min() + z.max()))  # height of the eyes' middle
+    # distance from the nearest pupil; all that is not at the front is white
     is_front = x > 0.128
     pupil_distance = np.where(is_front, np.hypot(np.abs(y) - 0.031, z - middle_z), 1.0)
     iris = step(0.0065 - pupil_distance, 0.0, soft=0.001)

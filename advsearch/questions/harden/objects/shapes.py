@@ -565,7 +565,7 @@ def lathe(profile: Sequence[tuple[str, Points]], columns: int = 56) -> list[Patc
     for tag, curve, normals in zip(tags, curves, _profile_normals(curves), strict=True):
         starts_on_axis = curve[0, 0] < 1e-9  # a radius of 0, up to rounding
         ends_on_axis = curve[-1, 0] < 1e-9
-        touches_axis = starts_on_axis != ends_on_axis  # with one end
+        touches_axis = starts_on_axis != ends_on_axis  # with one of its ends
         radius_change = abs(curve[-1, 0] - curve[0, 0])
         _, length = _along(curve)
         is_flat = radius_change > 0.5 * length

@@ -431,7 +431,7 @@ def book(sampler: ParameterSampler) -> Instance:
     height = 22.5
     size = _BookSize(width, height, thickness=sampler(4.2, low=2.2, high=6.0))
     board = sampler(0.34, low=0.2, high=0.45)  # thickness of a cover
-    overhang = sampler(0.4, low=0.2, high=0.6)  # of the covers over the pages
+    overhang = sampler(0.4, low=0.2, high=0.6)  # how far covers extend over the pages
     bulge = sampler(0.35, low=0.0, high=0.7)
     patches: list[Patch] = []
     for z in (board / 2, size.thickness - board / 2):
@@ -754,8 +754,10 @@ def _word_strokes(letters: str, height: float) -> list[Array]:
         letters: keys of `_STROKES`.
         height: height of a letter.
     """
-    spacing = 0.74  # from letter to letter, in heights; a letter is 0.6 wide
-    half_gap = 0.07  # at the left of each letter
+    # in heights of a letter, which is 0.6 wide: distance between letters, and half of
+    # the gap between them
+    spacing = 0.74
+    half_gap = 0.07
     strokes = []
     for index, letter in enumerate(letters):
         left = ((index - len(letters) / 2) * spacing + half_gap) * height

@@ -619,9 +619,9 @@ def _seal(t: Texels, bottom: float, height: float) -> Array:
         bottom, height: lower edge and height of the label.
     """
     x, y, z = t.xyz.T
-    # from the middle of the label, wrapped to [-180, 180) degrees
+    # azimuth from the middle of the label, wrapped to [-180, 180) degrees
     degrees = (np.degrees(np.arctan2(y, x)) - LABEL_AZIMUTH + 180.0) % 360.0 - 180.0
-    radius = float(np.hypot(x, y).max())  # of the bottle
+    radius = float(np.hypot(x, y).max())  # radius of the bottle
     center_distance = np.hypot(
         np.radians(degrees) * radius, z - (bottom + 0.2 * height)
     )
