@@ -37,8 +37,8 @@ class Backwards:
     stats = WorkerStats(workers=1)
 
     def __init__(self, work: WorkerTask, lost: str) -> None:
-        self.call, self.lost = parts.attacks_of(work.settings), lost
-        assert work.function == "advsearch.questions.attack.studies:attacks_of"
+        self.call, self.lost = parts.make_chain_worker(work.settings), lost
+        assert work.function == "advsearch.questions.attack.studies:make_chain_worker"
 
     def compute(self, ranges: Iterable[range]) -> Iterator[BatchResult]:
         for one in reversed(list(ranges)):

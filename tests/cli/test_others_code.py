@@ -21,7 +21,7 @@ from advsearch.cluster.worker import run_batch
 from advsearch.errors import InputError
 from advsearch.questions.attack.carry_out import load_parts_of_run
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.attack.studies import attacks_of
+from advsearch.questions.attack.studies import make_chain_worker
 from advsearch.questions.photographs.carry_out import Photographs
 from advsearch.questions.photographs.pages import PhotographPages
 from advsearch.runs.directory import RunDirectory
@@ -192,7 +192,7 @@ PYTHON: dict[str, Callable[[], object]] = {
     "assert_suite": lambda: testing.assert_suite("suite.yaml"),
     "a thread": lambda: Photographs().add(Path("runs/kept"), "0", photograph()),
     "a worker": in_a_worker,
-    "a worker of a study": lambda: attacks_of(
+    "a worker of a study": lambda: make_chain_worker(
         AttackConfig(object="mug,bowl", model=NAME, controls={"pose": {}}).to_json()
     )([0]),
 }

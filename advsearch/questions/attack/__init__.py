@@ -23,15 +23,17 @@ from advsearch.questions.attack.summary import (
     view=make_attack_view,
     claims=make_attack_claims,
     page=make_page,
-    other_results=BY_FIELD,
+    other_results=BY_FIELD,  # a curve and a matrix, instead of an `AttackSummary`
 )
 def attack(
     context: RunContext[AttackConfig],
 ) -> AttackSummary | CurveResult | MatrixResult:
-    """Find the worst configuration of a scene, and verify it with fresh renders; or do
-    so for several.
+    """Find the worst configuration of a scene, and verify it with fresh renders.
+
+    Several objects or epsilons make a curve of robust accuracy, and several models a
+    matrix of adversarial scenes and models.
     """
-    # imports torch
+    # imported here because they import torch
     from advsearch.questions.attack.run import attack_once
     from advsearch.questions.attack.studies import curve, matrix
 

@@ -16,18 +16,20 @@ from advsearch.engine.verifier import Verifier
 
 MAX_LUX = 1e5  # direct sun: nothing brighter is tried
 N_BISECTIONS = 2
-"""Bisections between the last ambient light in which it holds and the first in which it
-does not: they end at a factor of 1.19.
+"""Bisections between the brightest ambient light in which the configuration holds and
+the darkest in which it fails. They begin with a factor of 2 between the two, and end
+with 1.19.
 """
 
 
 def find_ambient(verifier: Verifier, u: Tensor) -> None:
     """Find the ambient light in which a verified configuration no longer holds.
 
-    The ambient light is doubled until the configuration fails; then the limit is
-    bisected between the last two lights. Nothing else changes: since exposure follows
-    the ambient light, the projector's light gets darker in the image. The trials have
-    the same seeds in every light, which no other stage uses. The results are stored in
+    It is searched for the light of a projector. The ambient light is doubled until the
+    configuration fails; then the limit is bisected between the last two lights. Exposure
+    follows the ambient light, so that the projector's light gets darker in the image.
+    Nothing else changes. The trials have the same seeds in every light, and no other
+    stage uses these seeds. The results are stored in
     `verifier.state.ambient_verifications`, by lux.
 
     Args:
@@ -38,7 +40,7 @@ def find_ambient(verifier: Verifier, u: Tensor) -> None:
     findings = verifier.state
     scene_lux = _find_scene_lux(problem)
     if scene_lux is None or findings.verification is None:
-        return
+        return  # no light of the attack competes with the ambient light
     findings.ambient_verifications[scene_lux] = findings.verification
 
     def holds(lux: float) -> bool:
@@ -76,10 +78,11 @@ def _verify_in_light(
         factor: the ambient light as a multiple of the scene's.
     """
     problem = verifier.problem
-    n_renders = 2 * verifier.n_trials  # of the clean scene, and of the configuration
+    # trials of the clean scene, and as many of the configuration
+    n_renders = 2 * verifier.n_trials
     title = f"trying it in ambient light of {lux:.3g} lux"
     verifier.begin_stage(title, n_renders, name="ambient", at_most=True)
-    # The factor is the key by which workers find the problem in that light.
+    # Workers find the problem in that light by its key, which is the factor.
     evaluator = ParallelEvaluator(
         with_ambient_light(problem, factor),
         verifier.journal.evaluator.executor,
@@ -101,9 +104,10 @@ def _verify_in_light(
 
 
 def _find_scene_lux(problem: Problem) -> float | None:
-    """Return the ambient light in lux that a searched control competes with.
+    """Return the ambient light of the scene in lux, if a searched control depends on it.
 
-    None if no control does, or if the ambient light is searched too.
+    Such a control adds light to the scene, as a projector does. None if there is no such
+    control, or if the ambient light itself is searched.
     """
     for control in problem.searched_space.controls:
         if control.competes_with_ambient:

@@ -1,7 +1,8 @@
-"""Load the parts of an attack from its settings, and make its problem of these.
+"""Load the parts of an attack from its settings, and make its problem from the parts.
 
-Everything that renders and judges single configurations begins with
-`problem_from_config` or `make_problem_on`; `advsearch.questions.attack.run` attacks.
+Experiments that render and evaluate single configurations, without a search, begin with
+`problem_from_config` or `make_problem_on`. The attack itself is in
+`advsearch.questions.attack.run`.
 """
 
 from __future__ import annotations
@@ -98,15 +99,15 @@ class AttackParts:
         config: the settings.
         scene: the clean scene.
         model_and_warnings: the model, and warnings of loading it.
-        task: not yet bound to the model.
-        controls: the searched ones.
+        task: the task, not yet bound to the model.
+        controls: the searched controls.
         random_controls: controls that vary by chance.
-        objective: a name, or the caller's function.
-        policy: may be the caller's.
+        objective: name of an objective, or the caller's function.
+        policy: policy that searches, which may be of the caller's own class.
         is_stored: whether the run is stored.
-        metrics: columns of the rows, by name.
-        clean_matrix: the matrix of light transport of the clean scene, which attacks
-            may share.
+        metrics: functions of an image, by the name of their column in the rows.
+        clean_matrix: the matrix of light transport of the clean scene. Attacks on the
+            same clean scene may share it.
     """
 
     config: AttackConfig
@@ -131,27 +132,29 @@ def load_parts(
         config: the settings.
         scene: scene to use instead of the one that the settings name.
         model: model to use instead of the one that the settings name. If both are
-            passed, the attack is not stored, and has no metrics.
+            passed, the attack is a step of another experiment. Then it is not stored,
+            and has no metrics, which are columns of stored rows.
     """
     if scene is None and len(config.objects) > 1:
         raise make_single_value_error("object", config.objects)
-    searched, sampled = make_attack_controls(config, config.controls, config.over)
+    searched, random_controls = make_attack_controls(
+        config, config.controls, config.over
+    )
     task, objective = make_task_and_objective(config, config.task, config.objective)
     policy = make_policy(config.policy_name, **config.policy_options)
     is_stored = scene is None or model is None
     scene = scene or naming.load_configured_scene(config)
+    warnings: list[str] = []
     if model is None:
-        loaded = load_ensemble(config.model, config, task)
-    else:
-        loaded = (model, [])
+        model, warnings = load_ensemble(config.model, config, task)
     metrics = judging.load_metrics(config.metrics) if is_stored else {}
     return AttackParts(
         config=config,
         scene=scene,
-        model_and_warnings=loaded,
+        model_and_warnings=(model, warnings),
         task=task,
         controls=searched,
-        random_controls=sampled,
+        random_controls=random_controls,
         objective=objective,
         policy=policy,
         is_stored=is_stored,
@@ -162,8 +165,8 @@ def load_parts(
 def load_parts_of_run(run: Path) -> AttackParts:
     """Load what is needed to evaluate the result of an attack's run.
 
-    The objective, the policy and metrics are replaced by default ones if they were the
-    caller's own: only the search used them.
+    The objective, the policy and the metrics may have existed only in the Python session
+    of the run. Then defaults replace them, because only the search used them.
 
     Args:
         run: the run directory.
@@ -177,10 +180,11 @@ def load_parts_of_run(run: Path) -> AttackParts:
     ]
     if missing:
         raise InputError(
-            f"{run}: {', '.join(missing)}: only the Python session that "
-            "asked has what judges its result"
+            f"{run}: {', '.join(missing)}: only the Python session that made the run "
+            "has this, and its result cannot be evaluated without it"
         )
-    return load_parts(with_evaluation_only(AttackConfig.from_yaml(run / CONFIG)))
+    config = AttackConfig.from_yaml(run / CONFIG)
+    return load_parts(with_evaluation_only(config))
 
 
 def move_to_photographs(
@@ -188,9 +192,9 @@ def move_to_photographs(
 ) -> tuple[dict[str, AttackParts], dict[str, AttackParts]]:
     """Return the parts of an attack with its scene in each photograph of a folder.
 
-    Beside each photograph is a camera file. What it states of camera, pose and ground
-    replaces the settings of the attack. Controls that vary by chance something that a
-    photograph fixes are left out.
+    Each photograph has a camera file next to it. The camera, the pose and the ground
+    that the file states replace the settings of the attack. A photograph fixes some
+    things, such as the sky. Controls that vary these by chance are left out.
 
     Args:
         parts: parts of the attack.
@@ -209,9 +213,12 @@ def move_to_photographs(
     photographs = scene.description.photographs
     if photographs is None:
         raise InputError(
-            f"{parts.config.object}: only the Python session that asked has the scene"
+            f"{parts.config.object}: only the Python session that made the run has the "
+            "scene"
         )
     used_photographs = list_used_photographs(parts.scene.description)
+    # The control of the kind "backdrop" chooses a photograph by chance. Here each scene
+    # is rendered into a single one.
     random_controls = tuple(
         control
         for control in parts.random_controls
@@ -227,7 +234,7 @@ def move_to_photographs(
             config=config,
             scene=replace(scene, description=description),
             random_controls=random_controls,
-            clean_matrix=CleanMatrix(),  # a new one: the clean scene is another
+            clean_matrix=CleanMatrix(),  # not shared: each has another clean scene
         )
     return parts_in_unused, parts_in_used
 
@@ -235,7 +242,7 @@ def move_to_photographs(
 def _set_photograph_folder(config: AttackConfig, folder: str) -> AttackConfig:
     """Return settings with which the scene is rendered into the photographs of a folder.
 
-    Settings that the camera files beside the photographs replace are left out.
+    Settings that the camera files of the photographs replace are left out.
 
     Args:
         config: settings of the attack.
@@ -243,7 +250,7 @@ def _set_photograph_folder(config: AttackConfig, folder: str) -> AttackConfig:
 
     Raises:
         FileFormatError: the folder cannot be used.
-        InputError: it is no such folder.
+        InputError: the folder has no photographs with camera files.
     """
     if not is_photograph_folder(folder):
         raise InputError(
@@ -281,9 +288,10 @@ def make_attack_controls(
     """Return the searched controls and those that vary by chance, with their settings.
 
     Args:
-        config: settings of the run; only a search has a budget.
-        searched: names, settings or instances.
-        random: names, settings or instances of those that vary by chance.
+        config: settings of the run. Their budget (`epsilon` and `norm`) is given to the
+            searched controls only.
+        searched: names, settings or instances of the searched controls.
+        random: names, settings or instances of the controls that vary by chance.
 
     Raises:
         InputError: a searched control has a distribution.
@@ -294,10 +302,9 @@ def make_attack_controls(
         for name, spec in getattr(control, "specs", {}).items():
             if has_distribution(spec):
                 raise InputError(
-                    f"`controls` {control.name}.{name}: expected values to search, "
-                    "which are all as good, got how "
-                    "likely each is; give a range, or put it into `over`, under which "
-                    "it varies by chance"
+                    f"`controls` {control.name}.{name}: expected values to search, got "
+                    "a probability distribution; give a range, or put the control into "
+                    "`over`, where it varies by chance"
                 )
     return controls, naming.make_configured_controls(config, random, are_searched=False)
 
@@ -310,27 +317,27 @@ def make_task_and_objective(
     Args:
         config: the settings.
         task: a name, settings or an instance.
-        objective: None for the task's own.
+        objective: a name or a function; None for the objective of the task.
 
     Raises:
         InputError: the objective does not fit the task or the goal.
     """
-    new_task = make_task(task)
+    unbound_task = make_task(task)  # not yet bound to a model
     if objective is None:
-        objective = new_task.objective
+        objective = unbound_task.objective
     check_objective(
         objective,
-        new_task.name,
+        unbound_task.name,
         targeted=config.target is not None,
         minimise=config.minimise,
     )
-    return new_task, objective
+    return unbound_task, objective
 
 
 def load_ensemble(
     model: AnyModel | Sequence[AnyModel], config: AttackConfig, task: Task
 ) -> tuple[Model, list[str]]:
-    """Load a model, or several ones as one ensemble.
+    """Load a model, or several models as an ensemble.
 
     Args:
         model: a name, a file or a module; or a sequence of these.
@@ -350,13 +357,13 @@ def check_from_config(config: AttackConfig) -> None:
     """Check that an attack can be made; nothing is rendered.
 
     Raises:
-        InputError: the settings name what does not exist, contradict themselves, or
-            give a result that cannot be evaluated.
+        InputError: the settings name something that does not exist, contradict each
+            other, or give a result that cannot be evaluated.
     """
     parts = load_parts(config)
     model, _ = parts.model_and_warnings
-    # The results of both calls are dropped: they raise errors for what does not fit.
-    _bind_task(parts, renders_clean_image=False)
+    # Both calls raise an error if something does not fit; their results are not used.
+    _bind_task(parts, is_calibrated=False)
     size = config.resolution or model.input_size
     make_space(
         (*parts.controls, *parts.random_controls),
@@ -367,11 +374,12 @@ def check_from_config(config: AttackConfig) -> None:
 def problem_from_config(
     config: SceneConfig, *, denoise: str | None = None
 ) -> tuple[Problem, list[str]]:
-    """Load what a configuration describes, without searching.
+    """Load the scene and the model of a configuration, and make their problem.
 
     Args:
         config: settings of an attack, or of another experiment with a scene and a
-            model; then the other settings of an attack are the defaults.
+            model. Settings of an attack that the other experiment lacks have their
+            defaults.
         denoise: denoiser to use instead of the setting.
 
     Returns:
@@ -508,29 +516,27 @@ def _check_objective_inputs(parts: AttackParts, problem: Problem) -> None:
 
 
 def _bind_task(
-    parts: AttackParts, *, renders_clean_image: bool = True
+    parts: AttackParts, *, is_calibrated: bool = True
 ) -> tuple[Task, Callable[[DescribeConfiguration, RenderSurfaces], Facts]]:
-    """Bind the task of an attack to its model.
-
-    Each member of an ensemble is checked and calibrated on its own model. Remarks of
-    tasks are added to the warnings of loading the model.
+    """Bind the task of an attack to its model, check it, and calibrate it.
 
     Args:
-        parts: the parts of the attack.
-        renders_clean_image: whether tasks are calibrated, for which a clean image may be
-            rendered.
+        parts: the parts of the attack. Remarks of the task are added to their warnings
+            of loading the model.
+        is_calibrated: whether the task is calibrated, for which a clean image may be
+            rendered; else it is only checked.
 
     Returns:
-        The task, and the function that gives it the ground truth of a configuration.
+        The task, and the function that makes its ground truth (facts) of a
+        configuration.
     """
     config = parts.config
-    model, warnings = parts.model_and_warnings
+    model, _ = parts.model_and_warnings
     task = parts.task
     if isinstance(parts.objective, str):
         task = task.with_objective(parts.objective)
-    task = judging.make_ensemble_task(task, model).on(
-        model, target=config.target, minimise=config.minimise
-    )
+    task = judging.make_ensemble_task(task, model)
+    task = task.on(model, target=config.target, minimise=config.minimise)
     make_scene_facts = partial(
         make_facts,
         parts.scene.description,
@@ -538,28 +544,28 @@ def _bind_task(
         config.label,
         judge=config.judge,
     )
-    # Facts are made with a function that describes the configuration. Here it is
-    # `dict`, which returns an empty description: all values are those of the scene.
-    scene_facts = make_scene_facts(dict)
-    ensemble = task if isinstance(task, EnsembleTask) else None
-    members = [(task, model)]
-    if ensemble is not None:
-        members = list(zip(ensemble.tasks, ensemble.models, strict=True))
-    member_tasks = list[Task]()
-    for member, network in members:
-        member_facts = scene_facts
-        if ensemble is not None:
-            member_facts = ensemble.select_facts(member, scene_facts)
-        prepared = _prepare_task(
-            parts, member, network, member_facts, is_calibrated=renders_clean_image
-        )
-        member_tasks.append(prepared)
-        warnings += [remark for remark in prepared.remarks if remark not in warnings]
-    if ensemble is None:
-        task = member_tasks[0]
+    # The facts of the clean scene. Their first argument is a function that describes
+    # the configuration: `dict` returns an empty description, with which all values are
+    # those of the scene. The second one, which renders surfaces, is not needed here.
+    clean_facts = make_scene_facts(dict)
+    if isinstance(task, EnsembleTask):
+        members = [
+            _prepare_task(
+                parts,
+                member,
+                member_model,
+                task.select_facts(member, clean_facts),
+                is_calibrated=is_calibrated,
+            )
+            for member, member_model in zip(task.tasks, task.models, strict=True)
+        ]
+        task = replace(task, tasks=tuple(members))
     else:
-        task = replace(ensemble, tasks=tuple(member_tasks))
+        task = _prepare_task(
+            parts, task, model, clean_facts, is_calibrated=is_calibrated
+        )
     if config.judge == ALL_THINGS:
+        # every thing in the scene is evaluated, not only the object
         task = make_each_thing_task(task)
     return task, make_scene_facts
 
@@ -567,9 +573,10 @@ def _bind_task(
 def choose_search_size(config: AttackConfig, problem: Problem) -> tuple[int, int]:
     """Return the steps of a search, and how many conditions each step evaluates.
 
-    Conditions are what varies by chance (setting `over`), such as the camera. If the
-    settings do not state both numbers, the defaults depend on how many numbers vary by
-    chance, and on whether images can be predicted, since rendered ones cost more.
+    Conditions are what varies by chance (setting `over`), such as the camera. A number
+    that the settings do not state has a default. It depends on how many parameters vary
+    by chance, and on whether matrices of light transport can predict the images of the
+    search: rendered images cost more.
 
     Args:
         config: the settings.
@@ -577,27 +584,30 @@ def choose_search_size(config: AttackConfig, problem: Problem) -> tuple[int, int
     """
     if problem.conditions is None:
         return config.steps or STEPS, 1
-    default_steps, default_draws = SIZE_OVER_PREDICTED
+    default_size = SIZE_OVER_PREDICTED
     if problem.conditions.dim == 1:
-        default_steps, default_draws = SIZE_OVER_SINGLE_PARAMETER
-    # whether images can be predicted depends on the number of steps
+        default_size = SIZE_OVER_SINGLE_PARAMETER
+    # Preparing a matrix costs more than it saves if there are few steps. So whether
+    # images are predicted depends on the number of steps.
+    default_steps, _ = default_size
     refusal = find_matrix_refusal(
         problem, config.steps or default_steps, config.specialise
     )
     are_images_rendered = refusal is not None
     if are_images_rendered:
+        # The norm "box" stands for parameters that have a range and no epsilon, such as
+        # a pose; they are few numbers.
         has_only_ranges = all(block.norm == "box" for block in problem.domain.blocks)
-        default_steps, default_draws = (
-            SIZE_OVER_NUMBERS if has_only_ranges else SIZE_OVER_RENDERED
-        )
+        default_size = SIZE_OVER_NUMBERS if has_only_ranges else SIZE_OVER_RENDERED
+    default_steps, default_draws = default_size
     return config.steps or default_steps, config.draws or default_draws
 
 
 def is_named(entry: Task | Policy[Any], make: Callable[[Any], object]) -> bool:
-    """Return whether a setting can name a task or a policy.
+    """Return whether a setting can describe a task or a policy.
 
-    It can if the task or policy is equal to the one that is made from its setting. One
-    of a user's own class, for example, is not.
+    It can if the setting makes an equal task or policy again. That fails, for example,
+    for an instance of a user's own class.
 
     Args:
         entry: the task or policy.
@@ -612,8 +622,9 @@ def is_named(entry: Task | Policy[Any], make: Callable[[Any], object]) -> bool:
 def with_evaluation_only(config: AttackConfig) -> AttackConfig:
     """Return the settings with which the adversarial scene of a run is evaluated.
 
-    Success depends on no metric, and not on the objective or the policy that searched,
-    which may exist only in the session of the run.
+    Metrics are dropped. An objective or a policy that is not bundled may exist only in
+    the session of the run, and the default replaces it. Whether the scene is a success
+    depends on none of these.
     """
     changes: dict[str, object] = {"metrics": {}}
     if config.objective is not None and config.objective not in OBJECTIVE_KINDS:
@@ -627,17 +638,18 @@ def _prepare_task(
     parts: AttackParts,
     task: Task,
     model: Model,
-    scene_facts: Facts,
+    clean_facts: Facts,
     *,
     is_calibrated: bool,
 ) -> Task:
     """Check that a model can be right about the scene, and calibrate its task.
 
     Args:
-        parts: the parts of the attack.
+        parts: the parts of the attack. Remarks of the task are added to their warnings
+            of loading the model.
         task: task of the model.
         model: the model, or one member of an ensemble.
-        scene_facts: ground truth of the clean scene.
+        clean_facts: ground truth of the clean scene.
         is_calibrated: whether the task is calibrated, for which a clean image may be
             rendered; else it is only checked.
 
@@ -645,25 +657,27 @@ def _prepare_task(
         InputError: no prediction of the model would be right.
     """
     config = parts.config
-    judging.check_truth(task, model, parts.scene, scene_facts, config.image_settings)
-    if not is_calibrated:
-        return task
-    return judging.calibrate_task(
-        task,
-        model,
-        [parts.scene],
-        config.label,
-        config.judge,
-        config.image_settings,
-    )
+    judging.check_truth(task, model, parts.scene, clean_facts, config.image_settings)
+    if is_calibrated:
+        task = judging.calibrate_task(
+            task,
+            model,
+            [parts.scene],
+            config.label,
+            config.judge,
+            config.image_settings,
+        )
+    _, warnings = parts.model_and_warnings
+    warnings += [remark for remark in task.remarks if remark not in warnings]
+    return task
 
 
 def open_executor(
     config: SceneConfig, function: str, progress: Progress
 ) -> AbstractContextManager[Workers | None]:
-    """Return the workers that run a function of a configuration.
+    """Open the workers that run a function of a configuration.
 
-    The context is None if no workers are requested: then this process does the work.
+    The context has None if no workers are requested: then this process does the work.
 
     Args:
         config: the settings.
@@ -671,8 +685,8 @@ def open_executor(
         progress: reports what the workers do.
 
     Raises:
-        InputError: the model is behind an address; a single process asks it, which
-            counts the calls.
+        InputError: workers are requested for a model behind an address. Only a single
+            process may call it, because it counts the calls.
     """
     # A worker gets the settings of the run, but must not start workers itself.
     in_process = {"workers": None, "cluster": None}
@@ -683,8 +697,7 @@ def open_executor(
     if (workers or cluster) and has_address(config.model):
         setting = "workers" if workers else "cluster"
         raise InputError(
-            f"{setting}: a model behind an address is "
-            "asked by one process, which counts "
-            "its calls; leave it out"
+            f"{setting}: a model behind an address is called by a single process, which "
+            "counts the calls; leave it out"
         )
     return open_workers(work, workers=workers, cluster=cluster, tell=progress.message)

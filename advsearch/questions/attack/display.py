@@ -24,7 +24,7 @@ from advsearch.report.views import Claim, Column, ResultPart, ShownResult
 from advsearch.runs.results import ControlGroup, VerifiedRate
 
 AttackResults = AttackSummary | CurveResult | MatrixResult
-# of a cell of a matrix, by its ending
+# what is appended to the rate in a cell of a matrix, by the ending of its trials
 ENDING_MARKS = {"found": " *", "already wrong": " (wrong already)"}
 
 
@@ -55,27 +55,32 @@ def _attack_claim(result: AttackSummary) -> Claim:
     verdict = wording.attack_verdict(result)
     extent = views.make_rate_extent("fresh renders that count as a success", rate)
     if result.ending == "found" and rate is not None and rate.successes:
-        text = f"{verdict} How many such configurations there are is not known."
+        text = f"{verdict} How many such configurations exist is not known."
         return views.claim("found", text, extent)
     if result.ending in views.FAILED_SEARCH_ENDINGS and rate is not None:
         searches = views.format_searches(
-            result.renders, result.policy, result.baseline is not None
+            result.renders, result.policy, random=result.baseline is not None
         )
         text = f"{verdict} Searched were {searches}. {views.NO_PROOF}"
         return views.claim("not found", text, extent)
-    unknown = f"the search ended as {result.ending!r} without trials that carry a claim"
-    return views.make_no_claim(
-        views.REASON_OF_ENDING.get(result.ending, unknown), verdict
+    other_reason = (
+        f"the search ended as {result.ending!r} without trials that support a claim"
     )
+    reason = views.REASON_OF_ENDING.get(result.ending, other_reason)
+    return views.make_no_claim(reason, verdict)
 
 
 def _matrix_claims(result: MatrixResult) -> Iterator[Claim]:
     """Yield what each scene of a matrix does to each model."""
     for row in result.table:
         for cell in row.tested:
-            searches = None  # on another model the scene was only tried
+            # A claim that nothing was found states how much was searched. On another
+            # model than the attacked one nothing was searched, and the scene only tried.
+            searches = None
             if cell.model == row.attacked:
-                searches = views.format_searches(row.renders, result.policy, False)
+                searches = views.format_searches(
+                    row.renders, result.policy, random=False
+                )
             name = f"searched on {row.attacked}, tried on {cell.model}"
             yield views.make_case_claim(name, cell.ending, cell.verified, searches)
 
@@ -83,8 +88,9 @@ def _matrix_claims(result: MatrixResult) -> Iterator[Claim]:
 def _view_attack(summary: AttackSummary) -> ShownResult:
     """Return the view of one attack: its verdict, tables, facts and cautions.
 
-    Facts with an empty text are left out.
+    Facts with an empty text are not displayed.
     """
+    # the page of an attack replaces the first section, the rates, by one with bars
     sections = [_rates_part(summary)]
     if summary.failures and summary.failures.tried:
         sections.append(make_failures_part(summary.failures, tried=True))
@@ -107,7 +113,7 @@ def _view_attack(summary: AttackSummary) -> ShownResult:
         "failures": failures_text(summary.failures) if summary.failures else "",
         "search": f"{summary.policy}, {steps}: {summary.ending}",
         "renders": wording.renders_text(summary),
-        # empty facts are left out; a page adds these two, and a text lacks them
+        # Only a page displays these two: it fills them in, in this order.
         "environment": "",
         "seed": "",
     }
@@ -116,7 +122,7 @@ def _view_attack(summary: AttackSummary) -> ShownResult:
         sections,
         facts,
         cautions=cautions,
-        says_interrupted=True,
+        says_interrupted=True,  # the verdict states that the attack was interrupted
     )
 
 
@@ -149,7 +155,7 @@ def _rates_part(summary: AttackSummary) -> ResultPart:
 def _rate_cells(
     outcome: str, rate: VerifiedRate | ControlGroup | None
 ) -> tuple[str, str]:
-    """Return a rate and its interval; `outcome` says what is counted."""
+    """Return a rate and its interval; `outcome` names what is counted, such as "right"."""
     if rate is None:
         return "not verified", ""
     n_counted = rate.correct if isinstance(rate, ControlGroup) else rate.successes
@@ -160,8 +166,8 @@ def _rate_cells(
 def make_ambient_parts(summary: AttackSummary) -> list[ResultPart]:
     """Return the section about ambient light, if it was tried.
 
-    It is about an image from a projector: up to which other light on the object it
-    still makes the model wrong.
+    The adversarial scene is lit by a projector. The section states up to which other
+    light on the object the model is still wrong.
     """
     light = summary.ambient
     if light is None:
@@ -171,8 +177,8 @@ def make_ambient_parts(summary: AttackSummary) -> list[ResultPart]:
         limit = f"no longer at {light.limit_lux:.3g} lux"
     factor = light.holds_to / light.lux
     text = (
-        f"Works up to {light.holds_to:.3g} lux, {factor:.3g} times the light that is "
-        f"there, and {limit}."
+        f"Works up to {light.holds_to:.3g} lux, {factor:.3g} times the light of the "
+        f"scene, and {limit}."
     )
     columns: Mapping[str, Column] = {
         "ambient light": "{0.lux:.3g} lux",
@@ -185,7 +191,8 @@ def make_ambient_parts(summary: AttackSummary) -> list[ResultPart]:
         "": lambda point: "holds" if point.holds else "ends",
     }
     note = (
-        "Exposure follows the ambient light: the projector alone is darker beside it."
+        "Exposure follows the ambient light: in brighter light the projector's image is "
+        "darker."
     )
     return [
         ResultPart.make_table(
@@ -195,12 +202,16 @@ def make_ambient_parts(summary: AttackSummary) -> list[ResultPart]:
 
 
 def failures_text(failures: DifferentFailures) -> str:
-    """Return where different failures were found, and how many hold."""
+    """Return where different failures were found, and how many hold.
+
+    They are counted in cells, into which some policies divide the space, or in draws.
+    """
     where = f"{failures.found} of {words.format_count(failures.examined, 'draw')}"
-    if failures.cells is not None:  # the space was divided into cells
+    has_cells = failures.cells is not None
+    if has_cells:
         where = (
             f"{failures.found} of {failures.cells} cells over "
-            f"{' and '.join(failures.over)} ({failures.examined} were seen)"
+            f"{' and '.join(failures.over)} ({failures.examined} were evaluated)"
         )
     if failures.share is not None:
         where += (
@@ -244,18 +255,19 @@ def _holds_text(failure: DifferentFailure) -> str:
 
 
 def range_text(failure: DifferentFailure) -> str:
-    """Return where a failure lies.
+    """Return the ranges of a failure as text.
 
     ``pose.yaw 36 to 72 degrees, material.kind brass``.
     """
     texts = []
     for name, bounds in failure.ranges.items():
-        if isinstance(bounds, str):
+        if isinstance(bounds, str):  # the option of a discrete choice
             texts.append(f"{name} {bounds}")
             continue
+        unit = ""
         value = failure.configuration.get(name)
-        has_unit = value is not None and value.unit not in words.PLAIN_UNITS
-        unit = f" {value.unit}" if value and has_unit else ""
+        if value is not None and value.unit not in words.PLAIN_UNITS:
+            unit = f" {value.unit}"
         low, high = map(words.format_number, bounds)
         texts.append(f"{name} {low} to {high}{unit}")
     return ", ".join(texts) or "anywhere"
@@ -277,11 +289,11 @@ CURVE_NOTE = (
 def _view_curve(result: CurveResult) -> ShownResult:
     """Return the view of robust accuracy against epsilon.
 
-    The chart needs several epsilons to be worth its place on a page. With a single one,
-    only a notebook shows it.
+    A notebook always draws the chart. A page has it only if there are several epsilons.
     """
     known = [point for point in result.curve if point.accuracy is not None]
-    # without the controls' own epsilons, which have no place on an axis
+    # A point without an epsilon stands for attacks in which each control had an epsilon
+    # of its own ("own" in the table): it has no position on the axis of the chart.
     points = [point for point in known if point.epsilon is not None]
     has_chart = len(points) > 1
     points_text = "; ".join(
@@ -365,7 +377,7 @@ def _curve_text(result: CurveResult, known: Sequence[CurvePoint]) -> str:
     """
 
     def at(epsilon: float | None) -> str:
-        """Return the end of a clause; empty for the controls' own epsilons."""
+        """Return " at epsilon 0.1"; empty if each control has an epsilon of its own."""
         return "" if epsilon is None else f" at epsilon {epsilon:g}"
 
     if not known or not result.table:
@@ -433,7 +445,7 @@ def _curve_claims(result: CurveResult) -> Iterator[Claim]:
         extent = views.Extent.from_count(
             "objects without a failure", point.robust, point.objects, point.interval
         )
-        budget = "the controls' own budget"
+        budget = "the controls' own budget"  # if each has its own epsilon
         if point.epsilon is not None:
             budget = f"epsilon {point.epsilon:g}"
         text = (

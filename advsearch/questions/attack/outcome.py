@@ -80,7 +80,7 @@ from advsearch.trust.writing import write_bytes
 from advsearch.viewer.pages import write_result
 
 T = TypeVar("T")
-MAX_LISTED_NUMBERS = 4096  # of a distribution, in a summary
+MAX_LISTED_NUMBERS = 4096  # larger distributions are left out of a summary
 
 
 def make_result(
@@ -107,37 +107,34 @@ def make_result(
         warnings: warnings so far.
         object_name: name of the object under attack.
         judge: the thing that is evaluated.
-        policy: policy by name, as requested.
-        objective: objective by name; None for the task's own.
+        policy: name of the requested policy.
+        objective: name of the objective; None for the objective of the task.
         printable: whether the search had print terms.
-        command_line: repeats the attack; None if no command does.
-        python_only: its parts that exist only in Python.
-        twins: a run of twins, which states how far the verdict holds.
+        command_line: command that repeats the attack; None if none does.
+        python_only: parts of the attack that exist only in Python.
+        twins: name or folder of a run of `advsearch twins`, which compared renders with
+            photographs; None without one.
     """
     problem = journal.problem
     search = findings.search
     run = journal.run
     stages.progress.stage("making the pictures and the report")
-    u = problem.domain.start  # without a search, both scenes are the clean one
+    u = problem.domain.start  # without a search, the adversarial scene is the clean one
     if search is not None:
         u = problem.domain.project(search.best_u)
-    # After Ctrl-C no images are rendered but those of the two scenes.
-    trial = None if findings.interrupted else choose_stored_trial(findings)
-    clean = StoredImage.render(problem, findings, problem.domain.start, trial)
-    adversarial = StoredImage.render(problem, findings, u, trial)
+    scene_images = _render_scenes(problem, findings, u)
     artifacts = problem.searched_space.get_artifact_images(u)
     if run is not None:
-        images = {"clean": clean, "adversarial": adversarial}
-        _write_files(run, problem, findings, u, images, artifacts)
-    drive = None  # both scenes along a path, if one varies by chance
+        _write_files(run, problem, findings, u, scene_images, artifacts)
+    drive = None  # the result for both scenes along a path, if one varies by chance
     if not findings.interrupted:
-        searched_u = None if search is None else u
-        drive = evaluate_drive(problem, searched_u, findings.spp, run)
+        adversarial_u = None if search is None else u
+        drive = evaluate_drive(problem, adversarial_u, findings.spp, run)
     summary = _summarize(
         findings,
         journal,
-        clean,
-        adversarial,
+        scene_images["clean"],
+        scene_images["adversarial"],
         run=None if run is None else str(run.path),
         object=object_name,
         judge=judge,
@@ -153,27 +150,51 @@ def make_result(
     )
     if run is not None:
         write_result(run, summary)
-        if not findings.interrupted:  # else the run may be continued, and needs them
+        # An interrupted run may be continued, and then needs what is cached.
+        if not findings.interrupted:
             run.store.delete_cached()
     return AttackResult(
-        summary,
-        None if run is None else run.path,
-        u,
-        clean.image,
-        adversarial.image,
-        artifacts,
-        search,
+        summary=summary,
+        run=None if run is None else run.path,
+        u=u,
+        clean=scene_images["clean"].image,
+        adversarial=scene_images["adversarial"].image,
+        artifacts=artifacts,
+        search=search,
         in_memory=tuple(journal.rows),
     )
+
+
+def _render_scenes(
+    problem: Problem, findings: RunState, u: Tensor
+) -> dict[str, StoredImage]:
+    """Render the clean scene and the adversarial one, as in a typical trial.
+
+    After Ctrl-C they are rendered with few samples, and not as in a trial.
+
+    Args:
+        problem: problem of the attack.
+        findings: findings of the attack.
+        u: (d,) the adversarial configuration.
+    """
+    trial = None if findings.interrupted else choose_stored_trial(findings)
+    return {
+        "clean": StoredImage.render(problem, findings, problem.domain.start, trial),
+        "adversarial": StoredImage.render(problem, findings, u, trial),
+    }
 
 
 def _find_twins(
     twins: str | None, problem: Problem, object_name: str
 ) -> TwinEvidence | None:
-    """Return how far the verdict holds for photographs, by a run of twins, if any.
+    """Return how well renders agreed with photographs in a run of twins, if any.
+
+    The agreement was measured under certain conditions, among them the environment and
+    whether the renders were in a photograph. Those nearest to the attack are chosen.
 
     Args:
-        twins: the run, which compared renderings with photographs of the same scene.
+        twins: name or folder of a run of `advsearch twins`, which compared renders with
+            photographs of the same scene.
         problem: problem of the attack.
         object_name: name of the object under attack.
     """
@@ -208,14 +229,14 @@ def _write_files(
         problem: problem of the attack.
         findings: findings of the attack.
         u: (d,) the adversarial configuration.
-        images: images of both scenes.
-        artifacts: images that the controls make of `u`.
+        images: images of both scenes, by "clean" and "adversarial".
+        artifacts: images that the controls make of `u`, by name, such as the texture.
     """
     save_images(run, problem, findings, images)
     for number, verification in enumerate(findings.failure_verifications):
-        trial = (f"failure {number}", 0)
+        first_trial = (f"failure {number}", 0)  # the kind and the index of a trial
         name = _name_failure_image(number)
-        save_trial(run, problem, findings, trial, name, verification.u)
+        save_trial(run, problem, findings, first_trial, name, verification.u)
     # an 8-bit PNG, and the same display-referred values in float32
     for name, image in artifacts.items():
         run.save_image(name, image, folder="artifacts")
@@ -240,11 +261,16 @@ def _summarize(
         journal: journal of the run.
         clean: image of the clean scene.
         adversarial: image of the adversarial scene.
-        **fields: fields of the summary that follow from none of these.
+        **fields: the other fields of the summary.
     """
     problem = journal.problem
     task = problem.task
     max_depth = problem.renderer.scene.max_depth
+    adversarial_prediction = None
+    if findings.search is not None:
+        adversarial_prediction = _make_prediction(
+            adversarial.judgement, adversarial.trial
+        )
     return AttackSummary(
         **fields,
         **_summarize_controls(problem),
@@ -263,9 +289,7 @@ def _summarize(
         ),
         ending=_find_ending(problem, findings).value,
         clean=_make_clean_prediction(problem, findings, clean),
-        adversarial=None
-        if findings.search is None
-        else _make_prediction(adversarial.judgement, adversarial.trial),
+        adversarial=adversarial_prediction,
         ambient=_summarize_ambient(findings),
         average=_summarize_average(findings),
         smallest=_summarize_bracket(problem, findings),
@@ -296,16 +320,16 @@ def _summarize_controls(problem: Problem) -> dict[str, Any]:
 
 
 def _summarize_verification(problem: Problem, findings: RunState) -> dict[str, Any]:
-    """Return the fields of a summary about the trials of the configurations.
+    """Return the fields of a summary about trials, and about their sample count.
 
-    These are the trials of the clean scene, of the adversarial one and of the random
-    search, and the samples per pixel.
+    Trials are made of the clean scene, of the adversarial one and of the configuration
+    that the random search found.
     """
     verification = findings.verification
     adversarial_trials = verification.adversarial_trials if verification else ()
     samples = findings.sample_count
     # If the random search found a worse configuration than the policy, `verification`
-    # is that of its configuration, and this one is the policy's.
+    # is about that configuration, and `outdone` about the policy's.
     outdone = findings.outdone_verification
     return {
         "verified": _make_rate(verification),
@@ -392,16 +416,20 @@ def _make_clean_prediction(
     problem: Problem, findings: RunState, picture: StoredImage
 ) -> CleanPrediction:
     """Return the prediction of the clean scene, with its trials if there are any."""
-    control = None
+    control_group = None
     if findings.clean_trials:
-        control = make_control_group(findings.clean_trials, findings.spp)
+        control_group = make_control_group(findings.clean_trials, findings.spp)
+    # values of the scene that were outside of a control's range, and were replaced
+    adjusted_values = [
+        MovedValue.from_values(value) for value in problem.space.adjusted_defaults
+    ]
+    # `CleanPrediction` has the fields of `PicturedPrediction` and some more.
+    picture_fields = vars(_make_prediction(picture.judgement, picture.trial))
     return CleanPrediction(
-        **vars(_make_prediction(picture.judgement, picture.trial)),
+        **picture_fields,
         correct=picture.judgement.right,
-        moved=[
-            MovedValue.from_values(value) for value in problem.space.adjusted_defaults
-        ],
-        control=control,
+        moved=adjusted_values,
+        control=control_group,
     )
 
 
@@ -431,8 +459,8 @@ def _summarize_ambient(findings: RunState) -> AmbientLight | None:
         )
         for lux, verification in sorted(findings.ambient_verifications.items())
     ]
-    # The first point is the scene's own light, in which the scene was verified. Points
-    # count up to the first that does not hold, whatever holds beyond it.
+    # The first point always holds: it is the scene's own light, in which the scene was
+    # verified. Points count up to the first that does not hold, whatever follows it.
     n_holding = 0
     while n_holding < len(points) and points[n_holding].holds:
         n_holding += 1
@@ -458,8 +486,8 @@ def _summarize_average(findings: RunState) -> AverageCase | None:
     ]
     trials = visible or findings.random_trials
     right = count_right(trials, findings.spp)
-    scores = [trial.score for trial in trials]
-    known_scores = [score for score in scores if not math.isnan(score)]
+    # without NaN, which `max` cannot order
+    scores = [trial.score for trial in trials if not math.isnan(trial.score)]
     # A score is the negative of a margin. It is negated as `0.0 - x`, since -x of 0.0
     # would be -0.0.
     return AverageCase(
@@ -468,7 +496,7 @@ def _summarize_average(findings: RunState) -> AverageCase | None:
         accuracy=right.rate,
         interval=right.interval,
         margin=0.0 - mean_number(scores),
-        worst_margin=0.0 - max(known_scores, default=math.nan),
+        worst_margin=0.0 - max(scores, default=math.nan),
     )
 
 
@@ -512,11 +540,13 @@ def _make_search_claim(search: SearchResult) -> SearchClaim:
 
 def _summarize_gradients(search: SearchResult) -> SearchGradients:
     """Return the statistics of the gradients of a search."""
+    # without steps whose objective was not finite
     norms = [
         record.gradient_norm
         for record in search.history
         if not math.isnan(record.objective)
     ]
+    # `agreement` has the cosine of each gradient with the previous one.
     median_cosine = None
     if search.agreement:
         median_cosine = statistics.median(search.agreement)
@@ -524,9 +554,9 @@ def _summarize_gradients(search: SearchResult) -> SearchGradients:
         count=search.gradients,
         cosine_with_the_one_before=median_cosine,
         zero=sum(norm == 0.0 for norm in norms),
-        cut=search.counts.cut,
-        shortened=search.counts.shortened,
-        rejected=search.counts.rejected,
+        cut=search.counts.cut,  # gradients in which single outliers were clipped
+        shortened=search.counts.shortened,  # gradients that were outliers in length
+        rejected=search.counts.rejected,  # steps that were taken back
     )
 
 
@@ -553,17 +583,16 @@ def _summarize_distribution(
 def name_objective(task: Task, objective: str | None) -> str:
     """Return the name of what a search maximised.
 
-    "score" is the task's own score. A detector may have a goal, such as "create"; then
-    the score is named after it. With the goal "vanish", a detector's default, the name
-    stays "score".
+    "score" is the task's own score. A detector has a goal, its attribute `seek`, such as
+    "create". Its score is named after the goal, unless that is the default, "vanish".
 
     Args:
         task: task of the search.
-        objective: the requested objective; None for the task's own.
+        objective: the requested objective; None for the objective of the task.
     """
     name = objective or task.objective
-    is_score = name == Task.objective
-    goal = getattr(task, "seek", "")
+    is_score = name == Task.objective  # "score", the default of all tasks
+    goal = getattr(task, "seek", "")  # other tasks than detection have none
     has_special_goal = goal not in ("", Detection.seek)
     return str(goal) if is_score and has_special_goal else name
 
@@ -701,9 +730,9 @@ def _describe_conditions(problem: Problem) -> dict[str, VariedValue]:
         return ranges
     start = problem.add_conditions(problem.domain.start)
     domain = make_domain(problem.space.controls)
-    for group, (block, _) in zip(
-        problem.space.groups, domain.list_block_slices(), strict=True
-    ):
+    # Each parameter has a group in the space and a block in the domain. The group knows
+    # its first coordinate, the block how many options a choice has (0 for a number).
+    for group, block in zip(problem.space.groups, domain.blocks, strict=True):
         # The searched controls come first in the space.
         is_random = group.begin >= len(problem.domain.start)
         if group.size != 1 or not is_random:
@@ -712,6 +741,7 @@ def _describe_conditions(problem: Problem) -> dict[str, VariedValue]:
         for coordinate in _list_described_coordinates(block.options):
             u = start.clone()
             u[group.begin] = coordinate
+            # None if the control does not describe this parameter
             value = problem.space.describe(u).get(group.name)
             if value:
                 described.append(value)
@@ -743,7 +773,9 @@ def _to_range(described: Sequence[Value], *, is_choice: bool) -> VariedValue:
     numbers = [float(value) for value in values if isinstance(value, (int, float))]
     if numbers and not is_choice:
         return VariedValue(unit=unit, low=min(numbers), high=max(numbers))
-    names = [format_number(value) for value in dict.fromkeys(values)]
+    distinct_values = dict.fromkeys(values)
+    # `format_number` leaves texts as they are
+    names = [format_number(value) for value in distinct_values]
     return VariedValue(unit=unit, names=names)
 
 
@@ -751,8 +783,8 @@ def _count_renders(findings: RunState, problem: Problem) -> dict[str, int]:
     """Count the images of an attack by what they were rendered for.
 
     An evaluation of a search takes an image for each of the `n_draws` conditions that
-    it averages over, and so does a gradient. Images that were traced to prepare a
-    predictor count for the search.
+    it averages over. Images that were rendered to prepare a predictor count for the
+    search, and the first renders of the clean scene for the verification.
 
     Args:
         findings: findings of the attack.
@@ -761,13 +793,16 @@ def _count_renders(findings: RunState, problem: Problem) -> dict[str, int]:
     Returns:
         Numbers of images by "search", "gradient", "baseline" (the random search),
         "verification", "products" (images that were predicted instead of rendered) and,
-        if there was a search without print terms, "unprinted".
+        if there was a search without print terms, "unprinted" (its images and
+        gradients).
     """
     predictor = findings.predictor
     counts = dict.fromkeys(
         ("search", "gradient", "baseline", "verification", "products"), 0
     )
     counts["verification"] = findings.verification_renders + len(findings.first_look)
+    # Searches by the kind of their queries. The kind `UNPRINTED` is a sentence; its
+    # count has the shorter key "unprinted".
     searches = {
         "search": findings.search,
         "baseline": findings.baseline,
@@ -778,8 +813,8 @@ def _count_renders(findings: RunState, problem: Problem) -> dict[str, int]:
             continue
         n_predicted = 0
         if predictor:
-            n_steps = predictor.count_predicted(kind, len(search.history))
-            n_predicted = n_steps * problem.n_draws
+            n_predicted_steps = predictor.count_predicted(kind, len(search.history))
+            n_predicted = n_predicted_steps * problem.n_draws
         n_rendered = search.renders * problem.n_draws - n_predicted
         # A predicted image has its gradient without further renders.
         n_gradients = max(0, search.gradients - n_predicted)
@@ -816,8 +851,8 @@ def _make_remarks(findings: RunState, problem: Problem, journal: Journal) -> lis
         for search in (findings.search, findings.baseline)
         if search is not None
     )
-    # The renderer counts those of the searches, too, unless images were predicted: so
-    # the two counts overlap, and the larger one is stated.
+    # The renderer counts those of rendered searches, too, so that the two counts
+    # overlap: the larger one is stated, not the sum.
     n_non_finite = max(problem.renderer.non_finite, n_in_searches)
     if n_non_finite:
         remarks.append(
@@ -834,22 +869,21 @@ def _make_samples_remark(spp: int, *, has_conditions: bool) -> str:
         spp: samples per pixel of the verification.
         has_conditions: whether conditions vary by chance.
     """
-    text = f"It is not shown that more than {spp} samples a pixel"
     if not has_conditions:
         return (
-            f"{text}, the most that a check takes, would leave the margin on its "
-            "side: noise may decide the verdict."
+            f"More than {spp} samples per pixel, the most that was tried, might change "
+            "the sign of the margin: noise may decide the verdict."
         )
     return (
-        f"{text} would leave the rate within {100 * MAX_MOVED_FRACTION:.0f} points. "
-        "A check takes no more than "
-        f"{OVER_LADDER[-1]}, and {MAX_SAMPLE_RATIO} times the samples of the "
-        "searches; `verify_spp` asks for more."
+        f"More than {spp} samples per pixel might change the rate by more than "
+        f"{100 * MAX_MOVED_FRACTION:.0f} points. At most {OVER_LADDER[-1]} are tried, "
+        f"and at most {MAX_SAMPLE_RATIO} times the samples of the searches; "
+        "`verify_spp` sets more."
     )
 
 
 def describe_failures(problem: Problem, findings: RunState) -> DifferentFailures | None:
-    """Return the failures that a search found which differ from each other.
+    """Return the failures of a search that differ from each other.
 
     None if the policy does not look for several failures.
 
@@ -861,23 +895,23 @@ def describe_failures(problem: Problem, findings: RunState) -> DifferentFailures
     if known is None:
         return None
     verifications = findings.failure_verifications
-    n_verified = len(verifications)  # only the first failures are verified
-    listed = [
-        _describe_failure(
-            problem,
-            failure,
-            number,
-            verifications[number] if number < n_verified else None,
-        )
-        for number, failure in enumerate(known.examples)
-    ]
+    n_tried = len(verifications)  # only the first failures are tried
+    listed = []
+    for number, failure in enumerate(known.examples):
+        verification = verifications[number] if number < n_tried else None
+        listed.append(_describe_failure(problem, failure, number, verification))
+    failing_fraction = None
+    if known.failure_rate is not None:
+        failing_fraction = FailingShare.from_values(known.failure_rate)
+    # A policy may divide the space of some parameters into cells, and count in cells.
+    # `over` has the columns of u that span the cells.
     return DifferentFailures(
         over=[problem.domain.names[column] for column in known.over],
         found=known.n_failures,
         examined=known.n_visited,
         cells=known.n_cells,
-        share=known.failure_rate and FailingShare.from_values(known.failure_rate),
-        tried=n_verified,
+        share=failing_fraction,
+        tried=n_tried,
         verified=sum(
             verification.ending is Ending.FOUND for verification in verifications
         ),

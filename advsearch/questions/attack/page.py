@@ -1,6 +1,6 @@
 """The page of an attack: its result with images, and how the search went.
 
-Without its script it lacks the slider and the animation.
+Where scripts are blocked, the page lacks the slider and the animation.
 """
 
 from __future__ import annotations
@@ -37,11 +37,12 @@ from advsearch.viewer.pages import (
     read_object,
 )
 
-FRAME_QUALITY = 85  # of the JPEG frames of the search, from 1 to 95
-MAX_TRIAL_IMAGES = 24  # of the verification on a page
-# fraction of a range; a value as near to an end lies at it
+FRAME_QUALITY = 85  # JPEG quality of the frames of the search, from 1 to 95
+MAX_TRIAL_IMAGES = 24  # images of trials on a page
+# A value that is this close to the end of its range, as a fraction of the range, is at
+# the end.
 END_TOLERANCE = 1e-6
-MARKED = "-prediction.png"  # end of the names of files with marks
+MARKED = "-prediction.png"  # end of the names of images with marks
 
 
 def make_page(run: Path, result: Result) -> str | None:
@@ -60,14 +61,15 @@ def make_page(run: Path, result: Result) -> str | None:
     if not isinstance(result, AttackSummary):
         return None
     view = display.make_attack_view(result)
-    turned_object = read_object(run)
+    # file of the 3-D object that a script lets the reader turn; empty without one
+    object_file = read_object(run)
     frames = _read_frames(run / directory.IMAGES / "search.gif")
     objectives = _read_objectives(run)
     method_rows = [[name, text] for name, text in wording.method_texts(result).items()]
-    rates_table = view.sections[0]
+    rates_table = view.sections[0]  # the view of an attack begins with the rates
     sections = [
         *_image_parts(run, result, animated=bool(frames)),
-        make_object_part(turned_object),
+        make_object_part(object_file),
         _changes_part(result),
         _textures_part(run),
         *_failures_parts(result),
@@ -84,7 +86,7 @@ def make_page(run: Path, result: Result) -> str | None:
         "environment": result.environment,
         "seed": str(result.seed),
     }
-    # what the result is about, in a few names
+    # the subject of the result in a few names
     about = [
         wording.budget_text(result),
         result.object,
@@ -92,18 +94,18 @@ def make_page(run: Path, result: Result) -> str | None:
         result.model,
     ]
     view = replace(view, sections=sections, facts=facts, about=about)
-    # what the scripts of the page read
-    data = make_object_data(turned_object)
+    # script elements with data, which the scripts of the page read
+    data = make_object_data(object_file)
     if frames:
         data = [_frames_data(frames, objectives.get("search", [])), *data]
     scripts = ["make.js", "attack.js"]
-    if turned_object:
+    if object_file:
         scripts.append("object.js")
     return make_view_page(run, result, view, data=data, scripts=scripts)
 
 
 def _read_objectives(run: Path) -> dict[str, list[float | None]]:
-    """Read the objective of every evaluation of the search and of the baseline."""
+    """Read the objectives of the search and of the baseline, in order of evaluation."""
     if not (run / store.NAME).is_file():
         return {}
     with store.Store(run / store.NAME, read_only=True) as stored:
@@ -124,14 +126,15 @@ def _time_text(seconds: Mapping[str, float]) -> str:
 def _frames_data(frames: list[str], objectives: Sequence[float | None]) -> Html:
     """Return the frames of the search for the page's script.
 
-    The frames are evenly spaced over the evaluations, except for the last, which is the
-    adversarial scene. Each of the others has its step and the objective there.
+    The last frame is the adversarial scene. The others are evenly spaced over the
+    evaluations, and each has its step and the objective of that step.
 
     Args:
-        frames: data addresses.
+        frames: images of the frames as data URLs.
         objectives: objectives of all evaluations of the search.
     """
     last_step = max(len(objectives) - 1, 0)
+    # without the last frame, which belongs to no step
     steps = [round(step) for step in np.linspace(0, last_step, len(frames) - 1)]
     # an interrupted search may have no objective yet
     frame_objectives = [
@@ -146,7 +149,7 @@ def _image_parts(
 ) -> Iterator[ResultPart]:
     """Yield the sections with images.
 
-    Sections with `live` are filled by the page's script, and hidden without it.
+    A script of the page fills the sections with `live`. They are hidden without it.
 
     Args:
         run: the run directory.
@@ -204,7 +207,7 @@ def _clean_and_adversarial(summary: AttackSummary, suffix: str) -> list[Picture]
 
 
 def _trial_note(summary: AttackSummary) -> str:
-    """Return which conditions the images of both scenes have.
+    """Return under which conditions both scenes were rendered for their images.
 
     Empty if no conditions vary by chance.
     """
@@ -213,10 +216,10 @@ def _trial_note(summary: AttackSummary) -> str:
     if not conditions:
         return ""
     if trial is None:
-        return f"Both with the {conditions} that the scene comes with."
+        return f"Both with the {conditions} of the original scene."
     return (
-        f"Both of trial {trial}, with the same {conditions}; in other trials they, and "
-        "what the model says, are others."
+        f"Both from trial {trial}, with the same {conditions}. In other trials these "
+        "differ, and so may the prediction."
     )
 
 
@@ -226,7 +229,7 @@ def _find_trial_images(images: Path) -> list[Picture]:
     marked_names = [name for name in names if name.endswith(MARKED)]
     pictures = []
     for name in (marked_names or names)[:MAX_TRIAL_IMAGES]:
-        trial = "".join(filter(str.isdigit, name))  # of "verification-07.png" 07
+        trial = "".join(filter(str.isdigit, name))  # "verification-07.png" is trial 07
         pictures.append(Picture(f"images/{name}", f"trial {trial}"))
     return pictures
 
@@ -234,8 +237,8 @@ def _find_trial_images(images: Path) -> list[Picture]:
 def _changes_part(summary: AttackSummary) -> ResultPart:
     """Return the table of the parameters that were changed.
 
-    Columns that are empty in all rows are left out. If any column is left out, there
-    are no bars of the ranges either.
+    A column that is empty in all rows is left out. Bars of the ranges are drawn only if
+    no column is left out.
     """
     rows = []
     bars = []
@@ -263,7 +266,10 @@ def _changes_part(summary: AttackSummary) -> ResultPart:
 
 
 def _range_text(changed: FoundValue) -> str:
-    """Return the range of a number, and whether it is at an end; empty without one."""
+    """Return the range of a number, and whether the number is at its end.
+
+    Empty if it has no range, or if the value is not a single number.
+    """
     low = changed.low
     high = changed.high
     if low is None or high is None or not isinstance(changed.value, (int, float)):
@@ -275,19 +281,21 @@ def _range_text(changed: FoundValue) -> str:
 
 
 def _range_bar(changed: FoundValue) -> tuple[float, ...] | None:
-    """Return the bar from the clean value to the adversarial one: begin, end and mark.
+    """Return the bar between the clean value and the adversarial one: begin, end, mark.
 
-    All are in [0, 1] of the range, and the mark is the adversarial value. Without a
-    clean value, the bar has no length. None of what has no range, or several values.
+    These are fractions of the range, in [0, 1], and the mark is the adversarial value.
+    Without a clean value, the bar has no length. None if the parameter has no range, or
+    if its value is not a single number.
     """
     low = changed.low
     high = changed.high
     value = changed.value
     if low is None or high is None or not isinstance(value, (int, float)):
         return None
-    begin = changed.clean if isinstance(changed.clean, (int, float)) else value
-    points = (min(begin, value), max(begin, value), value)
-    return tuple(min(max((point - low) / (high - low), 0.0), 1.0) for point in points)
+    clean = changed.clean if isinstance(changed.clean, (int, float)) else value
+    points = (min(clean, value), max(clean, value), value)
+    fractions = [(point - low) / (high - low) for point in points]
+    return tuple(min(max(fraction, 0.0), 1.0) for fraction in fractions)
 
 
 def _textures_part(run: Path) -> ResultPart:
@@ -300,8 +308,8 @@ def _textures_part(run: Path) -> ResultPart:
     pictures = []
     for name in originals:
         adversarial = f"artifacts/{name.removesuffix('-original.png')}.png"
-        caption = f"texture that was found; {adversarial}"
-        pictures.append(Picture(f"artifacts/{name}", "texture as it was", "Original"))
+        caption = f"adversarial texture; {adversarial}"
+        pictures.append(Picture(f"artifacts/{name}", "original texture", "Original"))
         pictures.append(Picture(adversarial, caption, "Adversarial"))
     title = "The textures" if len(originals) > 1 else "The texture"
     return ResultPart(title, pictures=[pictures] if pictures else [], layout="pair")
@@ -332,21 +340,19 @@ def _failures_parts(summary: AttackSummary) -> Iterator[ResultPart]:
 def _rates_part(summary: AttackSummary, table: ResultPart) -> ResultPart:
     """Return the table of rates with bars; empty if there are no rates.
 
-    Its columns are in another order than in `table`: the rates and all that follows
-    them come right after the name, because a phone cuts what is on the right.
-
     Args:
         summary: summary of the attack.
         table: the same without bars, with the columns name, prediction, number, rate
             and interval.
     """
     average = summary.average
-    # in the order of the table's rows
+    # in the order of the table's rows, see `display._rates_part`
     rates: list[ControlGroup | VerifiedRate | None] = [summary.clean.control]
     if summary.adversarial:
         rates.append(summary.verified)
     if summary.baseline:
         rates.append(summary.baseline.verified)
+    # each bar is an interval with a mark at the rate
     bars = [None if rate is None else (*rate.interval, rate.rate) for rate in rates]
     if average:
         bars.append((*average.interval, average.accuracy))
@@ -354,12 +360,19 @@ def _rates_part(summary: AttackSummary, table: ResultPart) -> ResultPart:
         return ResultPart()
     spp = f", {summary.verified.spp} samples per pixel" if summary.verified else ""
     note = f"Fresh seeds, pictures rounded to 8 bits, Clopper-Pearson intervals{spp}."
-    heads, *rows = (
-        [name, *rate_and_interval, prediction, number]
-        for name, prediction, number, *rate_and_interval in (table.heads, *table.rows)
-    )
+
+    def put_rate_first(cells: Sequence[str]) -> list[str]:
+        """Move rate and interval right after the name: a phone cuts off the rest."""
+        name, prediction, number, rate, interval = cells
+        return [name, rate, interval, prediction, number]
+
     return replace(
-        table, title="Verified rates", heads=heads, rows=rows, bars=bars, note=note
+        table,
+        title="Verified rates",
+        heads=put_rate_first(table.heads),
+        rows=[put_rate_first(row) for row in table.rows],
+        bars=bars,
+        note=note,
     )
 
 
@@ -370,8 +383,8 @@ def _search_part(
 
     Args:
         summary: summary of the attack.
-        objectives: objective of each evaluation, None if it was not a number, of the
-            "search" and of the "baseline", the random search.
+        objectives: objectives of the "search" and of the "baseline", the random search,
+            in order of evaluation; None if an objective was not a number.
     """
     curves = dict[str, list[float | None]]()
     ranges = []
@@ -383,9 +396,10 @@ def _search_part(
             ranges.append(f"{name}: from {known[0]:.3g} to {max(known):.3g}")
     if not curves:
         return ResultPart()
-    # the text at the zero line, above which the search has what it seeks
+    # the text at the zero line: what a prediction is if the objective is above 0
     zero_means = ""
     if summary.objective in words.SUCCESS_ABOVE_ZERO:
+        # With the setting `minimise` the search seeks a right prediction.
         above = "right" if summary.minimises else wording.success_name(summary)
         zero_means = f"above: {above}"
     label = words.format_objective(summary.objective)
@@ -393,9 +407,8 @@ def _search_part(
         "The search",
         [f"{label} over evaluations. {'; '.join(ranges)}"],
         draw=partial(draw_searches, curves, label, zero_means=zero_means),
-        note="Lines: the best so far. Dots: each evaluation. These are the search's "
-        "claims; the table above is "
-        "verified.",
+        note="Lines: the best so far. Dots: each evaluation. These are claims of the "
+        "search; the table above is verified.",
     )
 
 
@@ -410,8 +423,8 @@ def _plan_part(plan: PlannedGradient) -> ResultPart:
     }
     spp = "" if plan.spp is None else f", {format_count(plan.spp, 'sample')} a pixel"
     renders = (
-        f"{format_count(plan.renders_per_gradient, 'render')} a gradient beside the "
-        "picture itself"
+        f"{format_count(plan.renders_per_gradient, 'render')} per gradient in addition "
+        "to the picture itself"
     )
     title = (
         f"Gradient plan: {format_count(len(plan.groups), 'parameter')}, {renders}{spp}"
@@ -420,8 +433,8 @@ def _plan_part(plan: PlannedGradient) -> ResultPart:
 
 
 def _step_text(group: GroupDerivative) -> str:
-    """Return the step of finite differences, and why it is that; empty without one."""
-    if not group.step_reason:
+    """Return the step of finite differences, and why it was chosen; empty without one."""
+    if not group.step_reason:  # the derivative takes no finite differences
         return ""
     step = f"{group.step:.3g} of its range"
     if group.step_in_unit is not None:
@@ -431,7 +444,7 @@ def _step_text(group: GroupDerivative) -> str:
 
 
 def _read_frames(file: Path) -> list[str]:
-    """Return the frames of an animation as data addresses of JPEG files.
+    """Return the frames of an animation as data URLs of JPEG files.
 
     There are none if the file is missing or corrupt, or has a single frame.
     """

@@ -79,38 +79,41 @@ def attack(
 ) -> AttackResult:
     """Search for the worst configuration of a scene, verify it, and return the result.
 
-    All other arguments are the settings of `advsearch attack`; `environment`, `up`,
-    `set` and `exposure` belong to a scene that is named here, not to one that is
-    loaded.
+    All other arguments are the settings of `advsearch attack`. The settings
+    `environment`, `up`, `set` and `exposure` apply only if `scene` is a name or a file,
+    and not if it is a loaded scene.
 
     Args:
-        scene: scene from `load_scene`, or what that takes.
-        model: model from `load_model`, or what that takes; with `ensemble`, several.
-        object: the node or shape that is the object, where `scene` is a file or
-            dictionary that holds several.
-        task: what judges the model's output: a name, a mapping with a `name` and
-            options, an instance, or a function (output, truth) that says how wrong it
-            is, over 0 where it is wrong (docs/tasks.md).
+        scene: scene from `load_scene`, or an object's name or file that it takes.
+        model: model from `load_model`, or a name, file or module that it takes; with
+            `ensemble`, a sequence of several.
+        object: the node or shape that is the object, if `scene` is a file or dictionary
+            with several.
+        task: task that evaluates the model's output: a name, a mapping with a `name`
+            and options, an instance, or a function (output, truth) that returns how
+            wrong the output is, above 0 if it is wrong (docs/tasks.md).
         controls: what may vary: names, instances, or a mapping from names to settings.
-        objective: "margin", "log_odds", "cross_entropy", "dlr", "feature_distance",
-            "score", or a function of (output, images (N, H, W, 3), truth, or the target
-            where there is one) or of (output, labels) that returns (N,) values, which
-            are maximised; in classification the output is logits (N, C) and the truth
-            the index of the right label, (N,), or a tuple of several. It may ask for
-            more by the names of further parameters: `u`, `texture`, `inputs`,
-            `configuration` (docs/own-loss.md). None takes the task's own.
+        objective: what is maximised: "margin", "log_odds", "cross_entropy", "dlr",
+            "feature_distance", "score", or a function that returns (N,) values. Its
+            parameters are (output, images, truth) or (output, labels), with images (N,
+            H, W, 3); if there is a target, it takes the place of the truth. In
+            classification the output is logits (N, C), and the truth is the index of
+            the right label, (N,), or a tuple of several. The function gets more if it
+            has parameters with the names `u`, `texture`, `inputs` or `configuration`
+            (docs/own-loss.md). None takes the objective of the task.
         policy: a name, a mapping with a `name` and options, or an instance.
         over: controls that vary by chance: the configuration has to hold for all of
             their values.
-        metrics: columns of the rows, by name: functions of (image (H, W, 3) sRGB in [0,
-            1], output of that picture, truth: the index of the right class) that return
-            a number or a dict. `workers` need functions of a module.
-        run: folder to keep the run in; None keeps it in memory only.
-        resume: go on with the run of that name, if there is one, where it was stopped;
-            everything else has to be as it was.
+        metrics: functions by the name of their column in the rows. Each takes (image
+            (H, W, 3) sRGB in [0, 1], output for that image, truth: the index of the
+            right class), and returns a number or a dict. With `workers`, they have to be
+            functions of a module.
+        run: directory in which the run is stored; None keeps the result in memory only.
+        resume: continue the run in that directory, if there is one, from where it was
+            stopped. All other arguments have to be the same as before.
     """
     options = _drop_unset(settings)
-    if callable(task):
+    if callable(task):  # a function; names, mappings and instances are read below
         task = make_task(task)
     _check_policy(policy)
     session_controls = [
@@ -130,9 +133,9 @@ def attack(
         config, scene, model, task, objective, policy, session_controls
     )
     config = config.with_python_only_parts(python_only)
-    _check_single(config)
+    _check_single_attack(config)
 
-    # The caller's objects are used, and what is only named is made.
+    # Objects of the caller are used as they are. What is only named is made.
     searched, random_controls = make_attack_controls(config, controls, over)
     if not isinstance(policy, Policy):
         policy = make_policy(config.policy_name, **config.policy_options)
@@ -141,11 +144,11 @@ def attack(
         task if isinstance(task, Task) else config.task,
         objective if callable(objective) else config.objective,
     )
-    context = _open_run(run, resume, config)
-    with context as directory:
+    # None if nothing is stored, or if `run_attack` makes the directory itself
+    with _open_run(run, resume, config) as directory:
         parts = AttackParts(
-            config,
-            scene,
+            config=config,
+            scene=scene,
             model_and_warnings=load_ensemble(model, config, loaded_task),
             task=loaded_task,
             controls=searched,
@@ -159,10 +162,10 @@ def attack(
 
 
 def _check_policy(policy: object) -> None:
-    """Check that a policy is named, described or made.
+    """Check that a policy is a name, a mapping or an instance.
 
     Raises:
-        InputError: it is not.
+        InputError: it is none of these, or empty.
     """
     if not isinstance(policy, (str, Mapping, Policy)) or not policy:
         raise InputError(
@@ -184,7 +187,7 @@ def _check_can_use_workers(
     session_controls: Sequence[Any],
     options: Mapping[str, Any],
 ) -> None:
-    """Raise an error if workers are requested for objects that they cannot load.
+    """Raise an error if workers are requested but cannot load what the caller passed.
 
     Workers are other processes. They load everything by its name, and do not have the
     objects of this session.
@@ -198,7 +201,7 @@ def _check_can_use_workers(
         options: the settings that the caller passed, perhaps with `workers`.
 
     Raises:
-        InputError: such a setting is among `options`.
+        InputError: workers are requested, and some object exists in this session only.
     """
     objects = [
         value
@@ -231,7 +234,7 @@ def _make_config(
         model: model or models.
         task: a name, settings or an instance.
         controls: controls that are searched.
-        objective: a name or a function; None for the task's own.
+        objective: a name or a function; None for the objective of the task.
         policy: a name, settings or an instance.
         over: controls that vary by chance.
         metrics: functions by name.
@@ -249,30 +252,28 @@ def _make_config(
         "policy": to_setting(policy) if isinstance(policy, Policy) else policy,
         "metrics": judging.metrics_to_settings(metrics or {}),
     }
-    if options.get("exposure"):  # which replaces the exposure of the scene
+    if options.get("exposure"):  # this setting replaces the exposure of the scene
         described["set"].pop("camera.exposure", None)
-    return AttackConfig(
-        **{**described, **options, "run": None if run is None else str(run)}
-    )
+    run_path = None if run is None else str(run)
+    return AttackConfig(**{**described, **options, "run": run_path})
 
 
 def _open_run(run: str | Path | None, resume: bool, config: AttackConfig) -> Any:
-    """Return a context with the run directory of an attack; None without one.
+    """Return a context with the run directory of an attack.
 
-    It is that of a run that is continued, or a new one.
+    The context has the path of an existing run that is continued, or of a new one. It
+    has None if nothing is stored.
 
     Args:
-        run: name or folder of the run; None keeps none.
-        resume: whether a run that is there is continued.
-        config: the settings.
+        run: name or directory of the run; None stores nothing.
+        resume: whether the run is continued if it exists.
+        config: the settings, which have the name of the run, too.
     """
-    resumed = None
-    if resume and run is not None and is_run(locate_run(run)):
-        resumed = locate_run(run)
-    context: Any = nullcontext(resumed)
-    if run is not None and resumed is None:
-        context = create_before_work(config)
-    return context
+    if run is None:
+        return nullcontext(None)
+    if resume and is_run(locate_run(run)):
+        return nullcontext(locate_run(run))
+    return create_before_work(config)
 
 
 def _find_python_only(
@@ -324,7 +325,7 @@ def _load_scene(
     """Return a scene, loaded with the options that belong to it.
 
     Args:
-        scene: loaded scene, a file, a name, or a dictionary of Mitsuba.
+        scene: a loaded scene, the name of an object, a file, or a dictionary of Mitsuba.
         shape: id of the shape that is the object, if the scene has several.
         options: the settings that the caller passed; those of the scene are used.
     """
@@ -334,10 +335,12 @@ def _load_scene(
     scene_options = {
         name: options[name] for name in naming.SCENE_SETTINGS if name in options
     }
-    # A configuration needs some object. "mug" is not used: only other settings are.
+    # The setting `object` is required, but its value "mug" is not used below.
     config = SceneConfig(**{"object": "mug", **scene_options})
     environment = config.environment
     keywords = naming.make_scene_kwargs(config)
+    # `load_scene` takes the object first. That is a shape of a scene with several, or
+    # else `scene` itself is the name or the file of an object.
     if shape is not None:
         return loading.load_scene(shape, environment, scene=scene, **keywords)
     if isinstance(scene, Mapping):
@@ -346,24 +349,28 @@ def _load_scene(
 
 
 def _name_objective(objective: Callable[..., Tensor]) -> str:
-    """Name an objective of the caller, never as one of the built-in ones."""
+    """Return a name for an objective of the caller.
+
+    It is that of the function, or of the class of an instance that can be called. If
+    this is also the name of a built-in objective, "own" is put before it.
+    """
     name = str(getattr(objective, "__name__", None) or type(objective).__name__)
     return f"own {name}" if name in OBJECTIVE_KINDS else name
 
 
 def _make_policy(setting: Any) -> Policy[Any]:
     """Make the policy that a setting names."""
-    # Only the policy of this configuration is used, but it needs some object.
+    # The setting `object` is required, but only the policy is used.
     config = AttackConfig(object="mug", policy=setting)
     return make_policy(config.policy_name, **config.policy_options)
 
 
-def _check_single(config: AttackConfig) -> None:
-    """Check that the settings are of one attack, which can be made.
+def _check_single_attack(config: AttackConfig) -> None:
+    """Check that the settings describe a single attack, which can be made.
 
     Raises:
-        InputError: they are of several attacks, or need a run directory or functions
-            that workers can load.
+        InputError: they describe several attacks. Or they request workers, but not with
+            functions that these can load; or layers, but no run directory for them.
     """
     if config.workers is not None or config.cluster is not None:
         judging.check_metrics_importable(config.metrics)
@@ -379,6 +386,4 @@ def _check_single(config: AttackConfig) -> None:
             "`advsearch attack` draw the curve"
         )
     if config.aov is not None and config.run is None:
-        raise InputError(
-            "aov: expected `run` beside it, the folder that keeps the layers; name one"
-        )
+        raise InputError("aov: needs `run`, the directory that the layers are saved in")

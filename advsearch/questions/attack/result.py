@@ -1,6 +1,7 @@
-"""The result of an attack as Python has it, and its images.
+"""The result of an attack in Python, and the images and files that its run stores.
 
-These are of trials, of the object to turn, and along a drive.
+Images are of both scenes, of trials, and of frames along a path (a drive). A file has
+the object for a browser, which lets the reader turn it.
 """
 
 from __future__ import annotations
@@ -65,10 +66,10 @@ class RenderKeywords(TypedDict, total=False):
 
 
 def _check_render_keywords(options: Mapping[str, Any]) -> None:
-    """Check that `render` has all these keywords.
+    """Check that `AttackResult.render` takes all these keywords.
 
     Raises:
-        TypeError: it lacks one.
+        TypeError: it does not take one of them.
     """
     unknown = sorted(options.keys() - RenderKeywords.__annotations__)
     if unknown:
@@ -120,20 +121,20 @@ class AttackResult:
 
     Attributes:
         summary: what `summary.json` holds.
-        run: the run directory, or None if it was not kept.
-        u: (d,) the configuration that was verified; the start where nothing was
+        run: the run directory; None if the run was not stored.
+        u: (d,) the configuration that was verified; the clean one if nothing was
             searched.
-        clean: (H, W, 3) display-referred sRGB in [0, 1], 8-bit values: the clean
-            configuration, as in the trial that the summary names; its `clean` has what
-            the model says of it.
-        adversarial: the same of `u`.
+        clean: (H, W, 3) display-referred sRGB in [0, 1], 8-bit values: image of the
+            clean configuration, rendered as in the trial `summary.clean.trial`.
+            `summary.clean` has the prediction.
+        adversarial: (H, W, 3) image of `u`, rendered as in the same trial.
         artifacts: images that the controls make from `u`, by name, such as the texture;
             (h, w, 3) sRGB in [0, 1].
-        search: the search's own log and claim; None where nothing was searched, and of
-            a run that was loaded.
-        in_memory: the rows, where there is no run directory.
-        parts: returns the parts that the attack was made of (scene, model, settings);
-            None for a result that came from another process.
+        search: log and claim of the search; None if nothing was searched, or if the
+            result was loaded from a run.
+        in_memory: the rows, if there is no run directory.
+        parts: function that returns the parts of the attack (scene, model, settings);
+            None if the result came from another process.
     """
 
     summary: AttackSummary
@@ -165,7 +166,7 @@ class AttackResult:
     def values(self) -> dict[str, Any]:
         """The adversarial configuration by name, such as `pose.yaw`, without units.
 
-        Of a texture, numbers that describe it. Empty if nothing was searched;
+        A texture has a few numbers that describe it. Empty if nothing was searched.
         `summary.configuration` has the units.
         """
         return {
@@ -184,8 +185,9 @@ class AttackResult:
     def history(self) -> list[float]:
         """The objective of each evaluation of the search, in order.
 
-        `rows("search")` has all that is known of them.
+        `rows("search")` has everything else that is stored of each evaluation.
         """
+        # The ranking renders the best configurations of the search again.
         rows = [row for row in self.rows("search") if row.phase != "ranking"]
         return [row.objective for row in rows if row.objective is not None]
 
@@ -206,10 +208,10 @@ class AttackResult:
         particular, the controls of `over` have their start values.
 
         Args:
-            model: None for the attack's own.
-            scene: another one with the same object; None for the attack's own.
-            camera: where it is seen from, ``{"azimuth": 130.0}``; or the name of one of
-                the scene's cameras.
+            model: another model; None for the model of the attack.
+            scene: another scene with the same object; None for the scene of the attack.
+            camera: parameters of the camera, ``{"azimuth": 130.0}``; or the name of one
+                of the scene's cameras.
             settings: parameters of the scene to fix to other values, e.g.
                 ``{"camera.azimuth": 130.0}``.
             **options: `resolution`, `spp`, `denoise`, `sampler`, `seed`, `around` and
@@ -217,26 +219,27 @@ class AttackResult:
 
         Raises:
             TypeError: there is no such keyword.
-            InputError: the adversarial configuration sets one of `settings` itself, or
-                has other numbers than the scene takes.
+            InputError: the adversarial configuration itself sets one of `settings`, or
+                has not as many numbers as the controls take in the other scene.
         """
         if self.parts is None:
             raise InputError(
                 "render: expected a result of this session, got one from another "
-                "process; load_run(FOLDER) has it "
-                "with all that it needs"
+                "process; load_run(FOLDER) loads one that can be rendered"
             )
         _check_render_keywords(options)
+        # `self.parts` is a function: parts of a stored run are loaded only when needed
         parts = self.parts()
         camera_name, settings = _split_camera(to_python(camera), to_python(settings))
         clashes = set(settings or {}) & set(self.summary.configuration or {})
         if clashes:
             raise InputError(
-                "settings: the adversarial configuration says what "
-                f"{min(clashes)} is; leave it out"
+                f"settings: the adversarial configuration sets {min(clashes)}; leave it "
+                "out"
             )
         task = parts.task
         if model is None:
+            # the attack's own model, which may be an ensemble
             model, _ = parts.model_and_warnings
             task = make_ensemble_task(task, model)
         return render(
@@ -250,7 +253,7 @@ class AttackResult:
         )
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what is pickled: not what only this session has."""
+        """Return what is pickled: all but the parts, which only this session has."""
         return {**vars(self), "parts": None}
 
     def rows(self, kind: str | None = None) -> Iterator[store.Row]:
@@ -266,9 +269,12 @@ class AttackResult:
             yield from results.rows(kind)
 
     def to_pandas(self, kind: str | None = None) -> Any:
-        """Return these rows as a `pandas.DataFrame`.
+        """Return every evaluated configuration as a row of a `pandas.DataFrame`.
 
         Columns are those of an export (docs/runs.md); its `attrs` have the units.
+
+        Args:
+            kind: "search", "verification", ...; None for all.
         """
         from advsearch.runs.tables import to_pandas  # pandas takes half a second
 
@@ -301,25 +307,25 @@ class AttackResult:
         return join_images([*self.images.values()])
 
 
-# of all meshes that are written to turn; larger meshes are simplified
+# faces in the file for a browser; meshes with more are simplified
 MAX_FACES = 30_000
-# between the centers of the object and of another mesh that is written with it, in
-# units of the object's extent
+# A mesh is near the object, and written into the file, too, if their centers are at
+# most this far apart, in units of the object's extent.
 MAX_NEAR_DISTANCE = 2.0
-# samples per pixel of the images that are stored if there were no trials
+# samples per pixel of the stored images of both scenes if there were no trials
 UNTRIED_SPP = 16
 
 
 @dataclass(frozen=True, eq=False)
 class StoredImage:
-    """An image of a configuration that is stored, as the model gets it.
+    """A stored image of a configuration, as the model gets it.
 
     Attributes:
-        full_configuration: the configuration of the full space.
+        full_configuration: the configuration, with the coordinates of the conditions.
         radiance: (H, W, 3) linear.
         image: (H, W, 3) sRGB, 8-bit values in [0, 1].
         judgement: judgement of the image.
-        trial: whose image it is; None if there were no trials.
+        trial: number of the trial with the same seed; None if there were no trials.
     """
 
     full_configuration: Tensor
@@ -337,8 +343,9 @@ class StoredImage:
         Args:
             problem: problem of the attack.
             findings: findings of the attack.
-            u: (d,) of the searched controls.
-            trial: None renders the conditions as the scene comes.
+            u: (d,) coordinates of the searched controls.
+            trial: number of the trial; None renders the scene with the start values of
+                the conditions.
         """
         if trial is None:
             seed = seeds.stream(problem.seed, "pictures")
@@ -365,20 +372,23 @@ class StoredImage:
 def choose_stored_trial(findings: RunState) -> int | None:
     """Return the number of the trial whose images of both scenes are stored.
 
-    A trial renders both scenes under the same conditions. The selected one is typical:
-    the first in which the model predicts what it predicts most often among the
-    successes (if there are none, among the trials that count). If possible, the clean
-    scene has its own most frequent prediction in it, too. None if there were no trials.
+    A trial renders both scenes under the same conditions. The chosen trial is typical:
+    the adversarial scene has its most frequent prediction among the successes. If no
+    trial is a success, it has the most frequent one among the trials that count. If
+    possible, the clean scene has its most frequent prediction, too. The first such
+    trial is chosen. None if there were no trials.
     """
     verification = findings.verification
     if verification is None:
         clean_labels = _list_labels(findings.clean_trials)
         return clean_labels.index(mode(clean_labels)) if clean_labels else None
     clean_labels = _list_labels(verification.clean_trials)
-    has_successes = bool(verification.successful_trials)
+    # The outcome of a trial is True for a success, False for a failure, and None if the
+    # trial does not count. A typical trial is a success if there are any.
+    typical_outcome = bool(verification.successful_trials)
     typical_trials = verification.successful_trials or verification.valid_trials
-    usual_label = mode(_list_labels(typical_trials))
-    usual_clean_label = mode(clean_labels)
+    frequent_label = mode(_list_labels(typical_trials))
+    frequent_clean_label = mode(clean_labels)
     # The criteria that each trial meets, the most important first. Tuples of bools are
     # compared in this order, so that the largest one is the most typical trial.
     ranks = list[tuple[bool, bool, bool]]()
@@ -388,12 +398,10 @@ def choose_stored_trial(findings: RunState) -> int | None:
         clean_labels,
         strict=False,  # trials of one scene may have ended earlier
     ):
-        has_usual_label = label == usual_label
-        # The outcome is None for a trial that does not count. It has to be a success if
-        # there are any, else a failure.
-        is_typical = has_usual_label and outcome is has_successes
-        has_usual_clean_label = clean_label == usual_clean_label
-        ranks.append((is_typical, has_usual_label, has_usual_clean_label))
+        has_label = label == frequent_label
+        has_label_and_outcome = has_label and outcome is typical_outcome
+        has_clean_label = clean_label == frequent_clean_label
+        ranks.append((has_label_and_outcome, has_label, has_clean_label))
     first_best = ranks.index(max(ranks))
     return verification.first_index + first_best
 
@@ -411,8 +419,8 @@ def save_images(
 ) -> None:
     """Save the images of an attack: of both scenes, of trials, and of the search.
 
-    These are both scenes and their difference, the first `MAX_STORED_IMAGES` trials,
-    and an animation of the search that ends with the adversarial scene.
+    These are both scenes and their difference, the first `MAX_STORED_IMAGES` trials of
+    the adversarial scene, and an animation of the search that ends with this scene.
 
     Args:
         run: run directory into which they are saved.
@@ -427,9 +435,10 @@ def save_images(
     )
     run.save_image("difference", difference)
     verification = findings.verification
+    # The kind under which the images of trials are cached. If the random search found
+    # a worse configuration, this is the adversarial one, verified as the baseline.
     kind = "verification"
     if findings.outdone_verification is not None:
-        # the random search's configuration was worse, and became the adversarial one
         kind = "baseline verification"
     if verification is not None:
         end = verification.first_index + len(verification.adversarial_trials)
@@ -438,14 +447,15 @@ def save_images(
                 run,
                 problem,
                 findings,
-                (kind, number),
-                f"verification-{number:02d}",
-                verification.u,
+                trial=(kind, number),
+                name=f"verification-{number:02d}",
+                u=verification.u,
             )
     if findings.frames:
         last_frame = scene_images["adversarial"].image
         if problem.conditions is not None and findings.search is not None:
-            # The other frames have the conditions as the scene comes.
+            # That image may have the conditions of a trial. Frames of the search have
+            # the start values of the conditions, and so must the last one.
             u = problem.domain.project(findings.search.best_u)
             last_frame = StoredImage.render(problem, findings, u, None).image
         run.save_animation("search", [*findings.frames, last_frame.numpy()])
@@ -454,7 +464,7 @@ def save_images(
 def _save_scene_image(
     run: RunDirectory, problem: Problem, name: str, image: StoredImage
 ) -> None:
-    """Save the image of a scene, its radiance, its marks and its layers.
+    """Save the image of a scene, its radiance, the same with marks, and its layers.
 
     Marks are what a task draws on an image, such as the boxes of a detector. Layers are
     ground truth for each pixel, such as depth, if the settings request any.
@@ -489,13 +499,14 @@ def save_trial(
     Args:
         run: run directory into which it is saved.
         problem: problem of the attack.
-        findings: findings of the attack; an image that it does not have is rendered
-            again.
+        findings: findings of the attack, with images of some trials; the image of
+            another trial is rendered again.
         trial: kind and number of the trial, such as ("verification", 3).
         name: name of the file without its suffix.
         u: (d,) the configuration.
     """
     _, number = trial
+    # Trials of the same number have the same seed in verifications of every kind.
     seed = seeds.stream(problem.seed, "verification", number)
     image = findings.trial_images.get(trial)
     if image is None:
@@ -515,11 +526,11 @@ def save_with_marks(
 
 
 def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
-    """Write the clean and the adversarial object as a file that a browser can turn.
+    """Write the clean and the adversarial object as a 3-D file for a browser.
 
     Other meshes that controls move or paint are written, too, if they are near. Meshes
-    with many faces are simplified, so that all together have at most about `MAX_FACES`;
-    the file has a note on it.
+    with many faces are simplified, so that all together have at most about `MAX_FACES`.
+    A note in the file states which.
 
     Args:
         run: run directory into which it is written.
@@ -535,22 +546,23 @@ def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
     changed_names = {OBJECT, *(name.partition(".")[0] for name in adversarial)}
     meshes = [mesh for name, mesh in scene.meshes.items() if name in changed_names]
     max_faces = MAX_FACES // len(meshes)
-    # None if a mesh has few faces already
-    simplify = {part.name: make_simplifier(part.mesh, max_faces) for part in meshes}
+    # functions by the name of the mesh; None if it has few faces already
+    simplifiers = {mesh.name: make_simplifier(mesh.mesh, max_faces) for mesh in meshes}
 
     def make_shapes(inputs: Mapping[str, Tensor]) -> list[Shape]:
         """Return the shapes near the object, with fewer faces."""
-        shapes = {part.name: pose_mesh(part, inputs) for part in meshes}
+        shapes = {mesh.name: pose_mesh(mesh, inputs) for mesh in meshes}
         near_shapes = []
         for shape in _select_near(shapes):
-            simplify_shape = simplify[shape.name]
-            if simplify_shape:
-                shape = replace(shape, mesh=simplify_shape(shape.mesh))
+            simplify = simplifiers[shape.name]
+            if simplify is not None:
+                shape = replace(shape, mesh=simplify(shape.mesh))
             near_shapes.append(shape)
         return near_shapes
 
     to_world = _find_camera_pose(adversarial, scene)
-    note = _describe_simplified(meshes, simplify)
+    simplified = [mesh for mesh in meshes if simplifiers[mesh.name] is not None]
+    note = _describe_simplified(simplified)
     glb = encode_web_glb(make_shapes(adversarial), make_shapes(clean), to_world, note)
     write_bytes(run.path / OBJECT_FILE, glb)
 
@@ -558,27 +570,27 @@ def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
 def _find_camera_pose(
     adversarial: Mapping[str, Tensor], scene: Any
 ) -> npt.NDArray[np.float64]:
-    """Return the camera's pose (4, 4): the one that a control set, or the scene's."""
+    """Return the camera's pose (4, 4): that which a control has set, or the scene's."""
     camera_pose = adversarial.get("camera.to_world")
     if camera_pose is None:
         return camera_to_world(scene)
     return camera_pose.double().numpy()
 
 
-def _describe_simplified(meshes: Sequence[Any], simplify: Mapping[str, object]) -> str:
-    """Describe which meshes have fewer faces in the browser; empty if none has."""
-    simplified = [
-        f"{len(part.mesh.faces):,} of {part.name}"
-        for part in meshes
-        if simplify[part.name]
-    ]
+def _describe_simplified(simplified: Sequence[Any]) -> str:
+    """Return the note on meshes that have fewer faces in the file; empty without any.
+
+    Args:
+        simplified: the meshes before they were simplified.
+    """
     if not simplified:
         return ""
-    return f"It is shown with fewer faces than it has ({', '.join(simplified)})."
+    full_counts = [f"{len(mesh.mesh.faces):,} of {mesh.name}" for mesh in simplified]
+    return f"It is shown with fewer faces than it has ({', '.join(full_counts)})."
 
 
 def _assemble(problem: Problem, u: Tensor) -> Mapping[str, Tensor]:
-    """Return the tensors that the scene takes for a configuration (d,), by name."""
+    """Return the inputs of the scene for a configuration (d,): tensors by name."""
     with torch.no_grad():
         inputs = problem.space.inputs(problem.add_conditions(u))
         return problem.renderer.scene.assembly(inputs)
@@ -600,10 +612,10 @@ def _select_near(shapes: Mapping[str, Shape]) -> list[Shape]:
     ]
 
 
-FRAMES = 24  # of each path
-MAX_STRIP_FRAMES = 8
-STRIP_HEIGHT = 160  # pixels
-MIN_FRAME_MILLISECONDS = 40
+FRAMES = 24  # frames of each path
+MAX_STRIP_FRAMES = 8  # frames in the image that has some of them side by side
+STRIP_HEIGHT = 160  # height of that image in pixels
+MIN_FRAME_MILLISECONDS = 40  # shortest time of a frame in the animation
 
 
 def evaluate_drive(
@@ -620,18 +632,21 @@ def evaluate_drive(
         run: run directory for the images; None saves none.
 
     Returns:
-        How many frames are right; None if no path varies.
+        In how many frames of each scene the model is right. `frames` counts those of
+        all paths, and `seconds` are those of a single path. None if no path varies.
     """
     path, time_column = _find_path(problem)
     if path is None:
         return None
-    paths, frames = _make_frames(problem, path, time_column)
+    path_names, frames = _make_frames(problem, path, time_column)
+    # All paths have the same range of times: the last frame is the end of any path.
     first_time = _read_time(problem, path, frames[0])
     last_time = _read_time(problem, path, frames[-1])
     seconds = last_time - first_time
     # The animation has the paths one after another; a single path has no name.
-    total_seconds = seconds * max(1, len(paths))
+    total_seconds = seconds * max(1, len(path_names))
     right_counts: dict[str, int] = {}
+    # the configuration of each scene, by the name of its files
     for name, configuration in (("drive-clean", problem.domain.start), ("drive", u)):
         if configuration is None:  # nothing was searched
             continue
@@ -643,7 +658,7 @@ def evaluate_drive(
     return AlongDrive(
         frames=len(frames),
         seconds=seconds,
-        paths=[str(name) for name in paths],
+        paths=[str(name) for name in path_names],
         clean=right_counts["drive-clean"],
         adversarial=right_counts.get("drive"),
         spp=spp,
@@ -651,17 +666,20 @@ def evaluate_drive(
 
 
 def _find_path(problem: Problem) -> tuple[Any, int]:
-    """Find the control that travels at random times.
+    """Find the control that moves things along a path, at a random time of it.
 
     Returns:
-        The control, None if there is no such one; and the column of its time in a full
-        configuration, which is the control's first coordinate.
+        The control, and the column of its time in a full configuration, which is the
+        control's first coordinate. If there is no such control, it is None, and the
+        column has no meaning.
     """
     n_searched = len(problem.searched_space.controls)
+    # Random controls come after the searched ones, in the order of the space.
     column = len(problem.domain.start)
     for control in problem.space.controls[n_searched:]:
+        # A time that a setting fixes has no coordinate.
         has_random_time = any(
-            slot.parameter.name == "time" and slot.n_coordinates
+            slot.parameter.name == "time" and slot.n_coordinates > 0
             for slot in control.slots
         )
         if control.travels and has_random_time:
@@ -677,7 +695,7 @@ def _make_frames(
 
     Args:
         problem: problem of the attack.
-        path: the control that travels.
+        path: the control that moves things along a path.
         time_column: index of its time among the coordinates.
 
     Returns:
@@ -690,9 +708,10 @@ def _make_frames(
     names = list(dict.fromkeys(choices))
     frames = start.repeat(max(1, len(names)), FRAMES, 1)  # (paths, FRAMES, d)
     frames[..., time_column] = torch.linspace(0.0, 1.0, FRAMES)
-    path_column = time_column + 1
+    path_column = time_column + 1  # the choice of path is the next coordinate
     for index, name in enumerate(names):
-        # Each choice has an equal part of [0, 1]: the center of the path's first one.
+        # Each choice has an equal interval of [0, 1]. The coordinate is the center of
+        # the first interval that belongs to this path.
         coordinate = (choices.index(name) + 0.5) / len(choices)
         frames[index, :, path_column] = coordinate
     return names, frames.flatten(0, 1)
@@ -746,7 +765,7 @@ def save_drive(
     images: Sequence[npt.NDArray[np.float32]],
     seconds: float,
 ) -> None:
-    """Save frames as an animation, NAME.webp, and some side by side, NAME.png.
+    """Save frames as an animation, NAME.webp, and some of them side by side, NAME.png.
 
     Args:
         run: run directory into which they are saved.

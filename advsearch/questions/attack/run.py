@@ -1,8 +1,7 @@
 """An attack, from its parts to its result.
 
-`run_attack` does all of it, to be read from top to bottom; `search_and_verify` is
-what it does with a problem, and `advsearch.questions.attack.stages` has each of its
-stages.
+`run_attack` makes the full attack. It calls `search_and_verify`, whose stages are in
+`advsearch.questions.attack.stages`.
 """
 
 from __future__ import annotations
@@ -67,14 +66,14 @@ def attack_once(
     resumed: Path | None = None,
     clean: CleanMatrix | None = None,
 ) -> AttackResult:
-    """Attack one object with one epsilon, as settings name them, in a run directory.
+    """Attack one object with one epsilon, and store the run.
 
     Args:
-        config: the settings.
-        progress: reports it.
+        config: the settings, which name the object, the model and everything else.
+        progress: reports the progress; None for no reports.
         resumed: the directory of the run that is continued; None for a new one.
-        clean: the matrix of the clean scene, shared with attacks whose settings differ
-            in epsilon alone.
+        clean: the matrix of light transport of the clean scene, to share it with
+            attacks whose settings differ only in epsilon; None to share none.
     """
     if config.run is not None and resumed is None:
         check_free(config.run, overwrite=config.overwrite)
@@ -86,7 +85,7 @@ def attack_once(
 
 
 def attack_on(config: AttackConfig, scene: Scene, model: Model) -> AttackResult:
-    """Attack a scene and a model that are loaded already; nothing is stored."""
+    """Attack a loaded scene and a loaded model; nothing is stored."""
     return run_attack(load_parts(config, scene, model), NullProgress())
 
 
@@ -97,15 +96,16 @@ def run_attack(
 
     Args:
         parts: scene, model, task, controls and policy, with the settings of the attack.
-        progress: reports it.
+        progress: reports the progress.
         resumed: the directory of the run that is continued; None for a new one.
 
     Raises:
-        InputError: parts do not fit together, or the run that is continued has others.
+        InputError: parts do not fit together, or the run that is continued was made
+            with other parts.
     """
     config = parts.config
     if config.twins is not None:
-        read_twins(config.twins)  # a check before the work: raises if it is corrupt
+        read_twins(config.twins)  # only a check, before the work: raises if corrupt
     model, loading_notes = parts.model_and_warnings
     with ExitStack() as stack:
         run = None
@@ -260,22 +260,24 @@ def search_and_verify(
         policy: proposes configurations.
         journal: journal of the problem; it replays what is stored of the run.
         stages: reports what is done.
-        clean: the matrix of the clean scene, of attacks that share it.
-        smallest: search the smallest budget in which the model is wrong instead of the
-            worst configuration.
+        clean: the matrix of light transport of the clean scene, if attacks share it.
+        smallest: whether the smallest budget in which the model is wrong is searched,
+            instead of the worst configuration.
         seconds: seconds that the search may take; None for no limit.
         baseline: whether a random search with as many renders is made.
-        printable: whether the objective includes print terms; then a search without
-            them is made, too.
-        close_looks: further renders of candidates that are close to the best.
-        average: random configurations to evaluate.
+        printable: whether the objective includes print terms, which keep colors
+            printable. Then a search without them is made, too.
+        close_looks: maximum number of further renders of candidates that are close to
+            the best.
+        average: number of random configurations to evaluate.
         trials: renders that verify a configuration; None for as many as its verdict
             needs.
-        ladder: samples per pixel that a verification may take.
-        specialise: whether what the search does not need may be left out, and images be
-            predicted.
-        measure: choice of the gradient estimators that are measured.
-        deterministic: whether counts decide instead of times.
+        ladder: samples per pixel that a verification may take, ascending.
+        specialise: whether renders may leave out what the search does not need, and
+            images may be predicted.
+        measure: which gradient estimators are measured.
+        deterministic: whether counted renders, and not measured times, decide which
+            estimator is best.
         chooses_spp: whether a full measurement may choose the samples per pixel of the
             search.
     """
@@ -327,10 +329,10 @@ def search_and_verify(
 
 
 def _choose_looks(problem: Problem, trials: int | None) -> tuple[int, ...]:
-    """Return the numbers of trials after which a verdict may be reached.
+    """Return the numbers of trials after which a verification may end.
 
-    A verification looks at its trials after each of these numbers, and ends as soon as
-    they suffice. Conditions that vary by chance need more trials.
+    A verification evaluates its trials after each of these numbers, and ends as soon as
+    they suffice for a verdict. Conditions that vary by chance need more trials.
 
     Args:
         problem: problem of the attack.
@@ -344,10 +346,11 @@ def _choose_looks(problem: Problem, trials: int | None) -> tuple[int, ...]:
 def search_with_baselines(
     searches: Searches, policy: Policy[Any], *, seconds: float | None, baseline: bool
 ) -> None:
-    """Search with a policy, and make up to two other searches to compare with.
+    """Search with a policy, and make up to two other searches to compare it with.
 
-    One is a search without print terms, if the objective has print terms. The other is
-    a random search, if it is requested and the policy is not itself random.
+    One is a search without print terms, if the objective has print terms, which keep
+    colors printable. The other is a random search, if it is requested and the policy is
+    not itself random.
 
     Args:
         searches: searches of the attack.
@@ -368,8 +371,8 @@ def search_with_baselines(
         "search", policy, steps, problem.seed, frames=findings.frames, seconds=seconds
     )
     if seconds is not None:
-        # The other searches get as many renders as fitted into the time. `history` has
-        # those of the steps; those of the ranking at the end come on top.
+        # The other searches get as many steps as the first one had renders for its steps
+        # within the time. `history` lacks the ranking that follows the steps.
         history = findings.search.history
         steps = max(1, history[-1].renders) if history else 1
     if searches.printable:
@@ -396,27 +399,34 @@ def choose_policy(
 ) -> Policy[Any]:
     """Return the policy that searches a problem: the requested one, or a special `auto`.
 
-    `auto` follows the model's gradient. If the model has no gradient, `auto` is
-    replaced by "nes", which estimates a gradient from differences. A model behind an
-    address (a remote one) has no gradient either. If only ranges are searched, without
-    any budget epsilon, `auto` then leaves out its gradient steps, and keeps its samples
-    and its surrogate model.
+    `auto` follows the model's gradient. What replaces it depends on the model and on
+    what is searched: ranges, such as a pose, or budgets with an epsilon, such as a
+    texture's.
+
+    - If the model is behind an address (a remote one), it has no gradient. For ranges
+      alone, `auto` leaves out its gradient steps, and keeps its samples and its
+      surrogate model. Otherwise "nes" replaces it, which estimates a gradient from
+      differences.
+    - If a local model has no gradient, "nes" replaces `auto` for budgets alone. If any
+      range is searched, `auto` stays.
 
     Args:
-        policy: the requested one.
+        policy: the requested policy.
         problem: problem that is searched.
-        gradient_setting: the setting that concerns derivatives; None if none does.
+        gradient_setting: name of a setting about derivatives that the user has set;
+            None if none is set.
 
     Raises:
-        InputError: the policy needs the gradient of a model that has none, or does not
-            use the derivatives that a setting concerns.
+        InputError: the policy needs the gradient of a remote model, or takes no
+            derivatives although a setting about them is set.
     """
-    # A block with the norm "box" is a range alone; others have a budget epsilon.
+    # A block of parameters with the norm "box" is a range; others have an epsilon.
     norms = {block.norm for block in problem.domain.blocks}
     has_only_ranges = norms == {"box"}
     has_only_budgets = "box" not in norms
     if isinstance(problem.model.module, RemoteNetwork):
         if policy.name == "auto":
+            # `WithoutAscent` is `auto` without gradient steps
             policy = WithoutAscent() if has_only_ranges else make_policy("nes")
         elif policy.uses_gradient:
             raise InputError(
@@ -437,14 +447,14 @@ def choose_policy(
 
 
 def _find_gradient_setting(config: AttackConfig) -> str | None:
-    """Return the name of a setting that concerns derivatives; None without any."""
+    """Return the name of a setting about derivatives that is set; None if none is."""
     if config.estimators:
         return "estimators"
     return "measure" if config.measure == "full" else None
 
 
 def find_user_functions(parts: AttackParts) -> dict[str, Callable[..., Any] | None]:
-    """Return the caller's own functions by what they are used for.
+    """Return the caller's own functions by their role, such as "objective".
 
     A run stores their digests, since it can only be continued with the same functions.
     """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, ClassVar, Literal
 
 from pydantic import JsonValue, model_validator
@@ -19,22 +20,23 @@ from advsearch.files import JsonObject
 from advsearch.settings import Clash, setting, setting_as_in, split_names
 from advsearch.trust import powers
 
-# Fresh renders that check what a search found, and what holds for many conditions
-TRIALS = 20
-TRIALS_OVER = 200
-STEPS = 40  # Of a search about one picture
+TRIALS = 20  # fresh renders that verify a configuration
+TRIALS_OVER = 200  # the same if conditions vary by chance (`over`)
+STEPS = 40  # steps of a search without conditions
+
+# If conditions vary by chance: steps of a search, and conditions that each step
+# evaluates.
 SIZE_OVER_PREDICTED = (300, 8)
+"""If a bank of matrices of light transport predicts the images."""
 SIZE_OVER_SINGLE_PARAMETER = (100, 4)
+"""If it predicts them, and only one number varies, such as a time (docs/drives.md)."""
 SIZE_OVER_RENDERED = (150, 4)
+"""If every image is rendered."""
 SIZE_OVER_NUMBERS = (STEPS, 4)
-"""Steps of a search for many conditions, and conditions that each evaluates: if a bank
-of light transport predicts images; if, besides, conditions are a single number
-(docs/drives.md); if each image is rendered; and if, besides, only a few numbers are
-searched (a pose).
-"""
+"""If every image is rendered, and only a few numbers are searched, such as a pose."""
 MIN_TRIALS = 6
-"""With fewer trials nothing can be called found: `attacks.verification.Rule.fewest`,
-which a test compares.
+"""With fewer trials nothing can be called found. A test compares it with the rules of
+verification, which `advsearch.attacks.verification` has.
 """
 
 
@@ -67,14 +69,13 @@ class AttackConfig(DerivativeConfig):
         Clash(
             "model",
             lambda config: config.is_matrix and config.is_curve,
-            "several make a matrix, of one object and one epsilon; name one `object` "
-            "and one `epsilon`, or one "
-            "`model`",
+            "several models make a matrix, for one object and one epsilon; name one "
+            "`object` and one `epsilon`, or one `model`",
         ),
         Clash(
             "ensemble",
             lambda config: len(split_names(config.model)) < 2,
-            "is of several models; name them in `model`, separated by commas, or "
+            "needs several models; name them in `model`, separated by commas, or "
             "leave `ensemble` out",
         ),
         Clash(
@@ -118,8 +119,8 @@ class AttackConfig(DerivativeConfig):
         Clash(
             "draws",
             lambda config: not config.over,
-            "is how many conditions of `over` a step looks at, and there are none; "
-            "add `over`, or leave `draws` out",
+            "is the number of conditions of `over` that a step evaluates, and there are "
+            "none; add `over`, or leave `draws` out",
         ),
         Clash(
             "estimators",
@@ -131,8 +132,8 @@ class AttackConfig(DerivativeConfig):
                     for part in (name, name.rpartition(":")[2])
                 }
             ),
-            "names a control that varies by chance, whose derivative nobody asks "
-            "for; leave it out",
+            "names a control that varies by chance, whose derivative is not needed; "
+            "leave it out",
         ),
         Clash(
             "average",
@@ -151,9 +152,8 @@ class AttackConfig(DerivativeConfig):
     model: str = setting_as_in(
         SceneConfig,
         "model",
-        description="the network under test; of several, separated by commas, each is "
-        "attacked and its adversarial "
-        "scene tried on all",
+        description="the network under test; if there are several, separated by commas, "
+        "each is attacked, and its adversarial scene is tried on all of them",
     )
     ensemble: Literal["mean", "worst"] | None = setting(
         None,
@@ -179,18 +179,16 @@ class AttackConfig(DerivativeConfig):
         "search",
         "number of search steps, each of which evaluates one configuration",
         otherwise=f"{STEPS}; for textures and the like with --over "
-        f"{SIZE_OVER_PREDICTED[0]} "
-        "where pictures are predicted, "
-        f"{SIZE_OVER_SINGLE_PARAMETER[0]} where one number varies, as along a path, "
-        "and "
-        f"{SIZE_OVER_RENDERED[0]} where they are rendered",
+        f"{SIZE_OVER_PREDICTED[0]} if pictures are predicted, "
+        f"{SIZE_OVER_SINGLE_PARAMETER[0]} if one number varies, as along a path, and "
+        f"{SIZE_OVER_RENDERED[0]} if they are rendered",
         ge=1,
         le=1_000_000,
     )
     seconds: float | None = setting(
         None,
         "search",
-        "stop the search after this time; the random search beside it "
+        "stop the search after this time; the random search for comparison "
         "gets as many renders",
         otherwise="no limit",
         unit="seconds",
@@ -217,15 +215,13 @@ class AttackConfig(DerivativeConfig):
         False,
         "search",
         "prefer a smooth texture or patch in printable colours; a second search "
-        "without this tells what it costs in "
-        "margin",
+        "without this measures what it costs in margin",
     )
     aov: str | None = setting_as_in(
         RenderConfig,
         "aov",
-        description="write ground truth of each pixel, names separated by commas, as "
-        "layers of an EXR, for the clean "
-        "scene and the adversarial one",
+        description="write ground truth for each pixel as layers of an EXR file, for "
+        "the clean scene and the adversarial one; names are separated by commas",
     )
     metrics: dict[str, str] = setting(
         dict,
@@ -257,12 +253,10 @@ class AttackConfig(DerivativeConfig):
         None,
         "search",
         "the path along which camera or object travel, with --over path; pictures of "
-        "the adversarial scene along it "
-        "are kept",
+        "the adversarial scene along the path are stored",
         "approach, pass, orbit, a .csv file or a trajectory (TUM, EuRoC, KITTI), or "
-        "two of them, the camera's and the "
-        "object's, as in approach+orbit; of "
-        "several with commas between them, one is drawn each time",
+        "two of them, the camera's and the object's, as in approach+orbit; if there are "
+        "several, separated by commas, one is drawn each time",
         otherwise="approach",
         min_length=1,
     )
@@ -270,7 +264,7 @@ class AttackConfig(DerivativeConfig):
         None,
         "search",
         "how long each row of a picture is exposed along a path (motion blur)",
-        otherwise="a still",
+        otherwise="no blur",
         unit="seconds",
         gt=0.0,
         le=60.0,
@@ -289,18 +283,16 @@ class AttackConfig(DerivativeConfig):
     draws: int | None = setting(
         None,
         "search",
-        "how many random conditions each step looks at, with --over",
-        otherwise=f"{SIZE_OVER_PREDICTED[1]} where pictures are predicted and more "
-        "than one "
-        "number varies, otherwise "
-        f"{SIZE_OVER_RENDERED[1]}",
+        "number of random conditions that each step evaluates, with --over",
+        otherwise=f"{SIZE_OVER_PREDICTED[1]} if pictures are predicted and more "
+        f"than one number varies, otherwise {SIZE_OVER_RENDERED[1]}",
         ge=1,
         le=1000,
     )
     average: int = setting(
         0,
         "search",
-        "also evaluate this many random configurations, to tell how often "
+        "also evaluate this many random configurations, to measure how often "
         "the model is wrong on average",
         unit="renders",
         ge=0,
@@ -309,16 +301,16 @@ class AttackConfig(DerivativeConfig):
     baseline: bool = setting(
         True,
         "search",
-        "run a random search with as many renders beside it",
+        "run a random search with as many renders, for comparison",
         flag="--no-baseline",
-        switched="skip the random search that runs beside the search as a baseline",
+        switched="skip the random search that is a baseline for the search",
     )
 
     verify_spp: int | None = setting(
         None,
         "verification",
         "samples per pixel of the verification",
-        otherwise="raised until more would leave the margin on its side",
+        otherwise="raised until more would not change the sign of the margin",
         unit="samples",
         ge=1,
         le=65536,
@@ -330,9 +322,8 @@ class AttackConfig(DerivativeConfig):
         "many of the clean scene",
         f"a whole number from {MIN_TRIALS} to 100000 (with fewer, nothing can be "
         "called found)",
-        otherwise=f"14, or 23 where one fails; with --over 30, or up to {TRIALS_OVER} "
-        f"where some fail; {TRIALS} with "
-        "--smallest",
+        otherwise=f"14, or 23 if one fails; with --over 30, or up to {TRIALS_OVER} "
+        f"if some fail; {TRIALS} with --smallest",
         unit="renders",
         ge=MIN_TRIALS,
         le=100_000,
@@ -350,9 +341,9 @@ class AttackConfig(DerivativeConfig):
     workers: int | None = setting(
         None,
         "run",
-        "worker processes; they share the attacks of several objects or models, or the "
-        "independent renders of one",
-        otherwise="this one alone",
+        "number of worker processes; they share the attacks on several objects or "
+        "models, or the independent renders of one attack",
+        otherwise="only this process",
         unit="processes",
         ge=1,
         le=100_000,
@@ -377,16 +368,19 @@ class AttackConfig(DerivativeConfig):
         The text is ``pgd={momentum: 0.9}``. Options may have the steps of the search
         among them: ``{name: pgd, steps: 80, momentum: 0.9}`` sets `steps`, too.
         """
-        policy = read_named(data.get("policy"), "policy", "auto")
-        if policy is None:
+        # Options without a name are those of "auto".
+        read_policy = partial(read_named, setting="policy", default_name="auto")
+        policy = read_policy(data.get("policy"))
+        if policy is None:  # the setting is missing
             return data
-        if not isinstance(policy, Mapping):
+        if not isinstance(policy, Mapping):  # a name without options
             return {**data, "policy": policy}
         steps = {"steps": policy["steps"]} if "steps" in policy else {}
         options = {
             option: value for option, value in policy.items() if option != "steps"
         }
-        return {**data, **steps, "policy": read_named(options, "policy", "auto")}
+        # Read again: without `steps` there may be no options left, but the name alone.
+        return {**data, **steps, "policy": read_policy(options)}
 
     @property
     def policy_name(self) -> str:
@@ -404,7 +398,7 @@ class AttackConfig(DerivativeConfig):
 
     @property
     def is_curve(self) -> bool:
-        """Whether it takes several attacks, over objects or over epsilons."""
+        """Whether there are several attacks, on several objects or epsilons."""
         return bool(self.epsilons) or len(self.objects) > 1
 
     @property
@@ -414,21 +408,21 @@ class AttackConfig(DerivativeConfig):
 
     @property
     def is_study(self) -> bool:
-        """Whether it takes several attacks."""
+        """Whether there are several attacks: a curve or a matrix."""
         return self.is_curve or self.is_matrix
 
     @property
     def trial_count(self) -> int:
-        """Trials of each group in the verification."""
+        """Number of trials of each configuration in the verification."""
         if self.trials is not None:
             return self.trials
         return TRIALS_OVER if self.over else TRIALS
 
 
 def parse_instance(parameter_name: str) -> str:
-    """Return the instance in the name of a parameter.
+    """Return the instance of a control in the name of a parameter.
 
-    `light:key` for itself, `camera` for `camera.azimuth`.
+    "light:key" for "light:key.power", "camera" for "camera.azimuth".
     """
     kind, colon, name = parameter_name.partition(":")
     return kind.partition(".")[0] + colon + name.partition(".")[0]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, Literal
 
 from torch import Tensor
@@ -59,11 +58,11 @@ from advsearch.scene.predictor import Refusal, RefusalCause
 from advsearch.scene.transport.matrix import TransportTooLargeError
 from advsearch.tasks import Judgement
 
-MAX_FRAMES = 60  # of the animation of a search
+MAX_FRAMES = 60  # frames in the animation of a search
 N_RANKED = 4  # best configurations of a search that are rendered again
 UNPRINTED = "search without print terms"
-"""The kind of the search without print terms: compared with one that has them, it
-measures what they cost.
+"""Kind of the queries of the search without print terms. Print terms keep colors
+printable; what they cost is measured by a search without them.
 """
 N_FIRST_LOOKS = 4
 """Renders of the clean configuration before the search. If the model is wrong in all of
@@ -89,21 +88,23 @@ def plan_renders(
     """Choose light bounces, gradient estimators and samples of a search by measurement.
 
     The choice is set in the journal's problem and stored, so that a run that is
-    continued uses the same. Bounces are measured only if the search renders images, and
-    gradient estimators only if it renders gradients: predicted images need neither.
+    continued uses the same. Bounces are not measured if light on surfaces may predict
+    the images of the search. Gradient estimators are not measured if matrices of light
+    transport may, unless a full measurement is requested.
 
     Args:
-        policy: policy of the search; only for one with gradients they are measured.
+        policy: policy of the search. Gradients are measured only if it uses them.
         journal: journal of the run.
         stages: reports what is measured.
-        specialise: whether what the search does not need may be left out.
-        measure: choice of the gradient estimators that are measured.
-        deterministic: whether counts decide instead of times.
+        specialise: whether renders may leave out what the search does not need.
+        measure: which gradient estimators are measured.
+        deterministic: whether counted renders, and not measured times, decide which
+            estimator is best.
         chooses_spp: whether a full measurement may choose the samples per pixel.
     """
     problem = journal.problem
     stored = journal.get_note(PLAN_NOTE)
-    if stored is not None:
+    if stored is not None:  # of a run that is continued
         problem.plan = problem.plan.restore(stored["plan"])
         problem.spp = stored["spp"]
         problem.search_depth = stored["search_depth"]
@@ -115,13 +116,11 @@ def plan_renders(
         surface_light_refusal = surface_light.find_surface_light_refusal(
             problem, problem.steps, policy, specialise
         )
-        are_steps_rendered = surface_light_refusal is not None
-        if are_steps_rendered:
+        if surface_light_refusal is not None:
             _choose_bounces(problem, stages)
     if policy.uses_gradient and measure != "no":
         matrix_refusal = find_matrix_refusal(problem, problem.steps, specialise)
-        are_gradients_rendered = matrix_refusal is not None
-        if is_full or are_gradients_rendered:
+        if is_full or matrix_refusal is not None:
             _measure_gradients(
                 problem,
                 stages,
@@ -168,14 +167,16 @@ def _measure_gradients(
     Args:
         problem: gets the plan, and perhaps another number of samples.
         stages: reports what is measured.
-        full: whether all estimators are measured, then steps and samples; else only
-            those that could both be the best.
-        deterministic: whether counted renders decide in place of times.
+        full: whether all estimators are measured, and then steps and samples. Else only
+            controls for which two or more estimators may be the best are measured.
+        deterministic: whether counted renders, and not measured times, decide which
+            estimator is best.
         chooses_spp: whether a full measurement may choose the samples per pixel.
     """
     renderer = problem.renderer
     progress = stages.progress
-    counts_renders = not full or deterministic  # a quick choice takes no times
+    # A quick measurement is too short to measure times: it counts renders.
+    counts_renders = not full or deterministic
     seed = seeds.stream(problem.seed, "measure")
     bench = Bench(
         renderer,
@@ -185,14 +186,14 @@ def _measure_gradients(
         problem.spp,
         tick=lambda samples: progress.advance(1),
     )
-    gradients = planning.count_plan_gradients(renderer.plan, with_all=full)
-    if gradients:
+    n_gradients = planning.count_plan_gradients(renderer.plan, with_all=full)
+    if n_gradients:
         hint = (
-            f"{gradients} gradients of {format_count(problem.spp, 'sample')} a pixel; "
-            "`measure=no` leaves it out"
+            f"{n_gradients} gradients of {format_count(problem.spp, 'sample')} a "
+            "pixel; `measure=no` leaves it out"
         )
         stages.begin(
-            "setup", "measuring which gradients are best here", gradients, hint=hint
+            "setup", "measuring which gradients are best here", n_gradients, hint=hint
         )
     problem.plan = planning.choose_estimators(
         bench, with_all=full, count_renders=counts_renders
@@ -247,15 +248,14 @@ def evaluate_clean_scene(
     hint = "the first picture compiles the renderer's code"
     stages.begin("setup", "looking at the clean scene", N_FIRST_LOOKS, hint=hint)
 
-    def evaluate(query: Query) -> Evaluation:
-        """Evaluate a query, and report it."""
-        evaluation = problem.evaluate(query)
-        stages.progress.advance(1)
-        return evaluation
+    def evaluate_all(queries: Sequence[Query]) -> Iterator[Evaluation]:
+        """Evaluate queries one after another, and report each."""
+        for query in queries:
+            evaluation = problem.evaluate(query)
+            stages.progress.advance(1)
+            yield evaluation
 
-    return run_trials(
-        partial(map, evaluate), start, spp=spp, seed=seed, trials=N_FIRST_LOOKS
-    )
+    return run_trials(evaluate_all, start, spp=spp, seed=seed, trials=N_FIRST_LOOKS)
 
 
 def is_already_wrong(verifier: Verifier, *, in_any_case: bool) -> bool:
@@ -277,7 +277,7 @@ def is_already_wrong(verifier: Verifier, *, in_any_case: bool) -> bool:
     if was_right_once and not in_any_case:
         return False
     verifier.choose_spp({"clean": problem.domain.start})
-    min_trials = verifier.looks[0]  # after which a verdict is first possible
+    min_trials = verifier.looks[0]  # trials after which a verdict is first possible
     verifier.begin_stage("checking the clean scene with fresh renders", min_trials)
     verifier.try_clean()
     return problem.rule.is_already_wrong(
@@ -296,10 +296,11 @@ def choose_predictor(
 ) -> PredictedSearch | None:
     """Prepare and return the cheapest predictor that is accurate here.
 
-    Predictors replace renders by something faster. They are tried in turn. If one turns
-    out to be too inaccurate, the next one is tried; if one takes too much memory, no
-    other is. A refusal is the reason why a predictor is not used, or None if it may be
-    used. Refusals are stored in `findings` and reported.
+    A predictor replaces renders by something faster: a matrix of light transport, or a
+    bank of matrices if conditions vary, or light on surfaces. Predictors are tried in
+    turn. If one is too inaccurate, the next one is tried; if one takes too much memory,
+    no other is. A refusal is the reason why a predictor is not used, or None if it may
+    be used. Refusals are stored in `findings` and reported.
 
     Args:
         policy: policy of the search.
@@ -307,7 +308,7 @@ def choose_predictor(
         stages: reports the preparation.
         findings: findings of the attack.
         specialise: whether images may be predicted.
-        clean: the matrix of the clean scene, of attacks that share it.
+        clean: the matrix of light transport of the clean scene, which attacks may share.
 
     Returns:
         The predictor, perhaps one that renders only a part of each image; None if every
@@ -337,13 +338,15 @@ def choose_predictor(
             return predictor
         if refusal.cause is RefusalCause.TOO_LARGE:
             return _crop_search(problem, refusal, stages, findings)
-        # Only light on surfaces is refused for its accuracy.
+        # The accuracy of matrices is not checked here, so this is light on surfaces.
         surface_refusal = refusal
         findings.surface_light_refusal = refusal
+        # the next candidate is the bank of matrices, unless it was refused above
         instead = "rendered" if matrix_refusal else "predicted by matrices"
         stages.progress.message(f"Pictures are {instead}: {refusal}.")
 
-    # No candidate is left, so each has been refused.
+    # A matrix and a bank end the loop if they are tried at all, so they were refused
+    # before it. Light on surfaces was refused before it or in it.
     assert matrix_refusal is not None and surface_refusal is not None
     refusal = surface_refusal
     if _is_about_matrices(problem, surface_refusal, findings, specialise=specialise):
@@ -357,26 +360,25 @@ def choose_predictor(
 def _is_about_matrices(
     problem: Problem, surface_refusal: Refusal, findings: RunState, *, specialise: bool
 ) -> bool:
-    """Return which of two refusals is reported: that of matrices, or of surface light.
+    """Return whether the reported refusal is that of matrices, not of surface light.
 
-    Neither a matrix nor light on surfaces predicts the images, and the user is told one
-    reason. It is that of matrices if the user could change it by more steps, or if no
-    camera moves, so that light on surfaces would not help anyway.
+    Neither a matrix nor light on surfaces predicts the images, and one reason is
+    reported. It is that of matrices if only the number of steps is too small for them,
+    which the user could change. It is also that of matrices if no camera moves: then
+    light on surfaces would not help anyway.
 
     Args:
         problem: problem of the attack.
         surface_refusal: why light on surfaces does not predict the images.
         findings: findings of the attack.
         specialise: whether images may be predicted.
-
-    Returns:
-        True for the refusal of matrices.
     """
+    # This refusal is stored only if light on surfaces was tried and was inaccurate.
     was_inaccurate = findings.surface_light_refusal is not None
-    # None as the number of steps: whether matrices would do for any number
-    pays_with_more_steps = (
-        not was_inaccurate and find_matrix_refusal(problem, None, specialise) is None
+    refusal_with_any_steps = find_matrix_refusal(
+        problem, steps=None, specialise=specialise
     )
+    pays_with_more_steps = not was_inaccurate and refusal_with_any_steps is None
     moves_no_camera = surface_refusal.cause is RefusalCause.NO_CAMERA
     return pays_with_more_steps or moves_no_camera
 
@@ -388,7 +390,8 @@ def _crop_search(
 
     Args:
         problem: problem of the attack.
-        refusal: why nothing predicts the images.
+        refusal: why nothing predicts the images. It is stored in any case, but reported
+            only if full images are rendered.
         stages: reports the preparation.
         findings: gets the refusals.
 
@@ -402,7 +405,7 @@ def _crop_search(
         if findings.crop_refusal is None:
             findings.predictor_refusal = refusal
             return crop
-    _report_rendering(refusal, stages, findings)
+    _report_rendering(refusal, stages, findings)  # also stores it
     return None
 
 
@@ -469,8 +472,10 @@ class Searches:
         samples = format_count(self.problem.spp, "sample")
         hint = f"{n_renders} pictures of {samples} a pixel; {shorter}"
         predictor = self.findings.predictor
+        # For the hint, a search is predicted if the main search ("search") is.
         if predictor is not None and predictor.count_predicted("search", steps):
-            n_traced = n_renders - steps  # of the ranking, which is always rendered
+            # A search ends with a ranking of the best configurations, always rendered.
+            n_traced = n_renders - steps
             hint = f"{steps} pictures predicted and {n_traced} traced; {shorter}"
         self.stages.begin(name, title, n_renders, hint=hint, at_most=True)
 
@@ -509,19 +514,20 @@ class Searches:
         """Search with one policy; stored evaluations are read instead of made again.
 
         Args:
-            kind: kind of its rows.
+            kind: kind of the search, such as "search" or "baseline", under which its
+                evaluations are stored as rows.
             policy: proposes configurations.
-            steps: evaluations.
-            seed: seed of the policy.
-            frames: is filled with images on the way, (H, W, 3) 8-bit values in [0, 1],
-                at most `MAX_FRAMES` and evenly spaced; None for none.
-            seconds: seconds that it may take; None for no limit.
-            domain: domain to search; None for the problem's.
+            steps: number of evaluations.
+            seed: seed of the policy; renders have the seed of the problem.
+            frames: list to fill with images of the search, (H, W, 3) 8-bit values in
+                [0, 1], at most `MAX_FRAMES` and evenly spaced; None for none.
+            seconds: seconds that the search may take; None for no limit.
+            domain: domain to search; None for that of the problem.
             ranked: whether the best configurations are rendered again.
 
         Raises:
-            KeyboardInterrupt: it was interrupted; the result of an interrupted main
-                search is in `findings` before.
+            KeyboardInterrupt: the search was interrupted. If it was the first search,
+                its result so far is stored in `findings.search`.
         """
         result = search(
             self._make_evaluate(steps, has_frames=frames is not None),
@@ -537,8 +543,10 @@ class Searches:
             render_seed=self.problem.seed,
         )
         if result.ending is Ending.INTERRUPTED:
-            # The main search is the first: an interrupted one after it is dropped.
-            self.findings.search = self.findings.search or result
+            # The first search is the main one. The result of a later search that was
+            # interrupted is dropped.
+            if self.findings.search is None:
+                self.findings.search = result
             raise KeyboardInterrupt
         return result
 
@@ -558,7 +566,7 @@ class Searches:
         predictor = self.findings.predictor
 
         def request_image(query: Query) -> Query:
-            """Return the query, with an image if its step is one of those with it."""
+            """Return the query, with a request for an image if its step has one."""
             is_due = query.phase == "search" and query.index % frame_interval == 0
             return replace(query, with_image=is_due)
 
@@ -600,23 +608,25 @@ class Searches:
     def _evaluate(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
         """Evaluate queries with predicted or rendered images.
 
-        If there is a predictor, it predicts the steps of the search. The ranking of the
-        best configurations is rendered, but only the part of the image that the
-        predictor covers. If colors are to be printable, print terms are subtracted from
-        the objective.
+        If there is a predictor, it predicts the steps of the search. The ranking at the
+        end, which compares the best configurations, is rendered. If the predictor
+        covers only a window of the image, only the window is rendered. If colors are to
+        be printable, print terms are subtracted from the objective.
 
         Args:
-            queries: all of one phase, "search" or "ranking".
+            queries: queries of a single phase, "search" or "ranking".
         """
-        traced = self.journal.evaluator
+        evaluate_rendered = self.journal.evaluator
         predictor = self.findings.predictor
         if predictor is None or not queries:
-            evaluations = traced(queries)
+            evaluations = evaluate_rendered(queries)
         elif queries[0].phase == "ranking":
-            evaluations = predictor.rank_all(queries, traced)
+            evaluations = predictor.rank_all(queries, evaluate_rendered)
         else:
-            evaluations = predictor.evaluate_all(queries, traced)
+            # it may need rendered images, too: to check itself, or once it is given up
+            evaluations = predictor.evaluate_all(queries, evaluate_rendered)
         for query, evaluation in zip(queries, evaluations, strict=True):
+            # `UNPRINTED` is the kind of the search that measures what the terms cost
             has_print_terms = self.printable and query.kind != UNPRINTED
             if has_print_terms:
                 space = self.problem.searched_space
@@ -649,7 +659,10 @@ def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
     sign of the margin. A search of the smallest change keeps the count that was chosen
     for the clean scene: its result has a margin near 0, whose sign no count settles.
     Then the clean configuration, the adversarial one, that of the search without print
-    terms and that of the random search are tried with equal seeds.
+    terms and that of the random search are tried with equal seeds. If the random search
+    found something worse for the model, that becomes the adversarial configuration.
+    Finally, different failures of the policy are verified, and it is measured in how
+    bright ambient light an adversarial light still holds.
 
     Args:
         verifier: verifier of the attack, whose state gets the results.
@@ -665,9 +678,12 @@ def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
     results = [
         result for result in (candidate, baseline, unprinted) if result is not None
     ]
-    if not is_smallest or findings.sample_count is None:
+    has_sample_count = findings.sample_count is not None
+    if not is_smallest or not has_sample_count:
         _choose_verification_samples(verifier, results, adversarial)
-    n_groups = len(results)  # groups of trials, one for each configuration
+    # Groups of trials in this stage, one for each configuration. Failures and ambient
+    # light have stages of their own.
+    n_groups = len(results)
     if not verifier.has_clean_trials:
         n_groups += 1
     verifier.begin_stage(
@@ -679,24 +695,27 @@ def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
     findings.verification = verifier.verify("verification", candidate)
     if findings.verification.ending is Ending.ALREADY_WRONG:
         # The clean scene is wrong at the sample count of the verification, which is
-        # another one than in the search: no change is needed at all.
+        # another one than in the search. So no change is needed at all, and bounds of
+        # the smallest one (the bracket) mean nothing.
         findings.bracket = None
     if unprinted is not None:
         findings.unprinted_verification = verifier.verify(
             "unprinted verification", unprinted
         )
     if baseline is not None:
-        # If the policy's result is verified, the trials of the random search's result
-        # may end early, as soon as it cannot be verified any more (`curtailed`).
-        is_found = findings.verification.ending is Ending.FOUND
+        # Curtailed trials end as soon as the verdict is certain. If the policy's result
+        # is verified, the exact rate of the random search's result is not needed.
+        is_policy_verified = findings.verification.ending is Ending.FOUND
         findings.baseline_verification = verifier.verify(
-            "baseline verification", baseline, curtailed=is_found
+            "baseline verification", baseline, curtailed=is_policy_verified
         )
         _replace_if_random_is_worse(verifier, candidate, baseline)
     if not is_smallest:
         verify_failures(verifier, candidate)
-    if findings.verification.ending is Ending.FOUND:
-        find_ambient(verifier, findings.verification.u)
+    # the verification of the random search's configuration, if that replaced it above
+    verification = findings.verification
+    if verification.ending is Ending.FOUND:
+        find_ambient(verifier, verification.u)
 
 
 def _replace_if_random_is_worse(
@@ -704,9 +723,9 @@ def _replace_if_random_is_worse(
 ) -> None:
     """Replace the result of the policy by that of the random search if that is worse.
 
-    "Worse" means worse for the model. A configuration that is selected because of its
-    trials may just have been lucky in these. So it is tried again, and has to be worse
-    in the new trials, too.
+    "Worse" means worse for the model. The random search's configuration may have been
+    lucky in its trials. So it is tried again, and has to be worse in the new trials,
+    too.
 
     Args:
         verifier: verifier of the attack, whose state is changed.
@@ -741,20 +760,21 @@ def _replace_if_random_is_worse(
 
 
 MIN_CONFIRMING_TRIALS = 40
-"""Trials that the smallest epsilon has to pass at least, once the searches have ended.
+"""Minimum number of trials that the smallest epsilon has to pass after the searches.
 
-They are made in several checks, each of as many trials as a verification.
+They are made in several checks, each with as many trials as a verification.
 """
 
 
 def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -> None:
     """Find bounds (a bracket) of the smallest epsilon at which the model is wrong.
 
-    Smaller and smaller budgets are searched. What a search claims is checked in trials
-    with seeds of their own. While the bracket gets smaller, a check needs only the
-    fewest trials that can verify anything, if none of them fails. At the end, the
-    configuration at the upper bound of the bracket is checked again with all trials; it
-    is the result. The bracket and the result are stored in the findings.
+    Smaller and smaller budgets are searched. A check tries a configuration that a
+    search found; each check has new seeds. While the bracket gets smaller, a check ends
+    early, after the minimum number of trials that can verify anything, if none of them
+    fails. At the end, the configuration at the upper bound of the bracket is checked
+    again with all trials; it is the result. The bracket and the result are stored in
+    the findings.
 
     Args:
         searches: searches of the attack.
@@ -766,30 +786,34 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
     n_trials = verifier.n_trials
     max_failures = problem.rule.count_allowed_failures(n_trials)
     results: list[SearchResult] = []
-    # A matrix predicts scores without noise: it tells which configurations are likely
-    # to pass, and learns from the trials by how much it is off.
+    # A matrix of light transport predicts scores without noise. It estimates which
+    # configurations are likely to pass, and learns from the trials how far it is off.
     transport = None
+    is_likely = None
     if isinstance(findings.predictor, Transport):
         transport = findings.predictor
+        is_likely = transport.is_likely_success
 
     def search_inside(domain: Domain, number: int) -> Tensor:
         """Search a smaller domain, and return the best configuration (d,)."""
         result = _search_budget(searches, policy, domain, number)
         results.append(result)
-        # If the attack is interrupted before anything passes, this is its result.
-        findings.search = findings.search or results[0]
+        # The first result is that of the attack until a configuration passes a check:
+        # the attack may be interrupted before.
+        if findings.search is None:
+            findings.search = result
         verifier.begin_stage(
             "trying smaller changes", MAX_CHECKS * n_trials, at_most=True
         )
         return result.best_u
 
-    def passes(u: Tensor, check: int, min_trials: int = n_trials) -> bool:
-        """Return whether a configuration (d,) passes a check.
+    def passes_check(u: Tensor, check_index: int, min_trials: int = n_trials) -> bool:
+        """Return whether a configuration (d,) passes a check, by default a full one.
 
-        One that passes becomes the search's result so far.
+        If it passes, it is stored as the result of the attack so far.
         """
         scores, has_passed = _try_until_decided(
-            verifier, u, check, min_trials, max_failures
+            verifier, u, check_index, min_trials, max_failures
         )
         if transport is not None:
             transport.update_score_bias(u, scores)
@@ -797,17 +821,14 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
             findings.search = replace(results[-1], best_u=u)
         return has_passed
 
-    def passes_few(u: Tensor, check: int) -> bool:
-        """Return whether a configuration (d,) passes a check of few trials."""
-        return passes(u, check, problem.rule.min_trials)
+    def passes_short_check(u: Tensor, check_index: int) -> bool:
+        """Return whether a configuration (d,) passes a check that may end early."""
+        return passes_check(u, check_index, min_trials=problem.rule.min_trials)
 
     bracket = find_smallest_change(
-        search_inside,
-        passes_few,
-        problem.domain,
-        likely=None if transport is None else transport.is_likely_success,
+        search_inside, passes_short_check, problem.domain, likely=is_likely
     )
-    bracket = _confirm(bracket, passes, verifier, problem.domain)
+    bracket = _confirm(bracket, passes_check, verifier, problem.domain)
     findings.bracket = bracket
     findings.search = _combine_results(results, bracket)
 
@@ -826,10 +847,11 @@ def _search_budget(
     problem = searches.problem
     title = f"search {number + 1} of at most {MAX_SEARCHES}"
     searches.start("search", title, problem.steps, "`steps` shortens each search")
-    # the first has the kind of the only search of another attack
-    kind = f"search {number}" if number else "search"
-    # The ranking renders the best configurations again. A matrix predicts them without
-    # noise, so that their order is known.
+    # The first search has the kind "search", as the main search of every attack has.
+    is_first = number == 0
+    kind = "search" if is_first else f"search {number}"
+    # The ranking renders the best configurations again. It is not needed with a matrix
+    # of light transport (`Transport`), which predicts them without noise.
     has_noise = not isinstance(searches.findings.predictor, Transport)
     return searches.search(
         kind,
@@ -843,15 +865,19 @@ def _search_budget(
 
 def _confirm(
     bracket: Bracket,
-    passes: Callable[[Tensor, int], bool],
+    passes_check: Callable[[Tensor, int], bool],
     verifier: Verifier,
     domain: Domain,
 ) -> Bracket:
     """Try the configuration at the upper bound of a bracket again, in full checks.
 
+    A configuration that fails is replaced by a slightly larger change, at most
+    `MAX_CONFIRMATIONS` times in all. Each has to pass several checks in a row.
+
     Args:
         bracket: the bracket, perhaps without any configuration.
-        passes: whether a configuration (d,) passes the check of a number.
+        passes_check: takes a configuration (d,) and the index of a check, from which
+            the seeds of its trials follow; returns whether the configuration passes.
         verifier: verifier that tries it.
         domain: domain with the full budget.
     """
@@ -863,11 +889,11 @@ def _confirm(
             MAX_CONFIRMATIONS * n_checks * verifier.n_trials,
             at_most=True,
         )
-    return confirm_bracket(bracket, passes, domain, times=n_checks)
+    return confirm_bracket(bracket, passes_check, domain, times=n_checks)
 
 
 def _try_until_decided(
-    verifier: Verifier, u: Tensor, check: int, min_trials: int, max_failures: int
+    verifier: Verifier, u: Tensor, check_index: int, min_trials: int, max_failures: int
 ) -> tuple[list[float], bool]:
     """Try a configuration until it passes a check or fails it.
 
@@ -877,9 +903,9 @@ def _try_until_decided(
     Args:
         verifier: verifier that tries it.
         u: (d,) the configuration.
-        check: number of the check.
-        min_trials: trials that are enough if none fails.
-        max_failures: failed trials with which a configuration still passes.
+        check_index: index of the check, which decides the seeds of its trials.
+        min_trials: number of trials that suffices if none fails.
+        max_failures: maximum number of failed trials with which a configuration passes.
 
     Returns:
         The scores of the trials, and whether the configuration has passed.
@@ -890,7 +916,8 @@ def _try_until_decided(
     while len(scores) < n_trials and n_failures <= max_failures:
         if n_failures == 0 and len(scores) >= min_trials:
             break
-        (trial,) = verifier.try_configurations(f"check {check}", {len(scores): u})
+        trial_index = len(scores)
+        (trial,) = verifier.try_configurations(f"check {check_index}", {trial_index: u})
         scores.append(trial.score)
         if not trial.success:
             n_failures += 1
@@ -920,12 +947,12 @@ def _combine_results(results: Sequence[SearchResult], bracket: Bracket) -> Searc
 
 
 def _rank(verification: Verification) -> tuple[bool, float, float]:
-    """Return how bad a verified configuration is for the model; larger is worse.
+    """Return how bad a tried configuration is for the model; larger is worse.
 
-    What is verified comes first, then the success rate, then the mean score; a score
-    that is not a number counts as the lowest.
+    A verified success ranks above all others. Then the success rate decides, then the
+    mean score; a mean that is not a number counts as the lowest.
     """
-    scores = [trial.score for trial in verification.valid_trials]
+    scores = [trial.score for trial in verification.valid_trials]  # never empty
     mean_score = sum(scores) / len(scores)
     return (
         verification.ending is Ending.FOUND,
@@ -934,7 +961,7 @@ def _rank(verification: Verification) -> tuple[bool, float, float]:
     )
 
 
-MAX_TRIED_FAILURES = 8  # of the failures that a search lists, the first
+MAX_TRIED_FAILURES = 8  # failures of a search that are verified, the first of its list
 
 
 def verify_failures(verifier: Verifier, result: SearchResult) -> None:
@@ -954,9 +981,9 @@ def verify_failures(verifier: Verifier, result: SearchResult) -> None:
     rule = problem.rule
     if known is None or not known.examples or rule.is_conditional:
         return
-    # If the model is wrong about the clean scene, a failure says nothing. The 1 stands
-    # for samples per pixel, which do not matter for the counts.
-    clean_counts = count_right(findings.clean_trials, 1)
+    # If the model is wrong about the clean scene, a failure proves nothing. `spp` is
+    # only recorded in the counts, and does not matter here.
+    clean_counts = count_right(findings.clean_trials, spp=1)
     if rule.is_already_wrong(clean_counts):
         return
     failures = known.examples[:MAX_TRIED_FAILURES]

@@ -1,9 +1,9 @@
-"""Studies: questions that take several attacks, each in a directory of its own.
+"""Studies: several attacks, each in a directory of its own.
 
-An attack is made in its directory, continued, or read if it is done. A worker makes an
-attack in a directory on its own disk, which comes back as files. An attack that this
-process has begun itself is not given to a worker. What is distributed are full attacks,
-in a curve all those of an object, so that one whose worker died begins again.
+An attack is made in its directory, continued if it was interrupted, or read if it is
+done. A worker makes an attack in a directory on its own disk, and returns the files. A
+worker gets full attacks; in a curve, it gets all attacks on an object. If the worker
+dies, they begin again. An attack that this process has begun is not given to a worker.
 """
 
 from __future__ import annotations
@@ -62,9 +62,13 @@ from advsearch.tasks import make_task
 from advsearch.trust.writing import LOCK, PART, storage_errors, write_bytes
 
 MAX_ATTACK_SECONDS = 6 * 3600.0
-"""Seconds that one attack may take on a worker before it counts as hanging."""
-TEXTS = (".json", ".html", ".yaml")  # files that may have the path of the run
-# Endings after which an object is not attacked with a larger epsilon
+"""Seconds after which a worker counts as hanging."""
+TEXT_SUFFIXES = (
+    ".json",
+    ".html",
+    ".yaml",
+)  # files that may contain the path of the run
+# endings after which an object is not attacked with a larger epsilon
 SETTLED = ("found", "already wrong")
 ALL = "all"  # name of the ensemble among the models that were attacked
 
@@ -76,8 +80,8 @@ class StudyAttack:
     Attributes:
         config: settings of the attack.
         name: name of its directory.
-        subject: the object or the model that tells it from the others.
-        epsilon: epsilon of a curve; None otherwise.
+        subject: the object, in a curve; the attacked model, in a matrix.
+        epsilon: epsilon of a curve; None in a matrix, or if each control has its own.
     """
 
     config: AttackConfig
@@ -86,11 +90,13 @@ class StudyAttack:
     epsilon: float | None = None
 
 
-Chain = list[StudyAttack]  # attacks in order, until one of them settles the object
+# Attacks that are made in order until an ending in `SETTLED`: in a curve those on an
+# object, with growing epsilon. A chain of a matrix has a single attack.
+Chain = list[StudyAttack]
 
 
 def make_chains(config: AttackConfig) -> list[Chain]:
-    """Return the attacks of a study: of a matrix or a curve.
+    """Return the attacks of a study, a matrix or a curve, in chains.
 
     Raises:
         InputError: a model or an object comes twice.
@@ -99,7 +105,7 @@ def make_chains(config: AttackConfig) -> list[Chain]:
 
 
 def _matrix_chains(config: AttackConfig) -> list[Chain]:
-    """Return the attacks of a matrix: one for each model, or the one on the ensemble.
+    """Return the attacks of a matrix: one for each model, or one on the ensemble.
 
     Each is a chain of a single attack.
 
@@ -123,44 +129,45 @@ def _matrix_chains(config: AttackConfig) -> list[Chain]:
 
 def _curve_chains(config: AttackConfig) -> list[Chain]:
     """Return the attacks of each object, with the smallest epsilon first."""
-    # None: each control has its own epsilon
+    # None if the setting has no list of epsilons: `config.epsilon` is used as it is
     epsilons: list[float | None] = [*sorted(config.epsilons)] or [None]
     chains: list[Chain] = []
     for index, name in enumerate(check_distinct(config.objects, "object")):
         chain: Chain = []
         for epsilon in epsilons:
-            words = []
+            name_parts = []
             if epsilon is not None:
-                words = [f"epsilon {epsilon:g}".replace(".", "_")]
+                name_parts = [f"epsilon {epsilon:g}".replace(".", "_")]
             attack_config = AttackConfig.from_config(
                 config,
                 object=name,
                 epsilon=config.epsilon if epsilon is None else epsilon,
             )
-            directory = f"{index:02d}-" + make_default_name(name, words)
+            directory = f"{index:02d}-" + make_default_name(name, name_parts)
             chain.append(StudyAttack(attack_config, directory, name, epsilon))
         chains.append(chain)
     return chains
 
 
-def attacks_of(settings: JsonObject) -> BatchFunction:
+def make_chain_worker(settings: JsonObject) -> BatchFunction:
     """Return the function by which a worker makes the attacks of a chain.
 
-    The function takes a list of one number, the index of the chain. It returns, for
-    each attack, the name of its directory, the path of the directory on the worker, and
-    its files by relative path.
+    The function takes a batch with a single item, the index of the chain. It returns,
+    for each attack, the name of its directory, the path of the directory on the worker,
+    and its files by relative path.
 
     Args:
         settings: settings of the study.
     """
     chains = make_chains(AttackConfig(**settings))
 
-    def make_chain(numbers: Sequence[int]) -> list[tuple[str, str, dict[str, bytes]]]:
-        """Make the attacks of one chain; `numbers` has its index alone."""
+    def run_chain(batch: Sequence[int]) -> list[tuple[str, str, dict[str, bytes]]]:
+        """Make the attacks of the chain whose index is the only item of the batch."""
         finished = []
         clean = CleanMatrix()
+        (chain_index,) = batch
         with tempfile.TemporaryDirectory(prefix="advsearch-part-") as directory:
-            for study_attack in chains[numbers[0]]:
+            for study_attack in chains[chain_index]:
                 path = Path(directory) / study_attack.name
                 config = study_attack.config.model_copy(
                     update={"run": str(path), "overwrite": True}
@@ -171,7 +178,7 @@ def attacks_of(settings: JsonObject) -> BatchFunction:
                     break  # no larger epsilon is needed
         return finished
 
-    return make_chain
+    return run_chain
 
 
 def _read_files(directory: Path) -> dict[str, bytes]:
@@ -186,29 +193,30 @@ def _read_files(directory: Path) -> dict[str, bytes]:
 def distribute_attacks(
     config: AttackConfig, chains: Sequence[Chain], run: Path, progress: Progress
 ) -> None:
-    """Have workers make the attacks of a study that have not begun, if requested.
+    """Have workers make the attacks of a study that have not begun.
 
-    A worker gets all attacks of a chain at once. A chain of which any attack has begun
-    here is left to this process.
+    A worker gets all attacks of a chain at once. If any attack of a chain has begun in
+    this process, the chain is left to it. Without workers, nothing is done here.
 
     Args:
         config: settings of the study.
         chains: all of its attacks, in chains of growing epsilon.
         run: its run directory, which gets the files.
-        progress: reports it.
+        progress: reports the progress.
 
     Raises:
-        ClusterError: every worker died of an attack, or there are none.
+        ClusterError: every worker that tried an attack died, or no worker is left.
     """
-    missing = [
+    missing_chains = [
         index
         for index, chain in enumerate(chains)
         if not any(is_run(run / PARTS / attack.name) for attack in chain)
     ]
-    in_process = {"workers": None, "cluster": None}
+    in_process = {"workers": None, "cluster": None}  # workers start no workers
+    worker_settings = config.make_repeatable().model_copy(update=in_process).to_json()
     work = WorkerTask(
-        "advsearch.questions.attack.studies:attacks_of",
-        config.make_repeatable().model_copy(update=in_process).to_json(),
+        "advsearch.questions.attack.studies:make_chain_worker",
+        worker_settings,
         FILES,
         config.used_threads or 1,
         seconds=MAX_ATTACK_SECONDS,
@@ -216,31 +224,35 @@ def distribute_attacks(
     with open_workers(
         work,
         # without work no workers are started
-        workers=config.workers if missing else None,
-        cluster=config.cluster if missing else None,
+        workers=config.workers if missing_chains else None,
+        cluster=config.cluster if missing_chains else None,
         tell=progress.message,
     ) as executor:
         if executor is None:  # none are requested: this process makes the attacks
             return
-        progress.stage("attacks on workers", len(missing))
-        for done in executor.compute([index] for index in missing):
-            _check_not_lost(chains, done)
-            for name, worker_path, files in done.value:
+        progress.stage("attacks on workers", len(missing_chains))
+        # Each batch is a single chain: the longest one ends last, and delays no other.
+        for result in executor.compute([index] for index in missing_chains):
+            _check_not_lost(chains, result)
+            for name, worker_path, files in result.value:
                 _write_part(run, name, worker_path, files)
             stats = executor.stats
             worker_counts = {} if stats is None else {"workers": stats.workers}
             progress.advance(1, **worker_counts)
 
 
-def _check_not_lost(chains: Sequence[Chain], done: BatchResult) -> None:
-    """Raise an error if the worker of an attack died."""
-    if done.lost:
-        chain_index = done.items[0]  # the only item of the batch
-        lost_attack = chains[chain_index][0]
-        title = lost_attack.config.object
-        if lost_attack.subject != title:
-            title += f" with {lost_attack.subject}"
-        raise ClusterError(f"{title}: {done.lost}; leave it out, or go on without it")
+def _check_not_lost(chains: Sequence[Chain], result: BatchResult) -> None:
+    """Raise an error if the worker of a chain of attacks died.
+
+    The chain is named by its object, and in a matrix also by the attacked model.
+    """
+    if result.lost:
+        (chain_index,) = result.items
+        first_attack = chains[chain_index][0]  # all have the same object and model
+        title = first_attack.config.object
+        if first_attack.subject != title:
+            title += f" with {first_attack.subject}"
+        raise ClusterError(f"{title}: {result.lost}; leave it out, or go on without it")
 
 
 def _write_part(
@@ -248,33 +260,37 @@ def _write_part(
 ) -> None:
     """Write the files of an attack that a worker made: all of them or none.
 
+    They are written into an unfinished directory, whose name has the prefix `PART`, and
+    which is renamed at the end.
+
     Args:
         run: the run directory of the study.
         name: name of the attack's directory in it.
-        worker_path: the directory on the worker, which texts may name.
+        worker_path: the directory on the worker; texts that contain it get the new one.
         files: files by their relative paths.
     """
     path = run / PARTS / name
-    unfinished = run / PARTS / f"{PART}{name}"
+    unfinished_path = run / PARTS / f"{PART}{name}"
     with storage_errors(path):
-        for relative, data in files.items():
-            if relative.endswith(TEXTS):
+        for relative_path, data in files.items():
+            if relative_path.endswith(TEXT_SUFFIXES):
                 data = data.replace(worker_path.encode(), str(path).encode())
-            (unfinished / relative).parent.mkdir(parents=True, exist_ok=True)
-            write_bytes(unfinished / relative, data)
-        unfinished.rename(path)
+            file = unfinished_path / relative_path
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_bytes(file, data)
+        unfinished_path.rename(path)
 
 
 class StudyRun:
     """Makes the attacks of a study, each in a directory of its own.
 
-    Those that are done already are read; workers make the others first, if requested.
-    After an interrupt no attack is made any more.
+    If workers are requested, they make all attacks first. Attacks that are done are only
+    read. After an interrupt no further attack is made.
 
     Attributes:
         chains: all attacks.
         names: names of the attacks so far.
-        warnings: warnings of these, each sentence once.
+        warnings: warnings of these attacks, each sentence once.
     """
 
     def __init__(self, context: RunContext[AttackConfig]) -> None:
@@ -301,13 +317,14 @@ class StudyRun:
         return self.context.ending == INTERRUPTED
 
     def run_attack(
-        self, study: StudyAttack, clean: CleanMatrix | None = None
+        self, attack: StudyAttack, clean: CleanMatrix | None = None
     ) -> AttackSummary | None:
         """Make an attack, or read its result.
 
         Args:
-            study: the attack.
-            clean: the matrix of the clean scene, shared with others.
+            attack: the attack.
+            clean: the matrix of light transport of the clean scene, shared with other
+                attacks; None to share none.
 
         Returns:
             The result; None after an interrupt.
@@ -317,9 +334,9 @@ class StudyRun:
         """
         if self.interrupted:
             return None
-        config = study.config
-        path = self.run.path / PARTS / study.name
-        self.names.append(study.name)
+        config = attack.config
+        path = self.run.path / PARTS / attack.name
+        self.names.append(attack.name)
         # epsilon may also be None or a mapping by control, which is not reported
         budget = ""
         if isinstance(config.epsilon, float):
@@ -330,11 +347,13 @@ class StudyRun:
             f"{config.model}, {' and '.join(config.controls)}{budget}"
         )
 
-        def run_attack(part_config: AttackConfig, **options: Any) -> AttackSummary:
+        def attack_with_matrix(
+            part_config: AttackConfig, **options: Any
+        ) -> AttackSummary:
             """Make the attack with the shared matrix, and return its result."""
             return attack_once(part_config, clean=clean, **options).summary
 
-        summary = run_part(path, config, self.progress, run_attack)
+        summary = run_part(path, config, self.progress, attack_with_matrix)
         if not isinstance(summary, AttackSummary):
             raise FileFormatError(
                 f"{path}: expected the run of an attack, got one of {summary.command}"
@@ -343,7 +362,7 @@ class StudyRun:
             text for text in summary.warnings if text not in self.warnings
         ]
         if summary.ending == INTERRUPTED:
-            self.context.ending = INTERRUPTED
+            self.context.ending = INTERRUPTED  # the study is interrupted, too
             return None
         return summary
 
@@ -351,8 +370,8 @@ class StudyRun:
         """Return the result of the study.
 
         Args:
-            kind: kind of the result.
-            **fields: fields of it, besides those that all results have.
+            kind: class of the result.
+            **fields: fields of the result, besides those that all results have.
         """
         return self.context.result(
             kind, parts=self.names, warnings=self.warnings, **fields
@@ -407,21 +426,24 @@ def _attack_object(study: StudyRun, chain: Chain) -> ObjectRow:
     renders: Counter[str] = Counter()
     for attack in chain:
         summary = study.run_attack(attack, clean)
-        if summary is None:
+        if summary is None:  # interrupted
             break
         renders.update(summary.renders)
+        # Without an epsilon of the curve, the summary has those of the controls.
         epsilon = summary.epsilon if attack.epsilon is None else attack.epsilon
-        flips_at = epsilon if summary.ending == "found" else None
+        margin = None
+        if summary.verified is not None:
+            margin = summary.verified.margin
         row = ObjectRow(
             object=attack.subject,
             clean=summary.clean.control,
             ending=summary.ending,
             epsilon=epsilon,
-            flips_at=flips_at,
+            flips_at=epsilon if summary.ending == "found" else None,
             verified=summary.verified,
-            margin=summary.verified and summary.verified.margin,
+            margin=margin,
             run=summary.run,
-            tried=attack.epsilon,
+            tried=attack.epsilon,  # the epsilon of the curve only
             average=summary.average,
             renders=dict(renders),
         )
@@ -435,8 +457,8 @@ def _is_known(row: ObjectRow, epsilon: float | None) -> bool:
 
     It is known if the object was attacked with this epsilon or a larger one, if a wrong
     prediction was found, or if the clean scene is wrong already. It is not known if the
-    objective was not a number, or if noise alone makes the clean scene wrong so often
-    that no adversarial scene can be verified.
+    objective was not a number, or if the model is so often wrong about the clean scene,
+    because of noise, that no adversarial scene can be verified.
 
     Args:
         row: row of the last attack on the object.
@@ -488,16 +510,18 @@ def _compute_accuracy(rows: Sequence[ObjectRow], epsilon: float | None) -> Curve
 def _has_flipped(row: ObjectRow, epsilon: float | None) -> bool:
     """Return whether a wrong prediction was found within an epsilon.
 
-    Without one, controls have their own epsilons, at which the object was attacked.
+    Args:
+        row: row of the last attack on the object.
+        epsilon: the epsilon; None for the own epsilon of each control.
     """
     if row.ending != "found":
         return False
-    if epsilon is None:
+    if epsilon is None:  # the object was attacked with these epsilons only
         return True
     return isinstance(row.flips_at, float) and row.flips_at <= epsilon
 
 
-# samples per pixel of the trials, unless an attack needed more or a setting is given
+# minimum number of samples per pixel of the trials, unless `verify_spp` sets it
 MIN_TRIAL_SPP = 64
 
 
@@ -505,11 +529,11 @@ def matrix(context: RunContext[AttackConfig]) -> MatrixResult:
     """Attack several models, and try every adversarial scene on each of them.
 
     Trial k has the same seed for every scene and every model; no search or verification
-    has used these seeds. Models of one input size get the same image; for another size
-    the same configuration is rendered anew. As in an attack, a trial is a success only
-    if the model is right on the clean scene with the same seed. Samples per pixel are
-    the setting `verify_spp`, or else the most that an attack needed, at least
-    `MIN_TRIAL_SPP`.
+    has used these seeds. Models with the same input size get the same image; for
+    another size the same configuration is rendered anew. As in an attack, a trial is a
+    success only if the model is right on the clean scene with the same seed. The
+    samples per pixel are the setting `verify_spp`. Without it, they are the maximum
+    that an attack needed, at least `MIN_TRIAL_SPP`.
 
     Args:
         context: settings, run directory and progress.
@@ -518,7 +542,7 @@ def matrix(context: RunContext[AttackConfig]) -> MatrixResult:
     names = check_distinct(config.models, "model")
     context.progress.stage(LOADING)
     for name in names:
-        check_from_config(_with_model(config, name))
+        check_from_config(_with_model(config, name))  # raises before any attack
 
     study = StudyRun(context)
     attacked = dict[str, AttackSummary]()
@@ -565,7 +589,7 @@ def _read_configurations(attacked: Mapping[str, AttackSummary]) -> dict[str, Ten
 def _choose_trial_spp(summaries: Iterable[AttackSummary]) -> int:
     """Return the samples per pixel that suffice for the trials of several attacks.
 
-    These are the most that any of them needed, at least `MIN_TRIAL_SPP`.
+    This is the maximum that any of them needed, at least `MIN_TRIAL_SPP`.
     """
     sample_counts = [
         summary.sample_count.spp for summary in summaries if summary.sample_count
@@ -622,7 +646,7 @@ def _try_on_models(
 def _make_conditions(
     names: Sequence[str], spp: int, config: AttackConfig
 ) -> list[RetrialCondition]:
-    """Return the conditions of trials on models: one for each."""
+    """Return a condition of trials for each model: its problem and the image size."""
     conditions = []
     for name in names:
         problem, _ = problem_from_config(_with_model(config, name))
@@ -665,13 +689,15 @@ def _try_adversarial(
 def models_worker(settings: JsonObject) -> BatchFunction:
     """Return the function by which a worker evaluates queries of several models.
 
+    Each query names its problem by the name of the model.
+
     Args:
         settings: settings of the study.
     """
     config = AttackConfig(**settings)
 
     def load_problem(name: str) -> Problem:
-        """Return the problem of a model, by which queries name it."""
+        """Load a model, and return the problem with it."""
         problem, _ = problem_from_config(_with_model(config, name))
         return problem
 

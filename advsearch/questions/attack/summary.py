@@ -1,6 +1,7 @@
 """The results of `attack`, as `summary.json` holds them.
 
-They are of one attack, of several objects or epsilons, or of several models.
+There is a class for one attack, for a curve (several objects or epsilons), and for a
+matrix (several models).
 """
 
 from __future__ import annotations
@@ -36,15 +37,17 @@ from advsearch.runs.summary import NAME, make_summary_error, read_result
 
 
 class FoundValue(DescribedValue):
-    """One value of the adversarial configuration, and where it lies."""
+    """A value of the adversarial configuration, with its clean value and its range."""
 
     clean: int | float | str | None = optional_field(
-        "the clean scene's; absent of several numbers"
+        "value of the clean scene; absent if it is not a single value"
     )
     low: float | None = optional_field(
-        "the least that the control allows; absent without a range"
+        "smallest value that the control allows; absent without a range"
     )
-    high: float | None = optional_field("the most")
+    high: float | None = optional_field(
+        "largest value that the control allows; absent without a range"
+    )
 
 
 class PicturedPrediction(Fields):
@@ -54,23 +57,25 @@ class PicturedPrediction(Fields):
     """
 
     label: str
-    index: int | None = Field(description="of the class")
+    index: int | None = Field(description="index of the class")
     probability: JsonFloat | None = Field(
-        description="of this prediction; of a detector the score of the box"
+        description="probability of the prediction; for a detector, score of the box"
     )
-    payload: Payload = optional_field("what else the task keeps of it; absent without")
+    payload: Payload = optional_field(
+        "what else the task stores about the prediction; absent if there is nothing"
+    )
     trial: int | None = optional_field(
-        "number of the trial, the same for both pictures; "
-        "absent where nothing was tried"
+        "number of the trial, the same for both pictures; absent without trials"
     )
 
 
 class CleanPrediction(CleanScene, PicturedPrediction):
     """The prediction of the stored image of the clean scene."""
 
-    correct: bool = Field(description="whether that is right")
+    correct: bool = Field(description="whether the prediction is right")
     control: ControlGroup | None = Field(
-        description="trials of the clean scene, and in how many it is right"
+        description="trials of the clean scene, and in how many the model is right; "
+        "null without trials"
     )
 
 
@@ -78,22 +83,22 @@ class ObjectiveValues(Fields):
     """The objective over some trials, in its own unit."""
 
     mean: JsonFloat
-    deviation: JsonFloat = Field(description="standard deviation of one trial")
-    low: JsonFloat = Field(description="the least")
-    high: JsonFloat = Field(description="the most")
+    deviation: JsonFloat = Field(description="standard deviation over the trials")
+    low: JsonFloat = Field(description="minimum over the trials")
+    high: JsonFloat = Field(description="maximum over the trials")
 
 
 class TriedObjective(Fields):
-    """What the search maximised, over the trials of the verification.
+    """The objective of the search, evaluated in the trials of the verification.
 
-    These have other seeds, and images of 8 bits.
+    Trials have other seeds than the search, and images of 8 bits.
     """
 
     clean: ObjectiveValues | None = Field(
-        description="of the clean scene; null where it was not tried"
+        description="values for the clean scene; null if it was not tried"
     )
     adversarial: ObjectiveValues | None = Field(
-        description="of the adversarial scene; null where nothing was verified"
+        description="values for the adversarial scene; null if nothing was verified"
     )
 
 
@@ -101,22 +106,24 @@ class AlongDrive(Fields):
     """Both scenes at evenly spaced times of the path that varied by chance."""
 
     frames: int
-    seconds: float = Field(description="from the first frame to the last")
+    seconds: float = Field(description="from the first frame of a path to the last")
     paths: list[str] = Field(
         default=[],
-        description="the paths, where one of several was drawn; the frames are theirs",
+        description="names of the paths if there are several; the frames are those of "
+        "all paths",
     )
     clean: int = Field(
         description="frames of the clean scene in which the model is right"
     )
     adversarial: int | None = Field(
-        description="likewise, with the adversarial one; null if nothing was searched"
+        description="frames of the adversarial scene in which the model is right; null "
+        "if nothing was searched"
     )
-    spp: int = Field(description="samples a pixel")
+    spp: int = Field(description="samples per pixel")
 
 
 class BaselineSearch(Fields):
-    """The random search beside it."""
+    """The random search that the search is compared with."""
 
     policy: str
     renders: int
@@ -124,82 +131,99 @@ class BaselineSearch(Fields):
 
 
 class SmallestEpsilon(Fields):
-    """The bracket of the least epsilon at which the prediction flips, by control."""
+    """Bounds of the smallest epsilon at which the model is wrong, by control."""
 
     epsilon: dict[str, float] | None = Field(
-        description="the least that passed its trials; null: none did"
+        description="smallest epsilon that passed its trials; null if none did"
     )
     not_found_at: dict[str, float] | None = Field(
-        description="the largest at which a search found none; null: none"
+        description="largest epsilon at which a search found nothing; null if there "
+        "was none"
     )
-    closed: bool = Field(description="the two are within 5 %")
-    confirmed: bool = Field(description="the upper end passed again with new seeds")
-    searches: int
-    checks: int
+    closed: bool = Field(description="whether the two are within 5 %")
+    confirmed: bool = Field(
+        description="whether the upper bound passed trials with new seeds, too"
+    )
+    searches: int = Field(description="number of searches")
+    checks: int = Field(
+        description="number of checks, each of which has several trials"
+    )
 
 
 class SearchDistribution(Fields):
-    """The distribution that the policy found, where it is over few numbers."""
+    """The distribution that the policy ended with, if it has few numbers."""
 
     mean: dict[str, DescribedValue]
-    deviation: list[float] = Field(description="in u")
+    deviation: list[float] = Field(
+        description="standard deviation of each coordinate in [0, 1]"
+    )
 
 
 class DifferentFailure(Fields):
-    """One of them: a configuration, and where those lie that it stands for."""
+    """One of several failures, and the ranges of the configurations it stands for."""
 
     ranges: dict[str, tuple[float, float] | str] = Field(
-        description="from, to; of a discrete choice its option"
+        description="lower and upper bound by parameter; the option, for a discrete "
+        "choice"
     )
     configuration: dict[str, DescribedValue]
     objective: JsonFloat = Field(
-        description="of the one render that won; biased upwards"
+        description="objective in the render by which it was selected; biased upwards"
     )
     holds: bool | None = Field(
         description="whether it is verified; null if it was not tried"
     )
     verified: VerifiedRate | None = Field(
-        description="trials that ended as soon as that was clear; null: not tried"
+        description="trials, which ended as soon as the verdict was certain; null if it "
+        "was not tried"
     )
     picture: str | None = Field(
-        description="the first of these trials; null if there is none"
+        description="path of the picture of the first trial; null if it was not tried"
     )
     pictured: PicturedPrediction | None = optional_field(
-        "of that picture; absent if there is none"
+        "prediction in that picture; absent if it was not tried"
     )
 
 
 class FailingShare(Fields):
     """The fraction of all configurations that fail in one render of the search."""
 
-    estimate: float | None = Field(description="null where too few draws failed to say")
-    interval: Interval = Field(description="95 %, however the draws were chosen")
-    effective: float = Field(
-        description="failures of equal weight that would say as much"
+    estimate: float | None = Field(
+        description="the fraction; null if too few samples failed to estimate it"
     )
-    draws: int
+    interval: Interval = Field(
+        description="95 % interval, valid however the policy chose the samples"
+    )
+    effective: float = Field(
+        description="effective number of failures: as many of equal weight would be as "
+        "informative"
+    )
+    draws: int = Field(description="number of samples")
 
 
 class DifferentFailures(Fields):
-    """Many different failures, of a policy that looks for them."""
+    """The failures that a policy found which looks for many different ones.
+
+    A policy counts in cells, into which it divides the space of some parameters, or in
+    sampled configurations.
+    """
 
     over: list[str] = Field(
-        description="the parameters that tell cells apart; empty "
-        "where there are no cells"
+        description="the parameters that span the cells; empty if there are no cells"
     )
     found: int = Field(
-        description="cells in which the search saw a success, or such "
-        "draws: its own claim"
+        description="cells or samples in which the search had a success: its own claim"
     )
-    examined: int = Field(description="cells, or draws, that it looked at")
+    examined: int = Field(description="cells or samples that it evaluated")
     cells: int | None = Field(
-        description="cells that there are; null where there are none"
+        description="number of all cells; null if there are no cells"
     )
-    share: FailingShare | None = optional_field("null where it can't be told")
+    share: FailingShare | None = optional_field("absent if it cannot be estimated")
     tried: int = Field(description="failures that were tried with fresh seeds")
-    verified: int = Field(description="of these, verified")
+    verified: int = Field(description="tried failures that were verified")
     listed: list[DifferentFailure] = Field(
-        description="the worst, then whichever is farthest from all before it"
+        description="first the worst failure, then always the one that is farthest from "
+        "all before it"
     )
 
 
@@ -208,35 +232,43 @@ class VerificationSamples(Fields):
 
     spp: int
     converged: bool = Field(
-        description="whether it is shown that more would leave the margins on their "
-        "sides; over conditions that vary, "
-        "the rate within 5 points"
+        description="whether more samples were shown not to change the signs of the "
+        "margins; if conditions vary, not to change the rate by more than 5 points"
     )
 
 
 class SearchClaim(Fields):
-    """What the search itself believes."""
+    """What the search itself claims, without trials."""
 
-    objective: JsonFloat = Field(description="of the one render that won")
-    re_evaluated: JsonFloat = Field(description="its mean when rendered again")
-    success_rate: JsonFloat = Field(description="of these renders")
+    objective: JsonFloat = Field(
+        description="objective in the render by which the configuration was selected"
+    )
+    re_evaluated: JsonFloat = Field(
+        description="mean objective of the configuration when it was rendered again"
+    )
+    success_rate: JsonFloat = Field(
+        description="fraction of successes in these renders"
+    )
 
 
 class SearchGradients(Fields):
-    """What the search saw of its gradients."""
+    """Statistics of the gradients of the search."""
 
     count: int
     cosine_with_the_one_before: JsonFloat | None = Field(
-        description="the median: noise, and the way between"
+        description="median cosine of a gradient with the previous one; lower with more "
+        "noise and longer steps"
     )
-    zero: int
-    cut: int = Field(description="of which single numbers were outliers and cut")
-    shortened: int = Field(description="outliers as a whole")
-    rejected: int = Field(description="steps that were taken back")
+    zero: int = Field(description="gradients that were zero")
+    cut: int = Field(description="gradients in which outlying elements were clipped")
+    shortened: int = Field(
+        description="gradients that were scaled down, because their norm was an outlier"
+    )
+    rejected: int = Field(description="steps that were undone")
 
 
 class PathSegments(Fields):
-    """The longest light paths that were rendered."""
+    """Segments of the longest light paths that were rendered."""
 
     search: int
     verification: int
@@ -250,38 +282,42 @@ class NotFinite(Fields):
 
 
 class PrintCost(Fields):
-    """What the terms of `printable` cost in margin.
+    """The margin that the print terms of `printable` cost.
 
-    They are compared with a search without them, of as many steps.
+    It is measured by another search without the terms, with as many steps.
 
-    Margins are means over trials with the same seeds, of what is sought: the smaller,
-    the worse for the model. Each is of one search, so that a cost below 0 says that the
-    search without terms ended in a worse place.
+    Margins are means over trials with the same seeds: the smaller, the worse for the
+    model. A cost below 0 means that the search without terms happened to find a less
+    adversarial scene.
     """
 
     steps: int = Field(description="evaluations of the search without the terms")
     margin_with: JsonFloat = Field(
-        description="of the run's adversarial scene, in logits"
+        description="margin of the run's adversarial scene, in logits"
     )
     margin_without: JsonFloat = Field(
-        description="of what was found by the search without the terms, in logits"
+        description="margin of the scene from the search without the terms, in logits"
     )
-    cost: JsonFloat = Field(description="the first less the second, in logits")
+    cost: JsonFloat = Field(
+        description="`margin_with` minus `margin_without`, in logits"
+    )
     verified: VerifiedRate = Field(
-        description="trials of what was found by the search without the terms"
+        description="trials of the scene from the search without the terms"
     )
-    terms: PrintTerms = Field(description="of that scene")
+    terms: PrintTerms = Field(
+        description="print terms of the scene from the search without the terms"
+    )
 
 
 class Printability(Fields):
-    """What `printable` was about, and what it cost."""
+    """How printable the colors of both scenes are, and the margin that this costs."""
 
-    clean: PrintTerms = Field(description="of the clean scene")
+    clean: PrintTerms = Field(description="print terms of the clean scene")
     adversarial: PrintTerms | None = Field(
-        description="of the adversarial scene; null if nothing was searched"
+        description="print terms of the adversarial scene; null if nothing was searched"
     )
     cost: PrintCost | None = optional_field(
-        "what the terms cost in margin; null if nothing was verified"
+        "margin that the terms cost; null if nothing was verified"
     )
 
 
@@ -296,104 +332,123 @@ class AmbientPoint(Fields):
 class AmbientLight(Fields):
     """The ambient light in which a projected image still makes the model wrong."""
 
-    lux: float = Field(description="on the object in the scene, without the projector")
+    lux: float = Field(
+        description="ambient light of the scene on the object, without the projector"
+    )
     holds_to: float = Field(
-        description="lux, the most in which it was verified, as in "
-        "all less that was tried"
+        description="brightest ambient light in lux up to which the scene was verified "
+        "in every light that was tried"
     )
     limit_lux: float | None = Field(
-        description="lux, the least in which it was not; null: it holds in direct sun"
+        description="darkest ambient light in lux in which it was not verified; null if "
+        "it holds in direct sun"
     )
     points: list[AmbientPoint] = Field(
-        description="what was tried, by lux; the first is the verification itself"
+        description="the lights that were tried, ascending; the first is that of the "
+        "verification"
     )
 
 
 class AttackSummary(SceneResult):
-    """The worst configuration that was found, how sure that is, and what it cost."""
+    """The worst configuration that was found, its verification, and what that cost."""
 
     command: ClassVar[str] = "attack"
 
     policy: str
     objective: str
     epsilon: float | dict[str, float | None] | None = Field(
-        description="the budget; by control where there are more"
+        description="the budget; by control if there are several"
     )
     norm: str | dict[str, str] = Field(
-        description="in which the budget is measured; by control as above"
+        description="norm of the budget; by control if there are several"
     )
-    label_set: list[str] = Field(description="the names that count as right")
+    label_set: list[str] = Field(description="the labels that count as right")
     judge: str = Field(
         default="object",
-        description="the thing whose answers count: object, the name "
-        "of one beside it, or all",
+        description="the thing whose predictions count: `object`, the name of another "
+        "thing, or `all`",
     )
     goal: str = Field(
-        description="`a wrong answer`, `a target answer` or `a right "
-        "answer`: what counts as success"
+        description="what counts as success: `a wrong answer`, `a target answer` or `a "
+        "right answer`"
     )
-    target: list[str] | None = Field(description="the targets' names")
+    target: list[str] | None = Field(
+        description="names of the targets; null if any wrong prediction counts"
+    )
     over: list[str] = Field(description="the controls that varied by chance")
     conditions: dict[str, VariedValue] = Field(
         default={},
-        description="what they were drawn from; absent without, and of "
-        "parameters of many numbers",
+        description="ranges or options of the parameters that varied by chance; a "
+        "parameter with many numbers is absent",
     )
     image_formation: Formation
     gradient_plan: PlannedGradient
     light_path_segments: PathSegments
     clean: CleanPrediction
     adversarial: PicturedPrediction | None = Field(
-        description="of what the search found; null if nothing was searched"
+        description="prediction of the adversarial scene; null if nothing was searched"
     )
     verified: VerifiedRate | None = Field(
         description="trials of the adversarial scene; null if nothing was verified"
     )
     tried_objective: TriedObjective | None = optional_field(
-        "the objective over these trials"
+        "the objective in the trials"
     )
     baseline: BaselineSearch | None = optional_field(
         "the random search; absent without `baseline`"
     )
     adversarial_from: str | None = optional_field(
-        "`random` where the run's adversarial scene is the random search's"
+        "`random` if the random search found the run's adversarial scene; else absent"
     )
     policy_verified: VerifiedRate | None = optional_field(
-        "of what the policy itself found then"
+        "trials of the scene that the policy found, if `adversarial_from` is `random`"
     )
     drive: AlongDrive | None = optional_field(
-        "[along a drive](drives.md), with `over` a path; absent without"
+        "the scenes [along a drive](drives.md); absent if no path varies (`over`)"
     )
     ambient: AmbientLight | None = optional_field(
-        "with [a projector](controls/projector.md) that is found: how much other light "
-        "it bears"
+        "ambient light in which the scene still holds, if the light of [a "
+        "projector](controls/projector.md) was searched"
     )
-    average: AverageCase | None = optional_field("only with `average`")
-    smallest: SmallestEpsilon | None = optional_field("only with `smallest`")
-    printability: Printability | None = optional_field("only with `printable`")
+    average: AverageCase | None = optional_field(
+        "random configurations; only with `average`"
+    )
+    smallest: SmallestEpsilon | None = optional_field(
+        "the smallest epsilon; only with `smallest`"
+    )
+    printability: Printability | None = optional_field(
+        "how printable the colours are; only with `printable`"
+    )
     distribution: SearchDistribution | None = optional_field(
-        "of a policy that finds one"
+        "distribution that the policy ended with; absent if it has none"
     )
     failures: DifferentFailures | None = optional_field(
-        "of a policy that looks for different ones"
+        "different failures; absent if the policy does not look for them"
     )
-    sample_count: VerificationSamples | None = optional_field("of the verification")
+    sample_count: VerificationSamples | None = optional_field(
+        "samples per pixel of the verification"
+    )
     transport: LinearTransport | None = optional_field(
-        "whether [a matrix of light transport](transport.md) predicted the searches' "
-        "pictures"
+        "whether [a matrix of light transport](transport.md) predicted the pictures of "
+        "the searches"
     )
-    claimed: SearchClaim | None = optional_field("what the search itself believes")
-    gradients: SearchGradients | None = optional_field("of the search")
+    claimed: SearchClaim | None = optional_field("what the search itself claims")
+    gradients: SearchGradients | None = optional_field(
+        "statistics of the gradients of the search"
+    )
     configuration: dict[str, FoundValue] | None = optional_field(
-        "the adversarial configuration in a few values"
+        "the adversarial configuration, summarized in a few values"
     )
     shared: SharedWork | None = optional_field("only with `workers` or `cluster`")
     renders: dict[str, int] = Field(
-        description="of the search, its gradients, the baseline and the verification; "
-        "`unprinted`: of the search "
-        "without print terms, with its gradients; `products`: predicted instead"
+        description="number of rendered pictures of the `search`, its gradients "
+        "(`gradient`), the `baseline`, the `verification`, and the search without print "
+        "terms with its gradients (`unprinted`); `products` is the number of predicted "
+        "pictures"
     )
-    steps: int = Field(description="evaluations of the search before the reranking")
+    steps: int = Field(
+        description="evaluations of the search, without the final ranking"
+    )
     non_finite: NotFinite
     warnings: list[str] = Field(description="sentences that a reader has to know")
 
@@ -421,18 +476,20 @@ class ObjectRow(Fields):
     object: str
     clean: ControlGroup | None
     ending: str | None = None
-    epsilon: EpsilonBudget = optional_field("of the last attack")
+    epsilon: EpsilonBudget = optional_field("epsilon of the last attack")
     flips_at: EpsilonBudget = Field(
-        description="the least epsilon at which an adversarial scene was found; null: "
-        "at none"
+        description="smallest epsilon at which an adversarial scene was found; null if "
+        "none was found"
     )
     verified: VerifiedRate | None = None
-    margin: JsonFloat | None = optional_field("mean of the trials, in logits")
+    margin: JsonFloat | None = optional_field("mean margin of the trials, in logits")
     run: str | None = None
     tried: float | None = optional_field("the largest epsilon that was tried")
-    average: AverageCase | None = optional_field("only with `average`")
+    average: AverageCase | None = optional_field(
+        "random configurations; only with `average`"
+    )
     renders: dict[str, int] | None = optional_field(
-        "pictures by kind, of the attacks at all epsilons together"
+        "number of pictures by kind, over the attacks at all epsilons"
     )
 
 
@@ -440,11 +497,15 @@ class CurvePoint(Fields):
     """How many objects are still recognised at an epsilon."""
 
     epsilon: float | None
-    objects: int = Field(description="of which something is known there")
+    objects: int = Field(
+        description="number of objects of which it is known whether they are robust"
+    )
     robust: int
-    found: int
-    already_wrong: int
-    accuracy: float | None
+    found: int = Field(description="objects with an adversarial scene")
+    already_wrong: int = Field(description="objects whose clean scene is wrong")
+    accuracy: float | None = Field(
+        description="`robust` / `objects`; null if there are no objects"
+    )
     interval: Interval
 
 
@@ -455,7 +516,7 @@ class CurveResult(InNotebook, StudyResult):
     tabular: ClassVar[str] = "curve"
 
     epsilons: list[float | None] = Field(
-        description="those that were tried; null: the own of each control"
+        description="the epsilons that were tried; null if each control has its own"
     )
     table: list[ObjectRow]
     curve: list[CurvePoint]
@@ -465,55 +526,57 @@ class MatrixModel(Fields):
     """One of the models, and its predictions of the clean scene."""
 
     model: str
-    labels: list[str] = Field(description="the names that count as right")
+    labels: list[str] = Field(description="the labels that count as right")
     input_size: tuple[int, int] = Field(
-        description="of the pictures that it is shown, [height, width] in pixels"
+        description="[height, width] of its input in pixels"
     )
-    spp: int = Field(description="samples a pixel")
+    spp: int = Field(description="samples per pixel")
     clean: ControlGroup
 
 
 class MatrixCell(Fields):
     """One adversarial scene, tried on one model."""
 
-    model: str = Field(description="that it is tried on")
+    model: str = Field(description="the model that the scene is tried on")
     ending: str = Field(
-        description="`found` where it is verified on this model, as for an attack"
+        description="ending as for an attack; `found` if the scene is verified on this "
+        "model"
     )
     verified: VerifiedRate
 
 
 class MatrixRow(Fields):
-    """One adversarial scene, and what it does to each model."""
+    """One adversarial scene, and its trials on each model."""
 
     attacked: str = Field(
-        description="the model that it was searched on; `all` for an ensemble"
+        description="the model that was attacked; `all` for an ensemble"
     )
-    ending: str = Field(description="of the search and its own verification")
+    ending: str = Field(description="ending of the attack")
     run: str | None
     renders: dict[str, int] = Field(
-        description="of the search and its own verification"
+        description="number of pictures of the attack, by kind"
     )
     tested: list[MatrixCell] = Field(
-        description="on each model; empty where nothing was searched"
+        description="trials on each model; empty if nothing was searched"
     )
 
 
 class MatrixResult(InNotebook, StudyResult):
-    """Adversarial scenes of several models, tried on each of them.
+    """Adversarial scenes, each tried on several models.
 
-    They were searched on each model, or on all of them as an ensemble.
+    Each model was attacked, or all of them as one ensemble.
     """
 
     command: ClassVar[str] = "attack"
 
-    models: list[str] = Field(description="as they were asked for")
+    models: list[str] = Field(description="names of the models, as requested")
     ensemble: str | None = Field(
-        description="how objectives were put together; null: each model by itself"
+        description="how the objectives of the models were combined; null if each was "
+        "attacked by itself"
     )
     tested: list[MatrixModel] = Field(
-        description="the models that adversarial scenes were tried on; empty where "
-        "none was"
+        description="the models that adversarial scenes were tried on; empty if none "
+        "was tried"
     )
     table: list[MatrixRow]
 
@@ -531,7 +594,7 @@ class MatrixResult(InNotebook, StudyResult):
 
 
 BY_FIELD: dict[str, type[Result]] = {"models": MatrixResult, "curve": CurveResult}
-"""Other results of the command, by a field that they alone have."""
+"""Other results of the command, each by a field that only this result has."""
 
 
 def load_attack_summary(folder: Path) -> AttackSummary:

@@ -12,23 +12,23 @@ from advsearch.report import wording as words
 from advsearch.report.wording import format_count, format_number
 from advsearch.runs.results import VerifiedRate
 
-PATH = "path"  # the control whose conditions are moments
+PATH = "path"  # the control that moves along a path, at a random moment
 NORMS = {
     "linf": "the largest change of any value",
     "l2": "the root of the sum of all squared changes",
 }
-"""What these words mean, stated where they are first used."""
+"""Explanations of the norms, which a text has where it first names a norm."""
 
 _REASONS = {
     "budget spent": "The budget is spent.",
     "stalled": "The policy had nothing more to propose.",
     "non-finite objective": "The objective was not a number several times in a row.",
 }
-"""Why a search ended without finding anything, by its ending, unless that says it."""
+"""Sentences about why a search ended without finding anything, by its ending."""
 
-ITS_OBJECT = ("object", "all")
-"""Values of the setting `judge` with which the object is evaluated: alone, or with all
-things near it. Other values name a single other thing.
+JUDGES_OF_OBJECT = ("object", "all")
+"""Values of the setting `judge` with which predictions of the object are evaluated:
+alone, or with all things near it. Any other value is the name of a single other thing.
 """
 
 _RENDER_KINDS = {
@@ -42,11 +42,11 @@ _RENDER_KINDS = {
 
 
 def attack_verdict(summary: AttackSummary) -> str:
-    """Return what the run found, in sentences that stand by themselves.
+    """Return what the run found, in sentences that need no context.
 
-    The ending of the search decides the form: "The model calls this mug a vase in 20 of
-    20 fresh renders (...)" if a scene was found, else that none was found and why the
-    search ended.
+    The ending of the search decides the form. If a scene was found: "The model calls
+    this mug a vase in 20 of 20 fresh renders (...)". Else the text states that none was
+    found, and why the search ended.
     """
     ending = summary.ending
     verified = summary.verified
@@ -84,7 +84,7 @@ def attack_verdict(summary: AttackSummary) -> str:
 
 
 def _unverified_verdict(summary: AttackSummary, thing: str) -> str:
-    """Return what a run found that ended before anything was verified.
+    """Return what a run found if it ended before anything was verified.
 
     Args:
         summary: summary of the attack.
@@ -107,10 +107,11 @@ def _unverified_verdict(summary: AttackSummary, thing: str) -> str:
 def _name_thing(summary: AttackSummary) -> str:
     """Return what is evaluated: ``this wine glass`` for the object `wine-glass`.
 
-    It is the object or a thing near it; the object of a file has the file's name.
+    It is the object or a thing near it. An object that was loaded from a file has the
+    name of the file.
     """
     name = summary.judge
-    if summary.judge in ITS_OBJECT:
+    if summary.judge in JUDGES_OF_OBJECT:
         name = PurePath(summary.object).stem
     thing = "this " + name.replace("-", " ").replace("_", " ")
     return f"{thing} or a thing beside it" if summary.judge == "all" else thing
@@ -119,19 +120,22 @@ def _name_thing(summary: AttackSummary) -> str:
 def _random_search_remark(summary: AttackSummary, verified: VerifiedRate) -> str:
     """Return a remark on a found scene if the random search did as well; else empty."""
     if summary.adversarial_from == "random":
-        return " Random search found it, and the policy nothing as bad."
+        return " Random search found it, and the policy found nothing as bad."
     random_rate = summary.baseline.verified if summary.baseline else None
+    # If neither had a success, there is nothing to compare.
     if random_rate is None or verified.rate <= 0:
         return ""
-    return " Random search finds as much." if random_rate.rate >= verified.rate else ""
+    is_random_as_good = random_rate.rate >= verified.rate
+    return " Random search finds as much." if is_random_as_good else ""
 
 
 def condition_text(over: Sequence[str], has_several_paths: bool = False) -> str:
     """Return what differs between trials: ``, each with another camera``.
 
     Args:
-        over: controls that vary by chance; of a path it is the moment.
-        has_several_paths: whether there are several paths.
+        over: controls that vary by chance. With the control "path", trials differ in
+            their moment on the path.
+        has_several_paths: whether the path is one of several.
     """
     controls = [name for name in over if name != PATH]
     parts = []
@@ -169,7 +173,7 @@ def _clean_remark(summary: AttackSummary) -> str:
     not_a_number = ""
     if control.not_a_number:
         not_a_number = f"; in {control.not_a_number} the output is not a number"
-    # over conditions, only trials with a right clean scene count
+    # If conditions vary, only trials with a right clean scene count.
     not_counted = " They do not count." if summary.over else ""
     return (
         f"The clean scene itself fails {n_failures} of its {control.trials} "
@@ -180,30 +184,30 @@ def _clean_remark(summary: AttackSummary) -> str:
 def _baseline_remark(summary: AttackSummary) -> str:
     """Return a remark if the random search did as well as the policy; else empty."""
     verified = summary.verified
-    # the policy's own, if the random search's configuration became the scene
-    policy_rate = summary.policy_verified
     random_rate = summary.baseline.verified if summary.baseline else None
+    # Stored only if the random search found a configuration that is worse for the
+    # model: then `verified` is about that configuration, and this about the policy's.
+    policy_rate = summary.policy_verified
     if summary.adversarial_from == "random" and policy_rate:
         return (
-            "The random search beside it found a worse configuration than the policy "
-            f"did ({policy_rate.successes} of {policy_rate.trials} with a margin of "
-            f"{policy_rate.margin:.2f}); that of the "
-            "random search is the scene. The margin is "
-            f"{words.get_margin_meaning(summary.task)}."
+            "The random search found a worse configuration than the policy did "
+            f"({policy_rate.successes} of {policy_rate.trials} with a margin of "
+            f"{policy_rate.margin:.2f}), and this is the adversarial scene. The margin "
+            f"is {words.get_margin_meaning(summary.task)}."
         )
     if verified is None or random_rate is None:
         return ""
+    if random_rate.rate <= 0 or random_rate.rate < verified.rate:
+        return ""  # without any success, the random search did not do well
     successes = f"{random_rate.successes} of {random_rate.trials}"
     text = "Random search with as many renders does"
-    if random_rate.rate <= 0 or random_rate.rate < verified.rate:
-        return ""
     if random_rate.rate > verified.rate:
         return f"{text} better: {successes}."
     return f"{text} as well: {successes}. The policy adds nothing here."
 
 
 def success_name(summary: AttackSummary) -> str:
-    """Return what counts as a success in the trials, in a word."""
+    """Return a word for the predictions that count as a success, such as "wrong"."""
     if summary.target:
         return "target"
     return "easier" if summary.minimises else "wrong"
@@ -218,18 +222,18 @@ def goal_text(summary: AttackSummary) -> str:
 
 
 def objective_text(summary: AttackSummary) -> str:
-    """Return the objective in the trials.
+    """Return the mean and the range of the objective in the trials.
 
-    Empty if it is not known, or if a trial is a success exactly where it is over 0: the
-    rate says as much.
+    Empty if it is not known, or if a trial is a success exactly when its objective is
+    above 0: then the rate is enough.
     """
     objective = summary.tried_objective
     if objective is None or summary.objective in words.SUCCESS_ABOVE_ZERO:
         return ""
-    arms = (("clean", objective.clean), ("adversarial", objective.adversarial))
+    scenes = (("clean", objective.clean), ("adversarial", objective.adversarial))
     parts = [
         f"{name} {values.mean:.3g} (from {values.low:.3g} to {values.high:.3g})"
-        for name, values in arms
+        for name, values in scenes
         if values is not None
     ]
     return f"{summary.objective} in the trials: {', '.join(parts)}" if parts else ""
@@ -305,7 +309,7 @@ def budget_text(summary: AttackSummary) -> str:
 
 
 def _within_text(name: str, epsilon: object, norm: object) -> str:
-    """Return a control's name with its budget; without an epsilon, the name alone."""
+    """Return a control's name with its budget, if it has an epsilon."""
     if not isinstance(epsilon, (int, float)):
         return name
     text = f"{name} within {format_number(epsilon)}"
@@ -313,7 +317,10 @@ def _within_text(name: str, epsilon: object, norm: object) -> str:
 
 
 def renders_text(summary: AttackSummary) -> str:
-    """Return ``40 of the search, 40 gradients, 21 of the verification``."""
+    """Return how many images were rendered for what.
+
+    ``40 of the search, 40 gradients, 21 of the verification``.
+    """
     spent = [
         f"{number} {_RENDER_KINDS.get(name, f'of {name}')}"
         for name, number in summary.renders.items()
@@ -345,8 +352,9 @@ def _error_clause(
 ) -> str:
     """Return what the model gets wrong, as in "The model calls this mug a vase".
 
-    - For a commanded action, or a scene that is easier to recognise, the clause is
-      `claim`; that of an action also has its direction.
+    - For a scene that is easier to recognise (setting `minimise`), or for a commanded
+      action (task "command"), the clause is `claim`. If all actions deviate in the same
+      direction, it has the direction, too.
     - If all trials have the same prediction, the clause names it.
     - If they have several, it names the most frequent one, or the outcomes of a
       detector.
@@ -357,7 +365,7 @@ def _error_clause(
         summary: summary of the attack.
         verified: the rate of the trials.
         thing: the object that is evaluated, as "this mug".
-        claim: clause for what a trial counts as, "the model is wrong about it" say.
+        claim: clause for what a success is, such as "the model is wrong about this mug".
     """
     labels = verified.labels
     only_label = next(iter(labels)) if len(labels) == 1 else None
@@ -365,7 +373,7 @@ def _error_clause(
         return _begin_upper(claim)
     if summary.task == words.COMMAND:
         if only_label is not None and not summary.target:
-            # such as "(steering above it)"
+            # "action outside its envelope (steering above it)" gives the text in ()
             direction = only_label.replace("action outside its envelope ", "")
             claim = f"{claim} {direction}" if direction else claim
         return _begin_upper(claim)
@@ -393,8 +401,9 @@ def _mixed_error_clause(
 ) -> str:
     """Return what the model gets wrong if trials have several predictions.
 
-    It names the most frequent prediction. If a detector has several outcomes, such as
-    missed and loose, it names these instead.
+    It names the most frequent prediction: "The model is wrong about this mug, most often
+    calling it a vase,". A detector's predictions have outcomes, such as missed and
+    loose. If there are several, it names these instead.
 
     Args:
         summary: summary of the attack.
@@ -405,22 +414,24 @@ def _mixed_error_clause(
     if summary.target:
         error = f"takes {thing} for one of the targets"
     outcome = words.get_only_outcome(verified.outcomes)
-    if outcome is None and verified.outcomes:
+    has_several_outcomes = outcome is None and bool(verified.outcomes)
+    if has_several_outcomes:
         outcomes = words.format_outcomes(verified.outcomes, summary.task)
         return f"The model {error} ({outcomes})"
     labels = verified.labels
     most_frequent = max(labels, key=lambda label: labels[label])
     calling = words.format_mistake_participle(summary.task, most_frequent, outcome)
+    # the sentence goes on with the rate, "in 18 of 20 fresh renders"
     return f"The model {error}, most often {calling},"
 
 
 def _clauses(summary: AttackSummary, thing: str) -> tuple[str, str]:
-    """Return what a trial counts as, and the goal of the search.
+    """Return clauses for what a success in a trial is, and for the goal of the search.
 
     Example: "the model is wrong about this mug" and "makes the model miss this mug". If
-    nothing was found, the sentence begins with the goal, which names the model; then
-    the claim is "it is wrong". For a commanded action, only the command is claimed,
-    since no vehicle has moved.
+    nothing was found, the verdict begins with the goal, which names the model; then the
+    first clause is only "it is wrong". For a commanded action, the clauses are about
+    the command alone, since no vehicle has moved.
 
     Args:
         summary: summary of the attack.
@@ -457,9 +468,9 @@ def _clauses(summary: AttackSummary, thing: str) -> tuple[str, str]:
 
 
 def method_texts(summary: AttackSummary) -> dict[str, str]:
-    """Return how an attack came to its result, by name; empty texts are left out."""
+    """Return texts about the method of an attack, by name, without empty ones."""
     segments = summary.light_path_segments
-    # values of the scene that a control leaves out, and the ones that the search used
+    # values of the scene outside of a control's range, and those that replaced them
     moved_texts = [
         f"{value.parameter} from {format_number(value.scene)} to "
         f"{format_number(value.used)} {value.unit}".rstrip()
@@ -470,7 +481,7 @@ def method_texts(summary: AttackSummary) -> dict[str, str]:
         "Sample count": _sample_count_text(summary),
         "Light transport": transport_text(summary),
         "Gradients": _gradients_text(summary),
-        "Cut or taken back": _rejected_text(summary),
+        "Clipped or undone": _rejected_text(summary),
         "Not finite": _non_finite_text(summary),
         "Light paths": (
             f"at most {segments.search} segments in the search, "
@@ -478,7 +489,7 @@ def method_texts(summary: AttackSummary) -> dict[str, str]:
         ),
         "Printability": _printability_text(summary),
         "Cost of printability": print_cost_text(summary),
-        "Moved before": ", ".join(moved_texts),
+        "Changed before the search": ", ".join(moved_texts),
     }
     return {name: text for name, text in facts.items() if text}
 
@@ -498,15 +509,19 @@ def _claim_text(summary: AttackSummary) -> str:
 
 
 def _sample_count_text(summary: AttackSummary) -> str:
-    """Return the samples of the verification, and whether they suffice."""
+    """Return the samples of the verification, and whether they suffice.
+
+    They suffice if more samples would not change the sign of the margin. If conditions
+    vary by chance (`over`), the rate must not change much.
+    """
     samples = summary.sample_count
     if samples is None:
         return ""
-    reason = "that more would not change it is not shown"
+    effect = "more might change the verdict"
     if samples.converged:
-        stable = "rate about where it is" if summary.over else "margin on its side"
-        reason = f"more would leave the {stable}"
-    return f"{samples.spp} a pixel in the verification; {reason}"
+        quantity = "rate much" if summary.over else "sign of the margin"
+        effect = f"more would not change the {quantity}"
+    return f"{samples.spp} per pixel in the verification; {effect}"
 
 
 def _gradients_text(summary: AttackSummary) -> str:
@@ -524,14 +539,19 @@ def _gradients_text(summary: AttackSummary) -> str:
 
 
 def _rejected_text(summary: AttackSummary) -> str:
-    """Return what the policy did about outliers and failed steps."""
+    """Return what the policy did about outliers and failed steps.
+
+    A policy clips elements of a gradient that are outliers (`cut`), and scales a
+    gradient down whose norm is an outlier (`shortened`). It undoes steps that make the
+    objective worse (`rejected`); it can do so without gradients, too.
+    """
     gradients = summary.gradients
     if gradients is None or not (gradients.count or gradients.rejected):
         return ""
     return (
-        f"{format_count(gradients.cut, 'gradient')} with single outliers cut, "
-        f"{gradients.shortened} shortened as a whole, "
-        f"{format_count(gradients.rejected, 'step')} taken back"
+        f"{format_count(gradients.cut, 'gradient')} with outlying elements clipped, "
+        f"{gradients.shortened} scaled down, "
+        f"{format_count(gradients.rejected, 'step')} undone"
     )
 
 
@@ -546,7 +566,10 @@ def _non_finite_text(summary: AttackSummary) -> str:
 
 
 def _printability_text(summary: AttackSummary) -> str:
-    """Return the print terms of both scenes."""
+    """Return the print terms of both scenes, in units of sRGB.
+
+    The unit is stated only if there is an adversarial scene.
+    """
     printability = summary.printability
     if printability is None:
         return ""
@@ -555,7 +578,7 @@ def _printability_text(summary: AttackSummary) -> str:
         f"printable colours {terms.off_print:.3g}"
         for name, terms in (
             ("clean", printability.clean),
-            ("answer", printability.adversarial),
+            ("adversarial", printability.adversarial),
         )
         if terms is not None
     ]
@@ -564,7 +587,7 @@ def _printability_text(summary: AttackSummary) -> str:
 
 
 def _short(value: float) -> str:
-    """Return a number with three digits, also one that is not known."""
+    """Return a number with three digits, or a text for one that is not known."""
     return f"{value:.3g}" if math.isfinite(value) else "an unknown amount"
 
 
@@ -589,13 +612,13 @@ def transport_text(summary: AttackSummary) -> str:
         parts = [f"a matrix predicted {n_predicted}"]
     if transport.error is not None:
         parts.append(
-            "at the last comparison with a traced one it was off by "
+            "at the last comparison with a rendered picture its error was "
             f"{_short(transport.error.levels)} of 255 levels of the picture's change "
             "(root mean square) and "
             f"{_short(transport.error.margin_bias)} of the objective"
         )
     if transport.renewed:
-        parts.append(f"made anew {format_count(transport.renewed, 'time')}")
+        parts.append(f"made again {format_count(transport.renewed, 'time')}")
     if transport.seconds is not None:
         parts.append(
             f"it and the comparisons took {words.format_seconds(transport.seconds)}"

@@ -1,5 +1,6 @@
-"""Check every gradient against differences; show how a search gets them and what it
-leaves out.
+"""Check every gradient against differences, and plan the gradients of a search.
+
+The plan also states what a search does not render.
 """
 
 from __future__ import annotations

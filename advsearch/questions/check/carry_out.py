@@ -28,14 +28,14 @@ from advsearch.questions.check.result import (
 planning = gradients.planning
 SCENES = (("mug", None), ("bowl", "kitchen"), ("bottle", "noon"))
 """Bundled scenes that `check --all` goes through; None is the default environment."""
-# samples per pixel of a gradient of the linear loss, which is taken without denoiser
+# samples per pixel of a gradient of the linear loss, which is rendered without denoiser
 RAW_SPP = 16
-# samples per pixel of the most expensive gradient of the model's loss
+# maximum samples per pixel of a gradient of the model's loss
 MAX_SPP = 256
 REFERENCE_SPP = 64
 """Samples per pixel of a reference render."""
 N_SEEDS = (6, 16)
-"""Seeds of a reference, at least and at most: until its noise is small."""
+"""Minimum and maximum number of seeds of a reference: until its noise is small."""
 # the same for the model's loss, whose renders have more samples
 N_MODEL_SEEDS = (3, 6)
 HINT = "`resolution` or fewer controls shorten it, `seconds` ends it"
@@ -47,7 +47,7 @@ FindingType = TypeVar("FindingType")
 
 @dataclass(frozen=True)
 class CheckedPart:
-    """What is checked in one go: a scene with its controls, and a loss.
+    """A part of a check: a scene with its controls, and a loss.
 
     Attributes:
         number: number from 1.
@@ -61,19 +61,19 @@ class CheckedPart:
 
     @property
     def key(self) -> str:
-        """The name of its measurements."""
+        """The name under which its measurements are stored."""
         return f"check {self.number}"
 
     @property
     def title(self) -> str:
-        """What the progress says of it."""
+        """The part in the messages of the progress: "mug in studio, pose"."""
         return (
             f"{self.config.object} in {self.config.environment_name}, "
             f"{' and '.join(self.config.controls)}"
         )
 
     def make_row(self, measured: results.Measured, **fields: Any) -> CheckedRow:
-        """Return a measurement with what it is of, and with other `fields`."""
+        """Return a measurement as a row, with the scene, the loss and other `fields`."""
         config = self.config
         scene_fields = {
             "object": config.object,
@@ -105,7 +105,7 @@ def list_bundled(config: CheckConfig) -> Iterator[CheckConfig]:
         if environment is not None:
             skipped.add("sky")  # it would replace the environment
         for control, control_type in workbench.CONTROLS.items():
-            # A control without parameters gets them from the scene.
+            # A control without parameters of its own gets them from a scene file.
             if not control_type.parameters or control in skipped:
                 continue
             scene_fields = {
@@ -121,10 +121,10 @@ def list_bundled(config: CheckConfig) -> Iterator[CheckConfig]:
 
 
 class GradientCheck:
-    """One session of a check.
+    """Makes or continues a check.
 
-    What is measured is stored at once, so that a check that was stopped goes on where
-    it was and ends with the same rows; only times differ.
+    Each measurement is stored at once. A check that was stopped continues with the next
+    one, and ends with the same rows; only times differ.
     """
 
     def __init__(self, context: RunContext[CheckConfig]) -> None:
@@ -214,15 +214,19 @@ class GradientCheck:
         renderer = problem.renderer
         # The raw image has no tone curve.
         renderer.formation = replace(renderer.formation, transfer="linear")
+        # Differences have steps over which outlines move by a pixel: a smooth loss is
+        # not linear over wider steps.
         renderer.plan = renderer.plan.with_pixel_steps()
         loss = gradients.make_smooth_loss(renderer.formation.resolution, config.seed)
         spp = config.spp if isinstance(config.spp, int) else RAW_SPP
+        # The reference takes differences with the planned step and with a wider one.
+        reference_factors = gradients.FACTORS[:2]
         rows = gradients.measure_derivatives(
             self._make_bench(part, renderer, loss, spp),
             reference_spp=REFERENCE_SPP,
             reference_repeats=N_SEEDS,
-            reference_factors=gradients.FACTORS[:2],  # two steps of differences
-            list_tries=gradients.list_attempts,
+            reference_factors=reference_factors,
+            list_tries=gradients.list_attempts,  # all estimators, not only the planned
             stage=partial(self._begin_stage, title),
         )
         for row in rows:
@@ -231,10 +235,11 @@ class GradientCheck:
     def _measure_model(self, part: CheckedPart, title: str) -> Iterator[Finding]:
         """Plan a search by the model's own loss, and measure its derivatives as planned.
 
-        There are three kinds of rows. First come the cosines between noisy gradients
-        and a converged one, by which steps and samples are chosen. Then comes the plan
-        of the search, except in a check of all controls. The derivatives come last,
-        with the factor by which each step was changed.
+        Three kinds of results are yielded. First come the cosines between noisy
+        gradients and a converged one, by which steps and samples are chosen. Then comes
+        the plan of the search, except in a check of all bundled scenes (setting `all`).
+        The derivatives come last. Each has the factor between the step of differences
+        that the measurement has chosen and the one before it.
 
         Args:
             part: controls and settings that are measured.
@@ -245,9 +250,9 @@ class GradientCheck:
         renderer = problem.renderer
         bench = self._make_bench(part, renderer, problem.compute_loss, problem.spp)
 
-        self._choose_plan(title, renderer, bench, config)
+        renderer.plan = self._choose_plan(title, bench, config)
 
-        planned_steps = {group.name: group.step for group in renderer.plan.groups}
+        steps_before = {group.name: group.step for group in renderer.plan.groups}
         rows = list[results.Measured]()
         for row in self._measure_cosines(problem, bench, config.seed, title):
             rows.append(row)
@@ -257,11 +262,7 @@ class GradientCheck:
 
         if not config.all:
             yield from self._plan_search(problem, part, spp)
-        step_factors = {
-            group.name: group.step / planned_steps[group.name]
-            for group in renderer.plan.groups
-            if planned_steps[group.name]
-        }
+        step_factors = _divide_steps(renderer.plan.groups, steps_before)
         derivatives = gradients.measure_derivatives(
             replace(bench, spp=spp),
             reference_spp=planning.CONVERGED_SPP,
@@ -269,17 +270,19 @@ class GradientCheck:
             stage=partial(self._begin_stage, title),
         )
         for row in derivatives:
-            # Coordinates of one group have a number after its name.
+            # A coordinate of a vector is "center.0"; its group is the full vector.
             group_name = f"{row.control}.{row.parameter.partition('.')[0]}"
             yield part.make_row(row, factor=step_factors.get(group_name, 1.0))
 
-    def _choose_plan(self, title: str, renderer: Any, bench: Any, config: Any) -> None:
-        """Measure ways to differentiate, and set the renderer's plan to the best."""
-        n_gradients = planning.count_plan_gradients(renderer.plan)
+    def _choose_plan(
+        self, title: str, bench: gradients.Bench, config: CheckConfig
+    ) -> Any:
+        """Return the plan with the best estimators, by measurement."""
+        n_gradients = planning.count_plan_gradients(bench.renderer.plan)
         stage_title = f"{title}: comparing ways to differentiate"
         self.progress.stage(stage_title, n_gradients, hint=HINT)
         measure_bench = replace(bench, seed=seeds.stream(config.seed, "measure"))
-        renderer.plan = planning.choose_estimators(measure_bench, count_renders=True)
+        return planning.choose_estimators(measure_bench, count_renders=True)
 
     def _measure_cosines(
         self, problem: Problem, bench: gradients.Bench, seed: int, title: str
@@ -342,7 +345,7 @@ class GradientCheck:
         )
 
     def _begin_stage(self, title: str, name: str, max_steps: int) -> None:
-        """Begin a stage of the progress, of a part with a title."""
+        """Begin a stage of the progress; `title` is the title of the part."""
         self.progress.stage(f"{title}: {name}", max_steps, hint=HINT, at_most=True)
 
     def _plan_search(
@@ -350,9 +353,9 @@ class GradientCheck:
     ) -> Iterator[Finding]:
         """Yield the plan of a search, its longest light paths, and what it saves.
 
-        What it saves is the gain of each item that is left out of the rendering, such
-        as bounces, and how many texels are visible. There are no such rows if nothing
-        is left out.
+        What it saves is stated by a row for each item that is left out of the
+        rendering, such as bounces, and a row for the visible texels of each texture.
+        With `specialise=false` nothing is left out, and only the plan is yielded.
 
         Args:
             problem: problem of the scene.
@@ -365,9 +368,11 @@ class GradientCheck:
         if config.specialise:
             left_out = list_left_out(renderer)
         summary = problem.summarize_plan(renderer.plan)
-        yield SearchPlan(**{**vars(summary), "spp": spp, "left_out": left_out})
+        plan_fields = {**vars(summary), "spp": spp, "left_out": left_out}
+        yield SearchPlan(**plan_fields)
         if not config.specialise:
             return
+        # Each measurement is read if it is stored, or else made and stored.
         length = self.measurements.get_row(
             f"{part.key} bounces",
             results.PathLength,
@@ -426,29 +431,45 @@ class GradientCheck:
         )
 
 
+def _divide_steps(
+    groups: Sequence[Any], steps_before: dict[str, float]
+) -> dict[str, float]:
+    """Return the factor between the step of each group and the one before, by name.
+
+    A group that takes no differences has a step of 0, and no factor.
+    """
+    return {
+        group.name: group.step / steps_before[group.name]
+        for group in groups
+        if steps_before[group.name] != 0.0
+    }
+
+
 def _select(findings: Sequence[Finding], kind: type[FindingType]) -> list[FindingType]:
     """Return the findings of a type."""
     return [finding for finding in findings if isinstance(finding, kind)]
 
 
 def list_left_out(renderer: gradients.Renderer) -> list[str]:
-    """Return what a search with the renderer's plan does not compute at all."""
-    used = {group.estimator for group in renderer.plan.groups}
+    """Return what a search with the renderer's plan does not compute, in sentences."""
+    estimators = {group.estimator for group in renderer.plan.groups}
     sentences = []
-    if "material" not in used:
+    # Of all adjoints, only the estimator "material" differentiates moving outlines.
+    if "material" not in estimators:
         sentences.append(
             "boundary terms: nothing that an adjoint differentiates moves an outline"
         )
-    if not used & gradients.ADJOINT_ESTIMATORS:
+    if not estimators & gradients.ADJOINT_ESTIMATORS:
         sentences.append("adjoint renders: no coordinate needs one")
-    if not used & gradients.DIFFERENCE_ESTIMATORS:
+    if not estimators & gradients.DIFFERENCE_ESTIMATORS:
         sentences.append(
-            "renders for differences: every derivative is an adjoint or "
-            "of the picture itself"
+            "renders for differences: every derivative comes from an adjoint or from "
+            "the picture itself"
         )
     if not renderer.scene.is_volumetric:
         sentences.append("the volumetric integrator: there is no medium")
-    if "material" in used:
+    if "material" in estimators:
+        # what this estimator leaves out or gets wrong
         sentences += [
             f"by the material form: {limit}" for limit in renderer.scene.material_limits
         ]

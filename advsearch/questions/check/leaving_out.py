@@ -1,4 +1,7 @@
-"""Measure what a search saves by what it leaves out, and that it changes nothing."""
+"""Measure how much time a search saves by what it does not compute.
+
+It is also checked that images and gradients stay the same.
+"""
 
 from __future__ import annotations
 
@@ -15,32 +18,32 @@ from advsearch.extend import gradients, seeds
 from advsearch.questions.check.result import GainRow, TexelRow
 
 ITEMS = gradients.OMISSIONS
-EVERYTHING = frozenset(ITEMS)  # leave out all that can be
-NOTHING = frozenset[str]()
-SEARCH = ""  # the renderer of the search, which computes no item
+ALL_ITEMS = frozenset(ITEMS)
+NO_ITEMS = frozenset[str]()
+# Names of the variants of a renderer that are compared, besides those that compute one
+# item: the search's, which computes no item; the one that computes all items; and the
+# one whose light paths have their full length.
+SEARCH = ""
 ALL = "everything above"
 BOUNCES = "bounces"
-"""Names of the rows in which all items are put back together, and in which paths have
-their full length.
-"""
 WHAT = {
     **ITEMS,
     BOUNCES: "bounces of light beyond the search's longest path",
     ALL: "all of these",
 }
-"""What is left out, in words, for each row."""
+"""Descriptions of what is left out, for each row."""
 AGREEMENT_LIMIT = 1.2
-"""Difference, as a fraction of what another seed changes, up to which two images or
-gradients agree: 1 is expected if the random numbers are others.
+"""Two images or gradients agree if they differ by at most this much, as a fraction of
+the difference between two seeds. Without any effect, 1 is expected.
 """
-REPEATS = 3  # timed gradients of each
+REPEATS = 3  # timed gradients of each variant
 MAX_GRADIENTS = (2 + REPEATS) * (len(ITEMS) + 3)
-"""That `measure_gains` takes: with every item put back, with all, with all bounces and
-with none.
+"""Maximum number of gradients that `measure_gains` computes: each variant has two to
+compare, and the timed ones.
 """
 TEXELS_PER_PIXEL = 2.0
-"""That `TexelRow.enough` keeps: two samples a period (Nyquist), with room for oblique
-views.
+"""Visible texels for each pixel that suffice: two samples a period (Nyquist), with room
+for oblique views.
 """
 
 
@@ -81,7 +84,8 @@ def measure_gains(
     measurements = {item: _Measurements() for item in variants}
     # The first gradient of a variant compiles its kernels. That is done here, and not
     # timed.
-    for noise_seed in (seed, seeds.stream(seed, "another")):
+    other_seed = seeds.stream(seed, "another")
+    for noise_seed in (seed, other_seed):
         for item, variant in variants.items():
             with torch.no_grad():
                 measurements[item].images.append(variant(u, noise_seed, spp))
@@ -110,7 +114,8 @@ def _make_variants(
     one of these items, and `ALL` computes all.
 
     Args:
-        renderer: renderer of the search, whose light paths have their full length.
+        renderer: renderer that leaves out everything it can, except bounces: its light
+            paths have their full length.
         depth: maximum number of segments of the search's light paths; None for the
             scene's.
     """
@@ -120,20 +125,20 @@ def _make_variants(
     if depth != scene.max_depth:
         variants[SEARCH] = renderer.copy_with(scene.copy_with(max_depth=depth))
     for item in ITEMS:
-        leave_out = EVERYTHING - {item}
+        other_items = ALL_ITEMS - {item}
         variants[item] = renderer.copy_with(
-            scene.copy_with(max_depth=depth, leave_out=leave_out)
+            scene.copy_with(max_depth=depth, leave_out=other_items)
         )
-    if depth < scene.max_depth:
-        # It leaves out the same things as the search, but no bounces.
+    leaves_out_bounces = depth < scene.max_depth
+    if leaves_out_bounces:
         variants[BOUNCES] = renderer
-    variants[ALL] = renderer.copy_with(scene.copy_with(leave_out=NOTHING))
+    variants[ALL] = renderer.copy_with(scene.copy_with(leave_out=NO_ITEMS))
     return variants
 
 
 @dataclass
 class _Measurements:
-    """What is measured with one renderer.
+    """Measurements with one variant of the renderer.
 
     Attributes:
         images: images (H, W, 3) at two seeds.
@@ -157,8 +162,8 @@ def _compare_item(
 
     Args:
         item: name of the item.
-        search: measurements without any of the items.
-        with_item: measurements with the item.
+        search: measurements with the search's renderer, which computes no item.
+        with_item: measurements with the renderer that computes the item.
     """
     image_difference = _relative_difference(search.images, with_item.images)
     gradient_difference = _relative_difference(search.gradients, with_item.gradients)
@@ -180,7 +185,7 @@ def _compare_item(
 
 
 def _difference(pair: list[Tensor]) -> float:
-    """Return the norm of what another seed changes."""
+    """Return the norm of the difference between two seeds."""
     first, other = pair
     return float((other - first).norm())
 
@@ -189,7 +194,7 @@ def _relative_difference(without: list[Tensor], with_item: list[Tensor]) -> floa
     """Return how much an item changes an image or gradient, compared with the noise.
 
     That is the difference at the first seed, divided by the root mean square of the
-    differences between the two seeds; not divided if seeds make no difference.
+    differences between the two seeds. If seeds make no difference, it is not divided.
 
     Args:
         without: images or gradients at two seeds, without the item.
@@ -207,7 +212,7 @@ def measure_texels(
 ) -> list[TexelRow]:
     """Compare the texels of each searched texture with the pixels that show it.
 
-    A texture with many more texels than pixels is larger than necessary.
+    A texture with many more visible texels than pixels is larger than necessary.
 
     Args:
         renderer: renderer of a search.
@@ -220,7 +225,9 @@ def measure_texels(
     for group in renderer.plan.groups:
         if group.parameter != "texels":
             continue
-        for name in sorted(renderer.routes.get(group.name, ())):
+        # names of the scene inputs (textures) that the group changes
+        input_names = renderer.routes.get(group.name, frozenset())
+        for name in sorted(input_names):
             n_pixels = _count_pixels(renderer, inputs, name, seed, spp)
             n_visible = _count_visible_texels(renderer, inputs, name, seed, spp)
             side = max(inputs[name].shape[:2])

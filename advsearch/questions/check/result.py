@@ -26,7 +26,7 @@ OF_ALL: Mapping[str, object] = {
     "controls": {"texture": {}},
     "set_": {},
 }
-"""Defaults of the settings that `all` does not allow to be changed."""
+"""Defaults of the settings that cannot be changed with `all`."""
 
 
 class CheckConfig(DerivativeConfig):
@@ -51,7 +51,7 @@ class CheckConfig(DerivativeConfig):
         settings.Clash(
             "objective",
             lambda config: config.loss == "linear",
-            "is of the model's loss, which `loss=linear` leaves out; leave one of "
+            "belongs to the model's loss, which `loss=linear` leaves out; leave one of "
             "the two out",
         ),
     )
@@ -68,7 +68,7 @@ class CheckConfig(DerivativeConfig):
     seconds: float | None = setting(
         None,
         "check",
-        "time after which no measurement is begun any more; `advsearch resume` goes on "
+        "time after which no further measurement begins; `advsearch resume` continues "
         "for as long again",
         otherwise="no limit",
         unit="seconds",
@@ -96,7 +96,7 @@ class CheckedRow(results.Measured):
 
     object: str
     environment: str
-    loss: str = Field(description="`linear`, or `model`: the model's own")
+    loss: str = Field(description="`linear`, or `model` for the loss of the model")
 
 
 class GainRow(results.Fields):
@@ -105,37 +105,41 @@ class GainRow(results.Fields):
     item: str
     what: str
     time_gain: float = Field(
-        description="a gradient's time x the picture's variance "
-        "with it, over those without it"
+        description="time of a gradient x variance of the picture, with the item "
+        "divided by without it"
     )
     picture_difference: results.JsonFloat = Field(
-        description="root mean square at one seed, over that of two seeds"
+        description="difference of the pictures with and without it at the same seed, "
+        "divided by the difference between two seeds"
     )
     gradient_difference: results.JsonFloat = Field(
-        description="the same of gradients; 0 where there are none"
+        description="the same for gradients; 0 if there are none"
     )
     safe: bool = Field(
-        description="whether pictures and gradients agree to within their noise"
+        description="whether pictures and gradients agree within their noise"
     )
-    seconds: float = Field(description="of a gradient with it")
+    seconds: float = Field(description="time of a gradient with the item")
 
 
 class TexelRow(results.Fields):
-    """How many texels of a searched texture a pixel shows."""
+    """How many texels of a searched texture are visible, and how many suffice."""
 
-    control: str = Field(description="whose texture")
-    side: int = Field(description="of the texture, in texels")
-    seen: int = Field(description="texels that light reaches the camera from directly")
-    pixels: int = Field(description="pixels that show the surface")
+    control: str = Field(description="the control that changes the texture")
+    side: int = Field(description="side of the texture, in texels")
+    seen: int = Field(
+        description="visible texels: light gets directly from them to the camera"
+    )
+    pixels: int = Field(description="pixels that show the texture")
     enough: int = Field(
-        description="side, `side` halved as often as the pixels still resolve as much"
+        description="smallest sufficient side: `side` halved while there are still "
+        "enough texels for the pixels"
     )
 
 
 class SearchPlan(results.PlannedGradient):
     """How a search over the scene gets its derivatives, and what it leaves out."""
 
-    left_out: list[str] = Field(description="what is not computed at all, in sentences")
+    left_out: list[str] = Field(description="sentences about what is not computed")
 
 
 class CheckResult(views.InNotebook, RunResult):
@@ -147,20 +151,22 @@ class CheckResult(views.InNotebook, RunResult):
 
     object: str
     measured: int = Field(
-        description="parts (a scene with a control and a loss) that are done"
+        description="number of parts (a scene with a control and a loss) that are done"
     )
-    planned: int = Field(description="all parts")
+    planned: int = Field(description="number of all parts")
     rows: list[CheckedRow]
     plan: SearchPlan | None = results.optional_field(
-        "absent of `loss=linear` and of `all`"
+        "plan of a search; absent with `loss=linear` and with `all`"
     )
     bounces: results.PathLength | None = results.optional_field(
-        "how long the light paths of a long search are"
+        "how long the light paths of a search with many steps are"
     )
     gains: list[GainRow] = Field(
         default=[], description="what is left out, and what that saves"
     )
-    texels: list[TexelRow] = Field(default=[], description="of the searched textures")
+    texels: list[TexelRow] = Field(
+        default=[], description="texels of the searched textures"
+    )
 
     @property
     def falls_short(self) -> bool:
@@ -174,15 +180,13 @@ class CheckResult(views.InNotebook, RunResult):
 
 
 READING = (
-    "Each row sets a derivative as a search gets it (gradient) beside one that takes "
-    "far more renders (reference). ok: "
-    "they agree within 5 %, and one gradient scatters by less than 20 % (noise); "
-    "biased: they disagree; noisy: it "
-    "scatters more; reference unusable: the reference is too noisy to tell. adjoint: a "
-    "second render that carries all "
-    "derivatives back at once; differences, secant: two renders with the parameter "
-    "moved by a step. A cosine of 1 with "
-    "the converged gradient means that a gradient points the right way."
+    "Each row compares a derivative as a search gets it (gradient) with one that takes "
+    "far more renders (reference). ok: they agree within 5 %, and single gradients "
+    "scatter by less than 20 % (noise); biased: they disagree; noisy: gradients scatter "
+    "more; reference unusable: the reference is too noisy to compare with. adjoint: a "
+    "second render that propagates all derivatives back at once; differences, secant: "
+    "two renders with the parameter changed by a step. A cosine of 1 with the converged "
+    "gradient means that a gradient has the right direction."
 )
 
 DERIVATIVE_COLUMNS: Mapping[str, views.Column] = {
@@ -211,8 +215,12 @@ GRADIENT_COLUMNS: Mapping[str, views.Column] = {
 
 
 def _step_text(group: results.GroupDerivative) -> str:
-    """Return the step of finite differences; empty without one."""
-    if not group.step_reason:
+    """Return the step of finite differences; empty without one.
+
+    It is a fraction of the parameter's range. In parentheses follows the step in the
+    parameter's unit, if that is a single number.
+    """
+    if not group.step_reason:  # the estimator takes no differences
         return ""
     if group.step_in_unit is None:
         return f"{group.step:.3g}"
@@ -235,7 +243,7 @@ GAIN_COLUMNS: Mapping[str, views.Column] = {
 }
 LOSSES = {
     "linear": "Smooth linear loss of the raw picture",
-    "model": "The model's loss, each parameter in the setting that is taken",
+    "model": "The model's loss, each parameter with the estimator and step that are used",
 }
 
 
@@ -324,13 +332,14 @@ def _left_out_texts(result: CheckResult) -> list[str]:
     bounces = result.bounces
     if bounces:
         texts.append(
-            f"light paths of a long search: at most {bounces.depth} segments of "
+            f"light paths of a long search: at most {bounces.depth} segments instead of "
             f"{bounces.full}: {bounces.reason}"
         )
     for row in result.texels:
         texts.append(
-            f"texels of {row.control}: {row.seen} are seen in {row.pixels} "
-            f"pixels, which resolve {row.enough} of {row.side} a side"
+            f"texels of {row.control}: {row.seen} are visible in {row.pixels} pixels; a "
+            f"texture with a side of {row.enough} instead of {row.side} texels would "
+            "suffice"
         )
     return texts
 
@@ -340,12 +349,14 @@ def find_inadequate(rows: Sequence[CheckedRow]) -> list[str]:
 
     For each parameter and loss only the best row counts, as a plan may use that
     estimator alone. For the model's loss, gradients of full controls count and single
-    derivatives do not: an attack needs the direction of the gradient.
+    derivatives do not: an attack needs the direction of the gradient. If the reference
+    is unusable, nothing is known against the estimator: it is not reported.
     """
-    order = ("ok", "reference unusable", "noisy", "biased")
+    order = ("ok", "reference unusable", "noisy", "biased")  # the best first
     best_rows: dict[tuple[str, ...], CheckedRow] = {}
     for row in rows:
-        if row.loss != "linear" and row.quantity != "gradient":
+        is_derivative = row.quantity == "derivative"
+        if row.loss == "model" and is_derivative:
             continue
         key = (row.object, row.environment, row.loss, row.name)
         best = best_rows.get(key)

@@ -31,23 +31,23 @@ def harden(context: RunContext[HardenConfig], **arguments: Any) -> HardenResult:
     a copy of the model is trained: the model itself does not change.
 
     Args:
-        model: a classifier, a detector or a segmenter: what `load_model` takes, and no
-            exported program.
+        model: a classifier, a detector or a segmenter, as `load_model` takes it, but
+            not an exported program.
         optimiser: function that takes the list of parameters and returns an optimizer,
             such as ``lambda p: torch.optim.SGD(p, 0.01)``. Its learning rate replaces
-            `rate` as the highest one.
+            the setting `rate` as the maximum.
         beside: batches of your own training examples, such as a `DataLoader`: images
             (N, H, W, 3) sRGB in [0, 1], class indices (N,). Each step also trains with
             one of these batches. For classifiers only; a detector takes `data`.
-        loss: loss of a detector whose network returns none in training: a function of
-            the network, its input (N, 3, H, W) and, for each picture, a mapping with
-            "boxes" (K, 4), x0, y0, x1, y1 in pixels of that input, and "labels" (K,),
-            indices of the model's labels; of a segmenter with "classes" (h, w) int64,
-            the class that each pixel of its output should have, and "object" (h, w)
-            bool, those of the object. It returns a number that is smaller where the
-            network is better.
-        resume: go on with the run of that name, if there is one, where it was stopped;
-            everything else has to be as it was.
+        loss: loss of a detector or a segmenter whose network returns none in training.
+            It is a function of the network, its input (N, 3, H, W), and a list with a
+            mapping for each picture. For a detector the mapping has "boxes" (K, 4), x0,
+            y0, x1, y1 in pixels of the input, and "labels" (K,), indices of the model's
+            labels. For a segmenter it has "classes" (h, w) int64, the class that each
+            pixel of its output should have, and "object" (h, w) bool, the pixels of the
+            object. The function returns a number; training makes it smaller.
+        resume: continue the run in the directory `run`, if there is one, from where it
+            was stopped. All other arguments have to be the same as before.
     """
     from advsearch.questions.harden.carry_out import run_hardening  # imports torch
 

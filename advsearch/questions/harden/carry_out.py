@@ -56,7 +56,7 @@ from advsearch.questions.harden.scenes import (
 from advsearch.questions.harden.training import ClassifierTrainer, Examples
 
 ARGUMENTS_NOTE = "means"
-"""Note of a run: which arguments that only Python can pass it has."""
+"""Note of a run: which of the arguments that only Python can pass were passed."""
 
 
 class Measurement(NamedTuple):
@@ -96,7 +96,7 @@ def run_hardening(
     beside: Examples | None = None,
     loss: Loss | None = None,
 ) -> HardenResult:
-    """Harden a model as the settings say, or continue a run that was stopped.
+    """Harden a model, or continue a run that was stopped.
 
     Args:
         context: the settings and the run.
@@ -176,17 +176,17 @@ def check_settings(
     if task_name not in TRAINERS or (is_classifier and uses_data_or_loss):
         raise InputError(
             "task: harden trains for classification, detection and segmentation; "
-            "`data` is of detection, and `loss` of both of the others"
+            "`data` is for detection only, and `loss` not for classification"
         )
     if task_name == "segmentation" and config.data:
-        raise InputError("data: is of detection; leave it out")
+        raise InputError("data: is for detection only; leave it out")
     if not is_classifier and beside is not None:
         raise InputError(
-            "beside: is of classifiers; give a detector a COCO folder as `data`"
+            "beside: is for classifiers only; give a detector a COCO folder as `data`"
         )
     if not is_classifier and config.layers != "all":
         raise InputError(
-            "layers: expected all of a detector or a segmenter; leave it out"
+            "layers: expected `all` for a detector or a segmenter; leave it out"
         )
 
 
@@ -202,35 +202,36 @@ def load_task_model(config: HardenConfig, model: Any = None) -> tuple[Model, lis
     except errors.ModelError as error:
         if config.task_name != "classification":
             raise
-        # The advice that follows is of commands which take any task.
-        text = str(error).partition(": use `task=")[0]
+        # "classification" is the default task: perhaps none was named. An error like
+        # "...: use `task=depth`" advises a task that harden may not train for.
+        reason, _, _ = str(error).partition(": use `task=")
         raise errors.ModelError(
-            f"{text}; harden trains classifiers, and with `task` detectors and "
+            f"{reason}; harden trains classifiers, and with `task` detectors and "
             "segmenters"
         ) from error
     return models[0], warnings
 
 
 def check_same_arguments(run: RunDirectory, arguments: Mapping[str, Any]) -> None:
-    """Check that a resumed run gets the same Python arguments, and note them.
+    """Check that a resumed run gets the same Python arguments, and store which.
 
     Args:
         run: the run.
         arguments: arguments by name; None for those that were not passed.
 
     Raises:
-        InputError: the run began with others.
+        InputError: the run began with other arguments.
     """
     is_passed = {name: value is not None for name, value in arguments.items()}
     was_passed = json.loads(run.store.read_note(ARGUMENTS_NOTE) or "{}")
-    # What the first session noted stays.
+    # What an earlier session stored stays.
     run.store.write_note(ARGUMENTS_NOTE, json.dumps({**is_passed, **was_passed}))
     for name, began_with_it in was_passed.items():
         if began_with_it != is_passed[name]:
             preposition = "with" if began_with_it else "without"
             raise InputError(
                 f"{run.path}: cannot resume: it began {preposition} `{name}`, which "
-                "only Python gives; resume it with advsearch.harden(..., run=..., "
+                "only Python can pass; resume it with advsearch.harden(..., run=..., "
                 "resume=True) and the same arguments"
             )
 
@@ -239,11 +240,12 @@ class Hardening:
     """A run that measures a model, trains it, and measures it again.
 
     Attributes:
-        is_wrong: whether a search found a wrong prediction, by the kind of the row,
-            which is a measurement and a control, and the number of the scene.
-        clean_is_right: whether each plain image of a held-out scene is right, "before"
-            and "after".
-        outcomes: counts of what becomes of the object in the others, likewise.
+        is_wrong: whether a search found a wrong prediction, by the kind of its row,
+            such as "before texture", and the number of the scene.
+        clean_is_right: whether the model is right about each plain image of the
+            held-out scenes, "before" and "after".
+        outcomes: counts of what becomes of the object in the plain images that are not
+            right, such as {"missed": 3}, "before" and "after".
         n_scenes: number of scenes by split.
     """
 
@@ -251,42 +253,44 @@ class Hardening:
         """Prepare the run, with what an earlier session of it has measured."""
         self.run = run
         self.trainer = trainer
-        self.scenes = trainer.work
+        self.jobs = trainer.work
         self.config = trainer.config
         self.rounds = Rounds(run, trainer)
+        # the step of a row is the number of its scene, see `_record`
         self.is_wrong = {
             (row.kind, row.step): bool(row.success) for row in run.store.rows()
         }
         self.clean_is_right: dict[str, list[bool]] = {}
         self.outcomes: dict[str, dict[str, int]] = {}
         n_training = self.config.scenes * self.config.rounds
+        # `measured` scenes are attacked. Plain images, which are cheaper, are evaluated
+        # in `CLEAN_SCENES` times as many.
+        n_held_out = scenes.CLEAN_SCENES * self.config.measured
         self.n_scenes = {
             TRAINING: n_training,
             FURTHER: trainer.n_further_scenes * n_training,
             VALIDATION: self.rounds.n_validation_scenes,
-            HELD_OUT: scenes.CLEAN_SCENES * self.config.measured,
+            HELD_OUT: n_held_out,
         }
 
     def execute(self, context: RunContext[HardenConfig]) -> None:
         """Measure the model, train it, and measure it again.
 
-        A run that was stopped continues: what is stored of its earlier part is not
-        computed again.
+        A run that was stopped continues: what it has stored is not computed again.
         """
-        splits = self.scenes.splits
+        splits = self.jobs.splits
         # A scene that the model was trained on must not measure it.
         scenes.check_disjoint(
             splits[HELD_OUT], [splits[name] for name in (TRAINING, FURTHER, VALIDATION)]
         )
         # Garbage is collected after each scene. Frozen objects are not visited then,
         # which saves a sixth of the time.
-        gc.freeze()  # for the same reason as in `load_scene_work`
+        gc.freeze()
         try:
             context.stages.begin("measurement", MEASUREMENTS["before"].title)
             self._measure("before", weights=None)
-            # "stronger" is a second attack with several policies and more steps. It
-            # shows whether the model resists, or only misleads the first attack's
-            # gradients.
+            # The stronger search has several policies and more steps. It shows whether
+            # the model resists, or only has gradients that mislead the usual search.
             self._measure("stronger_before", weights=None)
 
             context.stages.begin("training", "training")
@@ -312,7 +316,7 @@ class Hardening:
             for number in range(self.n_scenes[HELD_OUT])
         ]
         title = "looking at plain pictures of held-out scenes"
-        evaluations = [value for _, value in self.scenes.run_jobs(title, jobs)]
+        evaluations = [value for _, value in self.jobs.run_jobs(title, jobs)]
         for when in ("before", "after"):
             is_right = list[bool]()
             outcome_counts = Counter[str]()
@@ -334,8 +338,7 @@ class Hardening:
         steps_factor = 1
         if measurement.weaker is not None:
             steps_factor = scenes.STRONGER_STEPS_FACTOR
-            # Where the weaker search has found a failure already, the stronger one need
-            # not run.
+            # If the weaker search has found a failure, the stronger one is not run.
             self._record_weaker(name, measurement.weaker)
         to_attack = self._list_unmeasured(name)
         jobs = [
@@ -349,9 +352,9 @@ class Hardening:
             for control, number in to_attack
         ]
         hint = "`measured` and `steps` shorten it"
-        for index, status in self.scenes.run_jobs(measurement.title, jobs, hint=hint):
+        for index, status in self.jobs.run_jobs(measurement.title, jobs, hint=hint):
             control, number = to_attack[index]
-            self._record(name, control, number, status != ROBUST)
+            self._record(name, control, number, is_wrong=status != ROBUST)
 
     def _list_unmeasured(self, name: str) -> list[tuple[str, int]]:
         """Return the controls and scene numbers that a measurement has not done yet."""
@@ -364,15 +367,15 @@ class Hardening:
         ]
 
     def _record_weaker(self, name: str, weaker: str) -> None:
-        """Record, without a stronger search, what the usual search has found wrong.
+        """Record the failures of the usual search for the stronger one, too.
 
         Args:
             name: the measurement with the stronger search.
-            weaker: the one with the usual search.
+            weaker: the measurement with the usual search.
         """
         for control, number in self._list_unmeasured(name):
             if self.is_wrong[f"{weaker} {control}", number]:
-                self._record(name, control, number, True)
+                self._record(name, control, number, is_wrong=True)
 
     def _record(
         self, measurement: str, control: str, number: int, is_wrong: bool
@@ -383,7 +386,7 @@ class Hardening:
             measurement: a key of `MEASUREMENTS`.
             control: control that was searched.
             number: number of the scene.
-            is_wrong: whether it found one.
+            is_wrong: whether it found a wrong prediction.
         """
         kind = f"{measurement} {control}"
         self.is_wrong[kind, number] = is_wrong
@@ -400,7 +403,7 @@ class Hardening:
     ) -> list[bool] | None:
         """Return whether each measured scene withstood the searches of all controls.
 
-        None if a scene is not measured yet with one of them.
+        None if any search in any scene is missing.
 
         Args:
             measurement: a key of `MEASUREMENTS`.
@@ -421,9 +424,9 @@ class Hardening:
     def make_result(
         self, context: RunContext[HardenConfig], warnings: list[str]
     ) -> HardenResult:
-        """Return the result of the run, as far as it is measured.
+        """Return the result of the run.
 
-        Values that are not measured yet, because the run was stopped, are None.
+        If the run was stopped, values that are not measured yet are None.
         """
         config = self.config
         is_done = context.ending == "done"
@@ -432,11 +435,10 @@ class Hardening:
             text = (
                 "No round kept the clean accuracy, so the weights are the model's own."
             )
-            # A new list: the caller's list does not change.
-            warnings = [*warnings, text]
+            warnings = [*warnings, text]  # a new list, to leave the caller's as it is
         before = self._find_robust("before", config.controls)
         after = self._find_robust("after", config.controls)
-        training_split = self.scenes.splits[TRAINING]
+        training_split = self.jobs.splits[TRAINING]
         return context.result(
             HardenResult,
             **_compare_robustness(before, after),
@@ -459,7 +461,7 @@ class Hardening:
         )
 
     def _mark_best_round(self, is_done: bool) -> list[TrainingRound]:
-        """Return the rounds so far, the best one marked as kept once all are done."""
+        """Return the rounds so far; once all are done, the best is marked."""
         return [
             training_round.model_copy(
                 update={"is_selected": is_done and number == self.rounds.best}
@@ -479,9 +481,9 @@ class Hardening:
 
     def _describe_workers(self) -> results.SharedWork | None:
         """Return how workers shared the scenes; None without workers."""
-        if not self.scenes.executor or not self.scenes.executor.facts:
+        if not self.jobs.executor or not self.jobs.executor.facts:
             return None
-        stats = self.scenes.executor.facts
+        stats = self.jobs.executor.facts
         return results.SharedWork.of_facts(stats, stats.machines)
 
     def _make_clean_share(self, when: str) -> Share | None:
@@ -491,7 +493,9 @@ class Hardening:
             when: "before" or "after".
         """
         return make_share(
-            self.clean_is_right.get(when), scenes.CLEAN_VIEWS, self.outcomes.get(when)
+            self.clean_is_right.get(when),
+            views=scenes.CLEAN_VIEWS,
+            outcomes=self.outcomes.get(when),
         )
 
     def _make_control_rows(self) -> list[HardenedControl]:
@@ -522,13 +526,14 @@ class Hardening:
                 scenes=self.n_scenes[name],
                 views=n_views[name],
             )
-            for name, split in self.scenes.splits.items()
+            for name, split in self.jobs.splits.items()
         }
 
     def _make_hardened_name(self) -> str | None:
         """Return the name that loads the hardened model; None if no name can."""
         name = self.config.model.partition("@")[0].strip()
-        # A name with a colon is of code that makes the model.
+        # With a colon, such as "mypackage:network", the name is that of code which
+        # makes the network; the weights are named after it.
         if name == "reference" or ":" in name:
             return f"{name}@{self.run.path / WEIGHTS_FILE}"
         return None
@@ -540,8 +545,8 @@ def _compare_robustness(
     """Return the fields of a result that compare scenes before and after.
 
     Args:
-        before, after: whether each scene is robust, in the same order; None if that is
-            not measured, which leaves the fields out.
+        before, after: whether each scene is robust, in the same order. If any of them
+            is None, since it was not measured, there are no fields.
     """
     if before is None or after is None:
         return {}
@@ -565,7 +570,7 @@ def make_share(
     Args:
         is_right: whether each image is right (scenes * views), all views of a scene
             after each other; None if they are not measured.
-        views: images of each scene, which are not independent.
+        views: number of images of each scene, which are not independent.
         outcomes: counts of what happens to the object in the images that are not right,
             for example {"missed": 3}.
     """

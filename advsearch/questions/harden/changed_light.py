@@ -18,15 +18,16 @@ Their mean is about zero.
 WARM_RANGE = (-0.24, 1.0)
 """Bounds of the uniform factor of `WARM`: about 10,000 and 2,700 K."""
 WHITE_LIGHT_CHANGES = 0.5
-"""Probability that the color of light is changed."""
+"""Probability that the color temperature of an environment is changed."""
 
 
 def vary_environment(
     environment: assets.EnvironmentAsset, rng: np.random.Generator
 ) -> assets.EnvironmentAsset:
-    """Change the tint and contrast of an environment.
+    """Change the tint and contrast of an environment at random.
 
-    In half of the cases it is mirrored; in half of them a soft light is added.
+    With a probability of 1/2 it is mirrored, and, independently, with a probability of
+    1/2 a soft light is added.
     """
     radiance = environment.radiance
     if rng.random() < 0.5:
@@ -51,17 +52,14 @@ def sample_lobe(
 ) -> npt.NDArray[np.float64]:
     """Sample a broad light from above the horizon, as an environment map (H, W).
 
-    It falls off as exp(sharpness * (cosine - 1)), where `cosine` is that of the angle
-    between a texel's direction and the light's. Values are relative to the mean of the
-    environment that it is added to.
-
-    The color is not part of it. Values decrease from the center of the light in all
-    directions, as those of a von Mises-Fisher density do.
+    It has the shape of a von Mises-Fisher density: it falls off as exp(sharpness *
+    (cosine - 1)) with the angle between a texel's direction and the light's. Values are
+    gray, and relative to the mean of the environment that the light is added to.
 
     Args:
-        height, width: height and width of the map, which has the zenith at the top and
-            azimuths across.
-        rng: samples its direction, its size and its strength.
+        height, width: height and width of the map. The zenith is at the top, and the
+            azimuth changes from column to column.
+        rng: samples the direction, the size and the strength of the light.
     """
     # zenith angle and azimuth of each texel, and of the light
     theta = (np.arange(height) + 0.5)[:, None] * math.pi / height

@@ -1,6 +1,6 @@
 """Train detectors and segmenters on adversarial, plain and custom images.
 
-The loss is the network's own, or a function of the caller's.
+The loss is that of the network, or a function that the caller passes.
 """
 
 from __future__ import annotations
@@ -43,26 +43,26 @@ from advsearch.questions.harden.rounds import (
 from advsearch.questions.harden.scenes import SceneJobs
 
 Target = dict[str, Tensor]
-"""What is in a picture: "boxes" (K, 4), x0, y0, x1, y1 in pixels of the network's
-input, and "labels" (K,) indices.
+"""Ground truth of an image. For a detector: "boxes" (K, 4), x0, y0, x1, y1 in pixels of
+the network's input, and "labels" (K,), indices.
 """
 Loss = Callable[[nn.Module, Tensor, Sequence[Target]], Tensor]
-"""From a network, its input (N, ...) and what is in each picture to a number that
-training makes smaller.
+"""Takes a network, its input (N, ...) and the target of each image; returns a number
+that training makes smaller.
 """
 
 SPP = 8
-"""Samples per pixel."""
+"""Samples per pixel of all images."""
 TRIALS = 6
-"""Of a search."""
+"""Trials that verify what a search found."""
 N_VIEWS = 3
 """Views of a plain scene."""
 WORST_USES_PER_EPOCH = 5
-"""How often an epoch uses an adversarial image; a plain one it uses once."""
+"""How often an epoch uses an adversarial image; it uses a plain one once."""
 MAX_BYTES = 256 << 20
-"""Size of a COCO file."""
+"""Maximum size of a COCO file."""
 MAX_SIZE = 8192
-"""Width and height of an image of a COCO file, in pixels."""
+"""Maximum width and height of an image of a COCO file, in pixels."""
 
 
 class Example(NamedTuple):
@@ -71,7 +71,7 @@ class Example(NamedTuple):
     Attributes:
         levels: the image (H, W, 3) uint8.
         boxes: (K, 4), x0, y0, x1, y1 in pixels.
-        labels: classes of the boxes (K,).
+        labels: indices of the boxes' classes (K,).
         task: evaluates predictions of a rendered image; None for a custom image.
         truth: ground truth for the task: a `Place` of detection, or a `Region` of
             segmentation.
@@ -101,7 +101,7 @@ class Example(NamedTuple):
         boxes = torch.zeros(0, 4, dtype=torch.float32)
         if box:
             boxes = torch.tensor([box], dtype=torch.float32)
-        # The first label is the one that training uses where several are right.
+        # If several labels are right, training uses the first.
         labels = torch.tensor([truth.labels[0]] * len(boxes), dtype=torch.int64)
         return cls(
             levels=color.to_uint8(problem.picture(configuration, seed, SPP)),
@@ -129,8 +129,13 @@ def read_coco(directory: Path, model: Model) -> list[Example]:
     The file is not trusted: its size is limited, and names that lead outside of
     `images/` are rejected.
 
+    Args:
+        directory: the directory.
+        model: model whose labels are used.
+
     Raises:
-        FileFormatError: it is something else, or names files outside of it.
+        FileFormatError: the directory has no such files, or they name images outside of
+            it.
         InputError: no category is a label of the model.
     """
     path = directory / "annotations.json"
@@ -141,7 +146,6 @@ def read_coco(directory: Path, model: Model) -> list[Example]:
         )
         label_of_category = {
             category["id"]: model.labels.index(str(category["name"]))
-            # Predictions of the model have no index for other categories.
             for category in coco["categories"]
             if str(category["name"]) in model.labels
         }
@@ -159,7 +163,7 @@ def read_coco(directory: Path, model: Model) -> list[Example]:
         return examples
     except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise errors.FileFormatError(
-            f"{path}: expected COCO's JSON beside images/, got {str(error)[:120]}"
+            f"{path}: expected COCO's JSON and a folder images/, got {str(error)[:120]}"
         ) from None
 
 
@@ -175,7 +179,7 @@ def _read_levels(file: Path, image: Mapping[str, Any]) -> Tensor:
     """
     pixels = torch.from_numpy(workbench.load_upright(file, MAX_SIZE))
     if pixels.shape[:2] != (image["height"], image["width"]):
-        raise ValueError(f"{image['file_name']} of another size than it says")
+        raise ValueError(f"{image['file_name']} with another size than is stated")
     return color.to_uint8(pixels)
 
 
@@ -261,12 +265,12 @@ def compute_network_loss(
     Raises:
         ModelError: the network returns no loss.
     """
-    # The network inside a wrapper of ours, or else the network itself.
+    # `advsearch` wraps networks of both libraries: `inner` is the original network.
     inner: Any = getattr(network, "network", network)
     loss: Any = None
-    if hasattr(inner, "config"):  # of transformers
+    if hasattr(inner, "config"):  # a network of transformers
         loss = inner(pixel_values=x, labels=_transformers_labels(x, targets)).loss
-    elif inner is not network:  # of torchvision
+    elif inner is not network:  # a network of torchvision
         loss = inner(list(x), list(targets))
     elif len(inspect.signature(network.forward).parameters) > 1:
         loss = network(x, list(targets))
@@ -276,11 +280,10 @@ def compute_network_loss(
     if not isinstance(loss, Tensor) or loss.numel() != 1:
         raise errors.ModelError(
             "the network returns no loss: its `forward` has to take targets after its "
-            "input and return a loss or a "
-            "mapping of losses; or give `loss`, a function of network, input and "
-            "targets, in Python"
+            "input and return a loss or a mapping of losses; or pass `loss`, a function "
+            "of network, input and targets, in Python"
         )
-    # from one element of any shape to a scalar, which `backward` needs
+    # The sum of a single element: a scalar, which `backward` needs.
     return loss.sum()
 
 
@@ -321,7 +324,16 @@ class DetectorTrainer(Trainer):
         custom_items: Sequence[Example] = (),
         loss: Loss | None = None,
     ) -> None:
-        """Set up the trainer; without a `loss` it is `default_loss`."""
+        """Set up the trainer.
+
+        Args:
+            work: samples scenes of the run.
+            student: the copy of the network that is trained.
+            optimiser: function from a list of parameters to an optimizer; None for
+                AdamW.
+            custom_items: the user's own images, which each round trains on.
+            loss: training loss; None for `default_loss`.
+        """
         super().__init__(work, student, optimiser, custom_items)
         self.loss = loss or self.default_loss()
 
@@ -332,10 +344,10 @@ class DetectorTrainer(Trainer):
     def sample_items(
         self, title: str, split: str, scene_numbers: range
     ) -> list[Example]:
-        """Return plain images of scenes, then the worst one that each search finds.
+        """Return plain images of scenes, then the worst image that each search finds.
 
-        There is a search for each control; its image is used whether the prediction is
-        wrong or not.
+        There is a search for each control. Its worst image is used whether the
+        prediction is wrong or not.
 
         Args:
             title: title of the stage that the progress reports.
@@ -357,14 +369,29 @@ class DetectorTrainer(Trainer):
                 plain.append(plain_image)
                 worst.append(worst_image)
                 self.work.progress.advance(1)
-            # The first view is that of the search. Further views vary in what the last
-            # control does not search.
-            problem, _ = self.work.make_problem(scene_split, number, controls[-1:])
-            plain += [
-                Example.render(problem, seeds.stream(seed, "plain", view))
-                for view in range(1, N_VIEWS)
-            ]
+            plain += self._render_further_views(split, number, controls[-1])
         return plain + worst
+
+    def _render_further_views(
+        self, split: str, number: int, control: str
+    ) -> list[Example]:
+        """Return plain images of the views after the first, which a search has rendered.
+
+        What is not searched varies at random from view to view, such as the camera.
+
+        Args:
+            split: name of the split that the scene belongs to.
+            number: number of the scene.
+            control: control that is searched, because a problem needs one; its search
+                has given the seed.
+        """
+        scene_split = self.work.splits[split]
+        problem, _ = self.work.make_problem(scene_split, number, (control,))
+        seed = seeds.stream(scene_split.seed, f"search {control}", number)
+        return [
+            Example.render(problem, seeds.stream(seed, "plain", view))
+            for view in range(1, N_VIEWS)
+        ]
 
     def _attack(
         self, scene: workbench.Scene, name: str, control: str, seed: int
@@ -427,28 +454,26 @@ class DetectorTrainer(Trainer):
     def make_input(self, item: Example, is_mirrored: bool) -> tuple[Tensor, Target]:
         """Return the network's input (1, ...) for an image, and its target.
 
-                The target has "boxes" (K, 4), x0, y0, x1, y1 in pixels of the input, and
-                "labels" (K,).
-        # The mean or sum over the batch is the matter of `loss`.
+        The target has "boxes" (K, 4), x0, y0, x1, y1 in pixels of the input, and
+        "labels" (K,).
 
-                Args:
-                    item: the image and its boxes.
-                    is_mirrored: whether image and boxes are mirrored.
+        Args:
+            item: the image and its boxes.
+            is_mirrored: whether image and boxes are mirrored.
         """
         levels = item.levels
         boxes = item.boxes
         height, width = item.levels.shape[:2]
         if is_mirrored:
             levels = levels.flip(1)
-            # A mirrored point has x' = width - x, so the left edge comes from the right
-            # one.
+            # A mirrored point has x' = width - x, so that the right edge becomes the
+            # left one.
             x0, y0, x1, y1 = boxes.unbind(dim=1)
             boxes = torch.stack([width - x1, y0, width - x0, y1], dim=1)
+        # The image is resized to the network's input size, and boxes with it.
         input_height, input_width = self.student.model.input_size
-        # Boxes are scaled as the image is when it is resized to the network's input
-        # size.
         scale = torch.tensor([input_width / width, input_height / height] * 2)
-        x = self.student.model.prepare(levels[None] / 255.0)[:1]
+        x = _prepare_single(self.student.model, levels)
         return x, {
             "boxes": (boxes * scale).to(x.device),
             "labels": item.labels.to(x.device),
@@ -472,9 +497,9 @@ class DetectorTrainer(Trainer):
         """Write the images of a round in COCO's format.
 
         Args:
-            run: gets the files.
+            run: run directory that gets the files.
             number: number of the round.
-            new: its new items.
+            new: new items of the round.
         """
         directory = f"{IMAGE_DIRECTORY}/round-{number:03d}"
         images = []
@@ -502,7 +527,7 @@ class DetectorTrainer(Trainer):
     def _make_coco(
         self, images: Sequence[object], annotations: Sequence[object]
     ) -> dict[str, object]:
-        """Return what `annotations.json` holds."""
+        """Return the content of `annotations.json`."""
         categories = [
             {"id": index, "name": label}
             for index, label in enumerate(self.student.model.labels)
@@ -512,6 +537,13 @@ class DetectorTrainer(Trainer):
             "annotations": annotations,
             "categories": categories,
         }
+
+
+def _prepare_single(model: Model, levels: Tensor) -> Tensor:
+    """Return the network's input (1, ...) for an image (H, W, 3) uint8."""
+    # `prepare` fills the batch up to the model's minimum size with copies.
+    batch = model.prepare(levels[None] / 255.0)
+    return batch[:1]
 
 
 def _annotate(
@@ -565,8 +597,8 @@ def write_images(
 class SegmenterTrainer(DetectorTrainer):
     """Train a segmenter on adversarial and plain images.
 
-    The object's pixels are of its class. All others keep the class that the original
-    model predicts, since what they show is not known.
+    The target of the object's pixels is the object's class. The target of all other
+    pixels is what the original model predicts, since their ground truth is not known.
     """
 
     def default_loss(self) -> Loss:
@@ -578,7 +610,7 @@ class SegmenterTrainer(DetectorTrainer):
         """Return the network's input for an image, and the target of its pixels.
 
         The target has "classes" (h, w) int64 and "object" (h, w) bool at the size of
-        the network's output. Beside the object, classes are those that the original
+        the network's output. Outside of the object, classes are those that the original
         model predicts.
 
         Args:
@@ -588,14 +620,18 @@ class SegmenterTrainer(DetectorTrainer):
         region: Any = item.truth
         levels = item.levels.flip(1) if is_mirrored else item.levels
         with torch.no_grad():
-            classes = self.work.model(levels[None] / 255.0)[0].argmax(dim=0)
-        object_mask = region.resize_mask(tuple(classes.shape)).to(classes.device)
+            original_output = self.work.model(levels[None] / 255.0)
+        original_classes = original_output[0].argmax(dim=0)
+        size = tuple(original_classes.shape)
+        is_object = region.resize_mask(size).to(original_classes.device)
         if is_mirrored:
-            object_mask = object_mask.flip(1)
-        x = self.student.model.prepare(levels[None] / 255.0)[:1]
+            is_object = is_object.flip(1)
+        x = _prepare_single(self.student.model, levels)
+        object_class = region.labels[0]  # if several are right, training uses the first
+        classes = torch.where(is_object, object_class, original_classes)
         return x, {
-            "classes": torch.where(object_mask, region.labels[0], classes).to(x.device),
-            "object": object_mask.to(x.device),
+            "classes": classes.to(x.device),
+            "object": is_object.to(x.device),
         }
 
     def save_images(
@@ -627,14 +663,14 @@ def compute_pixel_loss(
     """
     classes = torch.stack([target["classes"] for target in targets])
     is_object = torch.stack([target["object"] for target in targets])
-    # The network inside a wrapper of ours, or else the network itself.
+    # the network inside of a wrapper of advsearch, or else the network itself
     inner: Any = getattr(network, "network", network)
-    if hasattr(inner, "config"):  # of transformers
+    if hasattr(inner, "config"):  # a network of transformers
         loss: Tensor = inner(pixel_values=x, labels=classes).loss
         return loss
     logits = task.read(network(x), len(x))
     pixel_losses = F.cross_entropy(logits, classes, reduction="none")
-    # Zero, with a graph to all parameters.
+    # starts with zero, with a graph to all parameters even if there are no pixels
     total = pixel_losses.sum() * 0.0
     for mask in (is_object, ~is_object):
         if bool(mask.any()):

@@ -1,12 +1,15 @@
-"""Make training examples: plain renders of scenes, and their worst configurations.
+"""Make lessons: training examples from scenes, with plain and adversarial images.
 
-Where light arrives linearly (textures, patches), a lesson holds a matrix of light
-transport of one view, which gives the image of any texture and its derivative without
-rendering: its adversarial texture is searched further each time that the lesson comes
-up (warm starts: Zheng et al. 2020, arXiv 1912.11969). A texture that several views
-share is one of expectation over transformation (EOT, Athalye et al. 2018). Everything
-else is rendered at random configurations: twice to train on, as new scenes teach more
-than further configurations of one, and more often to choose weights by.
+The image of a texture or a patch is linear in it. So a lesson with a texture has a
+matrix of light transport of one view, which predicts the image of any texture, and its
+derivative, without rendering. Each time that the lesson is used, the search for its
+adversarial texture goes on (warm starts: Zheng et al. 2020, arXiv 1912.11969). If
+several views share a texture, it is searched by expectation over transformation (EOT,
+Athalye et al. 2018).
+
+All other lessons are rendered at random configurations. For training there are two
+images of each, as new scenes teach more than further configurations of the same scene.
+For validation there are more, of which the worst counts.
 """
 
 from __future__ import annotations
@@ -38,8 +41,7 @@ from advsearch.extend import (
 IMAGE_DIRECTORY = "artifacts/pictures"
 """Directory of the training's images in the run."""
 SPP = 2
-"""Samples per pixel of an image; many lessons with noise teach more than few
-without.
+"""Samples per pixel of an image; many noisy lessons teach more than few without noise.
 """
 MATRIX_SPP = 4
 """Samples per pixel of a matrix of light transport."""
@@ -61,8 +63,8 @@ class Lesson:
 
     Attributes:
         right_classes: indices of the right classes.
-        levels: the image (H, W, 3) uint8, to save memory. Of a scene that is rendered
-            twice it is the one with a single control changed.
+        levels: the plain image (H, W, 3) uint8, to save memory. If a scene is rendered
+            twice, a single control has changed in it.
     """
 
     right_classes: tuple[int, ...]
@@ -75,7 +77,7 @@ class Lesson:
 
     @property
     def worst_image(self) -> Tensor:
-        """The worst image that is known (H, W, 3), sRGB in [0, 1]."""
+        """The worst image so far (H, W, 3), sRGB in [0, 1]; here the plain one."""
         return self.plain_image
 
 
@@ -86,10 +88,10 @@ class TextureLesson(Lesson):
     Attributes:
         space: maps configurations to textures.
         domain: the configurations that are allowed.
-        linear: computes the image of a texture; it no longer holds the scene.
-        conditions: the sampled conditions that it was made for.
-        texture: the adversarial configuration (d,). Other views may share it, and it is
-            changed in place.
+        linear: predicts the image of a texture by a matrix; its scene was released.
+        conditions: the sampled conditions of the view.
+        texture: the adversarial configuration (d,). Other lessons may share it, and it
+            is changed in place.
     """
 
     space: Any
@@ -105,10 +107,13 @@ class TextureLesson(Lesson):
             u: the texture as a configuration (d,), without the conditions.
         """
         inputs = self.space.inputs(u)
-        texture_inputs = {name: inputs[name] for name in self.linear.linearized_at}
-        image: Tensor = self.linear.predict_image(
-            texture_inputs, torch.cat([u, self.conditions])
-        )
+        # The matrix belongs to the inputs of the scene in which images are linear.
+        linear_names = self.linear.linearized_at.keys()
+        texture_inputs = {name: inputs[name] for name in linear_names}
+        # Some controls change the finished image, for which the full configuration is
+        # needed, too.
+        configuration = torch.cat([u, self.conditions])
+        image: Tensor = self.linear.predict_image(texture_inputs, configuration)
         return image
 
     @property
@@ -166,20 +171,20 @@ def make_lessons(
 ) -> list[Lesson]:
     """Make lessons from views of one scene, each with its own sampled conditions.
 
-    A lesson holds what one training step needs of a scene: an image with its right
-    classes, and the worse images that the step chooses from.
+    A lesson has what one training step needs of a scene: an image with its right
+    classes, and further images, of which the step uses the worst.
 
     Args:
         problem: the scene with the controls that make it harder.
         n_views: number of views that have worst images.
         seed: root of the samples.
         n_plain: further views without worst images.
-        n_tries: random configurations of each view that are rendered where a matrix of
-            light transport does not give the images (see `sample_configurations`). None
-            renders each view twice: with a single control changed, and with all of
-            them.
-        shares_texture: whether one adversarial texture is optimized for all views, in
-            place of one for each view.
+        n_tries: number of random configurations of each view that are rendered if a
+            matrix of light transport cannot predict the images (see
+            `sample_configurations`). None renders each view twice: with a single
+            control changed, and with all of them.
+        shares_texture: whether one adversarial texture is optimized for all views,
+            instead of one for each view.
     """
     # With a matrix of light transport an image is a linear function of the texture, so
     # the texture can be optimized in each training step without a render.
@@ -206,7 +211,7 @@ def _make_texture_lessons(
 
     Each view has sampled conditions of its own. Its texture starts at a random
     configuration whose values are all at a bound. With `shares_texture` all lessons
-    hold the same tensor, so that a step of one of them changes the texture of all.
+    have the same tensor, so that a step of one of them changes the texture of all.
 
     Args:
         problem: the scene with the controls that are searched.
@@ -216,9 +221,10 @@ def _make_texture_lessons(
     """
     right_classes = _find_right_classes(problem)
     domain = problem.domain
-    # The lessons stay in memory for the full training, so they do not hold the scene,
-    # which is large.
-    space = replace(problem.searched_space, scene=None)
+    # The lessons stay in memory during the full training. So they do not hold the scene,
+    # which is large. A lesson maps the searched coordinates to textures; its renderer
+    # also needs the controls that vary by chance.
+    searched_space = replace(problem.searched_space, scene=None)
     full_space = replace(problem.space, scene=None)
     shared_texture = _sample_texture(domain, seed)
     texture_lessons = []
@@ -227,7 +233,7 @@ def _make_texture_lessons(
         configuration = problem.add_conditions(domain.start, view_seed)
         linear = problem.make_linear_renderer(configuration, view_seed, MATRIX_SPP)
         levels = color.to_uint8(linear(configuration))
-        linear.release_scene(full_space)
+        linear.release_scene(full_space)  # only the matrix is needed from here on
         texture = shared_texture
         if not shares_texture:
             texture = _sample_texture(domain, view_seed)
@@ -235,10 +241,10 @@ def _make_texture_lessons(
             TextureLesson(
                 right_classes=right_classes,
                 levels=levels,
-                space=space,
+                space=searched_space,
                 domain=domain,
                 linear=linear,
-                # A clone does not keep the full configuration in memory.
+                # A slice would keep the full configuration in memory, a clone does not.
                 conditions=configuration[domain.dim :].clone(),
                 texture=texture,
             )
@@ -247,9 +253,10 @@ def _make_texture_lessons(
 
 
 def _sample_texture(domain: policies.Domain, seed: int) -> Tensor:
-    """Sample an extreme configuration (d,) from which a search begins."""
+    """Sample a configuration (d,) with all values at bounds, from which a search begins."""
     generator = torch.Generator().manual_seed(seed)
-    return domain.sample(generator, extreme=True)[0].clone()
+    samples = domain.sample(generator, extreme=True)  # a single sample (1, d)
+    return samples[0].clone()
 
 
 def _make_rendered_lessons(
@@ -257,9 +264,9 @@ def _make_rendered_lessons(
 ) -> list[RenderedLesson]:
     """Make a lesson with renders of random configurations for each view of a scene.
 
-    With `n_tries` the plain image is that of the start, and there are as many others.
-    Without it, the plain image has one random control changed, and the only other image
-    has all of them changed.
+    With `n_tries`, the plain image is that of the clean configuration, and `n_tries`
+    others have random ones. Without it, the plain image has one random control changed,
+    and the only other image has all controls changed.
 
     Args:
         problem: the scene with the controls that are varied.
@@ -273,7 +280,7 @@ def _make_rendered_lessons(
     rendered_lessons = []
     for number in range(views):
         view_seed = seeds.stream(seed, "lesson", number)
-        # A configuration is what is searched, then the conditions.
+        # A full configuration has the searched coordinates, then the conditions.
         full_start = problem.add_conditions(domain.start, view_seed)
         conditions = full_start[domain.dim :].clone()
         plain_image, *images = [
@@ -289,14 +296,14 @@ def _make_rendered_lessons(
 def _sample_lesson_configurations(
     problem: Problem, seed: int, n_tries: int | None
 ) -> list[Tensor]:
-    """Sample the configurations (d,) of a lesson, the one with the least change first.
+    """Sample the configurations (d,) of a lesson, that of the plain image first.
 
     Args:
         problem: problem of the scene.
         seed: seed of the samples.
         n_tries: number of random configurations after that of the clean scene. None
-            for two configurations only, both changed: one random control by itself,
-            and all controls.
+            for two changed configurations: one random control by itself, and all
+            controls.
     """
     domain = problem.domain
     generator = torch.Generator().manual_seed(seed)
@@ -329,9 +336,9 @@ def sample_configurations(
 
     In about half of the configurations, each value is moved with probability 1/2 to the
     nearer bound of its range, since searches often end with values at bounds. Choices
-    and periodic values have no bounds. Sample by sample, the first control changes
-    alone, then the second, and so on, then all together, and then the first again. A
-    control that does not change has its start values.
+    and periodic values have no bounds. In the first sample only the first control
+    changes, in the next only the second, and so on, then all together, and then only
+    the first again. A control that does not change has its start values.
 
     Args:
         domain: the searched space with its bounds.
@@ -359,6 +366,7 @@ def _alternate_controls(domain: policies.Domain, count: int) -> Tensor:
     The controls change each by itself in turn, then all together, then the first by
     itself again.
     """
+    # the name of a block of coordinates is "CONTROL.PARAMETER"
     control_of_block = [
         block.name.rpartition(".")[0] for block, _ in domain.list_block_slices()
     ]
@@ -396,7 +404,7 @@ def negative_log_likelihood(
 def select_hard_lessons(
     candidates: Sequence[Lesson],
 ) -> list[TextureLesson | RenderedLesson]:
-    """Return the lessons that have worst images."""
+    """Return the lessons that have a worst image besides the plain one."""
     return [
         lesson
         for lesson in candidates
@@ -409,13 +417,13 @@ def search_worse_images(
 ) -> None:
     """Search for worse images of lessons, which are changed in place.
 
-    Textures take `steps` of the search. Lessons with several rendered images have the
-    loss of each computed again, which decides which one is the worst.
+    Textures take `steps` of the search. For lessons with several rendered images, the
+    loss of each image is computed again: it decides which one is the worst.
 
     Args:
         selected: the lessons.
-        model: model that the images are to be hard for.
-        steps: steps of the search of textures.
+        model: model that should get the images wrong.
+        steps: number of steps of the search of textures.
     """
     for start in range(0, len(selected), BATCH_SIZE):
         batch = selected[start : start + BATCH_SIZE]
@@ -473,7 +481,7 @@ def ascend_textures(
     ]
     if not texture_lessons:
         return
-    # Views that share a texture have one tensor: any of them stands for it.
+    # Lessons that share a texture have the same tensor: one of them stands for all.
     lesson_of_texture = {id(lesson.texture): lesson for lesson in texture_lessons}
     for _ in range(steps):
         gradient_sums = dict[int, Tensor]()  # by the id of the texture
@@ -499,16 +507,17 @@ def compute_texture_gradients(
 
     Args:
         selected: the lessons.
-        model: returns logits (N, C).
-        change: is applied to the images (N, H, W, 3) before.
+        model: function that returns logits (N, C).
+        change: function that is applied to the images (N, H, W, 3) before, such as an
+            augmentation.
     """
     textures = [lesson.texture.clone().requires_grad_() for lesson in selected]
     images = torch.stack(
         [lesson.compute_image(u) for lesson, u in zip(selected, textures, strict=True)]
     )
-    right = [lesson.right_classes for lesson in selected]
-    # Images do not depend on each other, so the sum has the gradient of each.
-    loss = negative_log_likelihood(model(change(images)), right).sum()
+    right_classes = [lesson.right_classes for lesson in selected]
+    # Losses do not depend on each other's textures, so the sum has the gradient of each.
+    loss = negative_log_likelihood(model(change(images)), right_classes).sum()
     return torch.autograd.grad(loss, textures)
 
 
@@ -521,7 +530,7 @@ def save_lesson_images(
     `IMAGE_DIRECTORY` of the run. The WebDataset is next to that directory. It has a
     ``.png`` of each image, a ``.cls`` with the index of its class, and a ``.json`` with
     that and the kind of image. Members have no time and no owner, so that equal images
-    make equal files.
+    give equal files.
 
     Args:
         run: run directory.
@@ -536,15 +545,16 @@ def save_lesson_images(
         (run.path / class_directory).mkdir(parents=True, exist_ok=True)
         name = f"{number:03d}-{index:05d}"
         run.save_image(f"{name}-plain", lesson.plain_image, class_directory)
-        if select_hard_lessons([lesson]):
+        has_worst_image = bool(select_hard_lessons([lesson]))
+        if has_worst_image:
             run.save_image(f"{name}-worst", lesson.worst_image, class_directory)
     _write_webdataset(run.path / IMAGE_DIRECTORY)
 
 
 def _write_webdataset(directory: Path) -> None:
-    """Write the images of a directory into a tar beside it.
+    """Write the images of a directory into a tar file next to it.
 
-    `save_lesson_images` describes directory and tar.
+    `save_lesson_images` describes the directory and the tar file.
     """
     with (
         writing.replace_file(directory.with_suffix(".tar")) as temporary_path,

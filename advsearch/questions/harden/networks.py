@@ -20,9 +20,9 @@ class Trainable:
     """A copy of a network whose trained parameters collect gradients.
 
     Attributes:
-        network: the network.
-        model: predicts with the same weights, in evaluation mode and without gradients
-            for them.
+        network: the network that is trained.
+        model: model that predicts with the same weights, in evaluation mode and without
+            gradients for the weights.
     """
 
     network: nn.Module
@@ -34,11 +34,13 @@ class Trainable:
         Args:
             images: (N, H, W, 3) sRGB in [0, 1].
         """
-        # `model` predicts without gradients for its weights.
+        # `self.model` has no gradients for its weights. This copy has the network that
+        # is trained, and respects `detach` inside of it (`attached=False`), as ordinary
+        # training does.
         trained_model = replace(self.model, module=self.network, attached=False)
         with self._mixed_precision():
-            x = self.model.preprocessing(images.to(self.model.device))
-            logits: Tensor = trained_model.run_network(x.to(self.model.dtype))
+            x = trained_model.preprocessing(images.to(trained_model.device))
+            logits: Tensor = trained_model.run_network(x.to(trained_model.dtype))
         return logits
 
     def evaluation_logits(self, images: Tensor) -> Tensor:
@@ -49,6 +51,8 @@ class Trainable:
 
     def make_twin(self) -> Trainable:
         """Return the same weights with gradients of their own, for another thread."""
+        # `with_network` copies a network whose weights stay shared. The copy's
+        # parameters collect no gradients until `requires_grad_` is set again.
         network: nn.Module = self.model.with_network(self.network).module  # type: ignore[assignment]
         for parameter, original in zip(
             network.parameters(), self.network.parameters(), strict=True
@@ -65,15 +69,17 @@ class Trainable:
     def _mixed_precision(self) -> torch.autocast:
         """Return a context that uses bfloat16 if the processor has instructions for it.
 
-        Several threads that work on one product wait for each other busily. If others
-        use the cores too, it takes five times as long as in float32.
+        Without such instructions bfloat16 is slow. It is also slow if torch divides a
+        product among several threads while others use the cores: they wait for each
+        other busily, and take five times as long as in float32. With
+        `open_single_threaded_pool` a product is not divided.
         """
-        # torch 2.8 has no such function.
-        processor: Mapping[str, object] = getattr(torch.cpu, "get_capabilities", dict)()
-        bfloat16 = self.model.device.type == "cpu" and bool(
-            processor.get("avx512_bf16")
-        )
-        return torch.autocast("cpu", torch.bfloat16, enabled=bfloat16)
+        # torch 2.8 has no `get_capabilities`: `dict` returns no capabilities instead
+        get_capabilities = getattr(torch.cpu, "get_capabilities", dict)
+        capabilities: Mapping[str, object] = get_capabilities()
+        is_on_cpu = self.model.device.type == "cpu"
+        uses_bfloat16 = is_on_cpu and bool(capabilities.get("avx512_bf16"))
+        return torch.autocast("cpu", torch.bfloat16, enabled=uses_bfloat16)
 
 
 def make_trainable(
@@ -118,9 +124,9 @@ def make_trainable(
 
 @contextmanager
 def open_single_threaded_pool() -> Iterator[ThreadPoolExecutor]:
-    """Open as many threads as torch has, each of which uses a single one of torch's.
+    """Open a pool of as many threads as torch has.
 
-    So they do not wait for each other at barriers.
+    In each of them torch uses a single thread, so that they do not wait for each other.
     """
     count = torch.get_num_threads()
     with ThreadPoolExecutor(
@@ -142,7 +148,7 @@ class Augmentation:
     Attributes:
         flip: probability of a horizontal mirror image.
         smallest_crop, largest_crop: bounds of the crop's side, as a fraction of the
-            image's side; 1 and 1 switch it off.
+            image's side; 1 and 1 switch cropping off.
         turn: bound of the angle that the crop is rotated by, in degrees.
         brightness: bound of the shift, display-referred.
         contrast: bound of the relative change of deviations from the image's mean.
@@ -186,10 +192,13 @@ class Augmentation:
         scale = _uniform(
             self.smallest_crop, self.largest_crop, count, generator=generator
         )
-        # In the coordinates of `affine_grid` the image extends from -1 to 1: a crop is
-        # inside it if its middle is moved by at most 1 - scale.
+        # In the coordinates of `affine_grid` the image extends from -1 to 1. Without a
+        # rotation, a smaller crop is inside the image, and a larger one contains it, if
+        # its center is moved by at most |1 - scale|.
         relative_shift = _uniform(-1.0, 1.0, count, 2, generator=generator)
-        shift_x, shift_y = relative_shift.view(2, count) * (1.0 - scale).abs()
+        max_shift = (1.0 - scale).abs()
+        # all samples are independent: the first half is for x, the second for y
+        shift_x, shift_y = relative_shift.view(2, count) * max_shift
         is_mirrored = _choose(self.flip, count, generator)
         mirror = 1.0 - 2.0 * is_mirrored.float()  # -1 or 1
         degrees = _uniform(-self.turn, self.turn, count, generator=generator)
@@ -260,7 +269,7 @@ class Augmentation:
 
 
 def _uniform(lower: float, upper: float, *shape: int, generator: Generator) -> Tensor:
-    """Return as many uniform samples as a shape has elements, in one dimension."""
+    """Return uniform samples (N,), where N is the number of elements of a shape."""
     return lower + (upper - lower) * torch.rand(math.prod(shape), generator=generator)
 
 

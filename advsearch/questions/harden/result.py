@@ -22,24 +22,21 @@ from advsearch.extend import (
 )
 
 STEPS = 40
-"""Default of the steps of a search, as of an attack."""
+"""Default number of steps of a search, as for an attack."""
 ALL_OBJECTS = "all"
 """Value of `object` that stands for all bundled objects."""
 PLAIN_SCENES = 6
-"""Further scenes for each one of the training, with one plain view each.
+"""Number of further scenes for each training scene, with one plain view each.
 
-With few of them the training generalizes worse to other scenes, and loses clean
-accuracy.
+With fewer, the training generalizes worse to other scenes, and loses clean accuracy.
 """
 RENDERED_SCENES = 15
-"""The same where controls are rendered: the view is rendered at random
-configurations.
-"""
+"""The same if controls are rendered: the view is rendered at random configurations."""
 
 TEXTURE_USES_PER_EPOCH = 6
-"""How often an epoch uses a scene with a texture, over its views.
+"""How often an epoch uses a scene with a texture, counted over all of its views.
 
-The texture is another one each time, while what was rendered stays.
+The texture is different each time, while a rendered image stays the same.
 """
 
 QUICK: dict[str, int] = {
@@ -54,9 +51,7 @@ QUICK: dict[str, int] = {
 
 
 class HardenConfig(AttackConfig):
-    """Settings of `harden`: training on worst cases, and measurement before and
-    after.
-    """
+    """Settings of `harden`: training on worst cases, measured before and after."""
 
     # fmt: off
     command: ClassVar[str] = "harden"
@@ -71,23 +66,24 @@ class HardenConfig(AttackConfig):
 
     object: str = setting_as_in(
         AttackConfig, "object", default=ALL_OBJECTS,
-        description="objects to train on, separated by commas; all: every bundled one "
-                    "that the model has a class for; "
-        "a file is called as its class: coffee-mug.glb",
+        description="objects to train on, separated by commas; all stands for every "
+                    "bundled object that the model has a class for; a file is named "
+                    "after its class: coffee-mug.glb",
     )
     environment: str | None = setting_as_in(
         AttackConfig, "environment",
-        description="what lights the training; several, separated by commas, take turns",
+        description="environments of the training, separated by commas; each scene has "
+                    "one of them at random",
         otherwise="the bundled environments that the reference model was trained in",
     )
     held_out: str | None = setting(
-        None, "scene", "objects that training never sees, which are measured, "
+        None, "scene", "objects for the measurement, which are not trained on, "
                        "separated by commas",
         "names of objects or files", otherwise="other instances of the bundled objects",
         min_length=1,
     )
     held_out_environment: str | None = setting(
-        None, "scene", "what lights the measurement, and never the training",
+        None, "scene", "environments of the measurement, which are not trained on",
         "names of environments or files, separated by commas",
         otherwise="the bundled environments that the reference model was not trained in",
         min_length=1,
@@ -97,30 +93,29 @@ class HardenConfig(AttackConfig):
                                           "detection or segmentation"
     )
     data: str | None = setting(
-        None, "training", "pictures of your own that a detector is trained on too: "
+        None, "training", "your own pictures that a detector is also trained on: "
                           "`annotations.json` and `images/`",
-        "a folder, as of `export --format coco`", otherwise="none", min_length=1,
+        "a folder such as that of `export --format coco`", otherwise="none", min_length=1,
     )
     layers: Literal["all", "last"] = setting("all", "training", "layers that are trained")
     rounds: int = setting(2, "training", "rounds of search and training", ge=1, le=1000)
     scenes: int = setting(
         336, "training",
-        "new scenes a round for each control; of what is rendered "
-        f"{RENDERED_SCENES + 1} times as many",
+        "number of new scenes per round for each control; controls that are rendered "
+        f"have {RENDERED_SCENES + 1} times as many",
         ge=1, le=100_000,
     )
-    views: int = setting(2, "training", "views of each scene, unless it is rendered", ge=1, le=1000)
+    views: int = setting(2, "training", "views of each scene with a texture", ge=1, le=1000)
     epochs: int = setting(
         3, "training",
-        "how often a round looks at each view; where a texture is searched, as many "
-        "times as often as makes "
-        f"{TEXTURE_USES_PER_EPOCH} for a scene, at most, over its views",
+        "number of epochs of a round; an epoch uses each view once, and a scene with a "
+        f"searched texture up to {TEXTURE_USES_PER_EPOCH} times over its views",
         ge=1, le=10_000,
     )
-    rate: float = setting(1e-3, "training", "the highest learning rate", gt=0.0, le=1.0)
+    rate: float = setting(1e-3, "training", "the maximum learning rate", gt=0.0, le=1.0)
     clean_loss: float = setting(
-        0.02, "training", "clean accuracy that may be lost; weights that lose more are "
-                          "not kept", ge=0.0, le=1.0
+        0.02, "training", "maximum loss of clean accuracy; weights that lose more are "
+                          "not used", ge=0.0, le=1.0
     )
     measured: int = setting(28, "verification", "held-out scenes that are attacked, "
                                                 "before and after", ge=1, le=100_000)
@@ -128,8 +123,8 @@ class HardenConfig(AttackConfig):
     trials: int | None = setting_as_in(AttackConfig, "trials", default=6)
     verify_spp: int | None = setting_as_in(AttackConfig, "verify_spp", default=32)
     workers: int | None = setting_as_in(
-        AttackConfig, "workers", description="worker processes that share the scenes "
-                                             "that are drawn and attacked"
+        AttackConfig, "workers", description="number of worker processes, which share "
+                                             "the scenes to render and to attack"
     )
     quick: bool = setting(False, "training", "minutes instead of an hour: fewer "
                                              "rounds, scenes and steps")
@@ -138,7 +133,7 @@ class HardenConfig(AttackConfig):
     @model_validator(mode="before")
     @classmethod
     def _apply_quick(cls, data: Any) -> Any:
-        """Fill in the defaults of `quick`; what is set stays."""
+        """Fill in the defaults of `quick`; settings that are set stay."""
         return {**QUICK, **data} if data.get("quick") is True else data
 
     @property
@@ -154,9 +149,9 @@ class HardenConfig(AttackConfig):
 class Share(results.Fields):
     """The fraction of right predictions with its interval."""
 
-    accuracy: float = Field(description="`right` of `count`")
+    accuracy: float = Field(description="`right` / `count`")
     interval: results.Interval = Field(
-        description="of that share, 95 %, over scenes of the objects at hand"
+        description="95 % interval of the accuracy, over scenes of the same objects"
     )
     right: int
     count: int
@@ -172,40 +167,46 @@ class HardenedControl(results.Fields):
     control: str
     before: Share
     stronger_before: Share = Field(
-        description="before, against the search `stronger_search`"
+        description="`before`, but against the search `stronger_search`"
     )
     after: Share
-    stronger: Share = Field(description="after, against the search `stronger_search`")
+    stronger: Share = Field(
+        description="`after`, but against the search `stronger_search`"
+    )
 
 
 class TrainingRound(results.Fields):
     """One round of search and training.
 
-    It is evaluated on other scenes in the training's environments.
+    It is evaluated on other scenes, with environments of the training.
     """
 
-    lessons: int = Field(description="views that it was trained on")
+    lessons: int = Field(description="number of views that it was trained on")
     part: float = Field(
-        description="of the way from the weights that were given to "
-        "the trained ones, in 0 to 1"
+        description="interpolation between the original weights (0) and the trained "
+        "weights (1)"
     )
-    clean: float = Field(description="share of plain pictures that are right")
+    clean: float = Field(description="fraction of plain pictures that are right")
     robust: float = Field(
-        description="share of the worst pictures, searched for against these weights"
+        description="fraction of the worst pictures that are right; these were searched "
+        "against the weights of the round"
     )
     is_selected: bool = Field(description="whether its weights are the result")
 
 
 class SplitSide(results.Fields):
-    """One part of the split.
+    """One part of the split of scenes.
 
-    No object is in two parts, and no environment is in the held-out part and another.
+    No environment is in the held-out part and in another one, and no instance of an
+    object.
     """
 
     objects: list[str]
     environments: list[str]
-    scenes: int = Field(description="of those held out, a fourth is attacked")
-    views: int
+    scenes: int = Field(
+        description="number of scenes; of the held-out ones, a fourth is attacked"
+    )
+    views: int = Field(description="number of views of each scene")
 
 
 class HardenResult(views.InNotebook, RunResult):
@@ -215,57 +216,62 @@ class HardenResult(views.InNotebook, RunResult):
 
     objects: list[str]
     model: str
-    task: str = Field(description="what judges the predictions")
+    task: str = Field(description="the task of the model")
     before: Share | None = Field(
-        description="held-out scenes that are right and in which no search over any "
-        "control has found a wrong "
-        "prediction; null if it was interrupted, as are the others"
+        description="held-out scenes that are right, and in which no search over any "
+        "control has found a wrong prediction; null after an interrupt, as are the "
+        "following fields"
     )
     after: Share | None = Field(
-        description="the same, of the hardened model, searched again"
+        description="the same for the hardened model, which was searched anew"
     )
     clean_before: Share | None = Field(
         description="plain renders of held-out scenes that are right"
     )
-    clean_after: Share | None
+    clean_after: Share | None = Field(description="the same for the hardened model")
     gained: int | None = Field(
         default=None,
-        description="held-out scenes that are robust after and were not before; null "
-        "if it was interrupted",
+        description="number of held-out scenes that are robust only after the training; "
+        "null after an interrupt",
     )
     lost: int | None = Field(
         default=None,
-        description="held-out scenes that were robust before and are not after",
+        description="number of held-out scenes that were robust only before the "
+        "training; null after an interrupt",
     )
     p: float | None = Field(
         default=None,
-        description="how likely it is by chance that one is so much larger, in further "
-        "scenes of the same objects: "
-        "McNemar's exact test over scenes. Of other objects it says nothing",
+        description="p-value of McNemar's exact test over scenes: the probability of "
+        "such a difference between `gained` and `lost` by chance. It holds for further "
+        "scenes of the same objects, and not for other objects",
     )
     table: list[HardenedControl]
     search: str = Field(
-        description="policy and steps of the searches of `before` and `after`"
+        description="policy and steps of the searches for `before` and `after`"
     )
     stronger_search: str = Field(
-        description="another policy with three times the steps"
+        description="policy and steps of the stronger search: another policy with three "
+        "times the steps"
     )
     split: dict[str, SplitSide] = Field(
-        description="by side: `training`, `further training`, `validation`, `held out`"
+        description="the parts of the split: `training`, `further training`, "
+        "`validation`, `held out`"
     )
     rounds: list[TrainingRound]
     hardened: str | None = Field(
-        description="what `model` takes to load the hardened "
-        "one; null if nothing was kept"
+        description="value of `model` that loads the hardened model; null if no name "
+        "can load it, or after an interrupt"
     )
-    weights: str | None = Field(description="the hardened weights, safetensors")
+    weights: str | None = Field(
+        description="file of the hardened weights, safetensors; null after an interrupt"
+    )
     pictures: str | None = Field(
-        description="folder of the pictures of the training, a folder for each class"
+        description="folder of the pictures of the training, with a folder for each "
+        "class; null after an interrupt"
     )
     shared: results.SharedWork | None = Field(
         default=None,
-        description="how [workers](cluster.md) did that shared the work; "
-        "absent without",
+        description="how [workers](cluster.md) shared the work; null without workers",
     )
     warnings: list[str] = Field(description="sentences that a reader has to know")
 
@@ -282,21 +288,20 @@ class HardenResult(views.InNotebook, RunResult):
 
 ROBUST_NOTE = (
     "Robust: the plain picture of a held-out scene is right, and the search finds no "
-    "wrong one. 95 % intervals over scenes: Clopper-Pearson; of plain pictures, two of "
-    "each scene, by bets. Scenes are of the objects that are named: intervals and p "
-    "say "
-    "nothing of other objects."
+    "wrong one. 95 % intervals over scenes: Clopper-Pearson; for plain pictures, of "
+    "which each scene has two, by betting. The scenes have the named objects: intervals "
+    "and p do not hold for other objects."
 )
 TRAINING_NOTE = (
-    "Round 0 is the model as it was. Weights are part of the way from those to the "
-    "trained ones. Judged on scenes in the training's environments on which it was not "
-    "trained."
+    "Round 0 is the original model. Weights are interpolated between the original and "
+    "the trained ones. They are evaluated on scenes that were not trained on, with "
+    "environments of the training."
 )
 HEADS = ("on held-out scenes", "before", "95 % interval", "after", "95 % interval")
 ROUND_COLUMNS: Mapping[str, views.Column] = {
     "round": "{0[0]}",
     "views trained on": "{0[1].lessons}",
-    "part of the way": lambda row: wording.percent(row[1].part),
+    "interpolation": lambda row: wording.percent(row[1].part),
     "plain pictures right": lambda row: wording.percent(row[1].clean),
     "worst pictures right": lambda row: wording.percent(row[1].robust),
     "kept": lambda row: "yes" if row[1].is_selected else "",
@@ -310,7 +315,7 @@ SPLIT_COLUMNS: Mapping[str, views.Column] = {
 }
 
 ShareChanges = Mapping[str, tuple[Share | None, Share | None]]
-"""Fractions before and after, by what they are of."""
+"""Fractions before and after the training, by a description."""
 
 
 def make_harden_view(result: HardenResult) -> ShownResult:
@@ -375,7 +380,7 @@ def _make_robustness_part(result: HardenResult) -> ResultPart:
 def _list_shares(
     result: HardenResult,
 ) -> dict[str, tuple[Share | None, Share | None]]:
-    """Return the fractions of right images before and after, by what they are of."""
+    """Return the fractions of right images before and after, by a description."""
     shares: dict[str, tuple[Share | None, Share | None]] = {}
     for row in result.table:
         shares[f"robust to {row.control}"] = (row.before, row.after)
@@ -407,7 +412,7 @@ def _draw_shares(axes: Any, shares: ShareChanges, model: str) -> None:
         for name, before_and_after in shares.items()
     }
     figures.draw_fractions(axes, bars, ("before", "after"), (figures.RED, figures.BLUE))
-    axes.set(xlabel="share that is right, with 95 % interval")
+    axes.set(xlabel="fraction that is right, with 95 % interval")
     axes.set_title(f"Held-out scenes: {wording.shorten_name(model)}")
     axes.figure.legend(loc="outside lower center", ncols=2)
 
@@ -424,7 +429,7 @@ def _summarize(result: HardenResult) -> str:
     if before is None or after is None or clean_before is None or clean_after is None:
         return "Stopped before the hardened model was measured."
     text = (
-        f"Of {after.count} held-out scenes the searches leave {after.right} right, "
+        f"Of {after.count} held-out scenes, {after.right} are robust to the searches, "
         f"before {before.right}; "
         f"of {clean_after.count} plain pictures {clean_after.right} are right, before "
         f"{clean_before.right}."
@@ -437,14 +442,14 @@ def _summarize(result: HardenResult) -> str:
     if result.lost is not None:
         text += (
             f" Scene by scene: {result.gained} got better, {result.lost} worse "
-            f"(p = {result.p:.2g}, for scenes of these objects; of other objects it "
-            "says nothing)."
+            f"(p = {result.p:.2g}, for scenes of these objects and not for other "
+            "objects)."
         )
     return text
 
 
 def make_harden_claims(result: HardenResult) -> Iterator[views.Claim]:
-    """Yield the shares of held-out scenes without a failure."""
+    """Yield the fractions of held-out scenes without a failure, before and after."""
     for when, share in (("Before", result.before), ("After hardening", result.after)):
         if share is not None:
             extent = {

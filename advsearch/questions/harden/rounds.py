@@ -1,7 +1,7 @@
 """The rounds of a hardening.
 
-Each round samples scenes, trains a copy of the model on all scenes so far, and
-interpolates between the original and the trained weights: the result is the
+Each round samples scenes, and trains a copy of the model on all scenes so far. Then it
+interpolates between the original and the trained weights. Its result is the
 interpolation that is best on validation scenes.
 """
 
@@ -18,8 +18,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import torch
 
-# Optimizers import it too; it is imported before there are scenes, since importing with
-# many objects alive makes Python's garbage collection slow.
+# Optimizers import this module when they are made. It is imported here, before scenes
+# are loaded: with many objects in memory, the import makes garbage collection slow.
 import torch._dynamo
 from safetensors import torch as safetensors
 from torch import Tensor, nn
@@ -36,14 +36,16 @@ ROUND_FILE = "artifacts/round-{:03d}.safetensors"
 ROUNDS_NOTE = "rounds"
 """Note of a run: the result of each round."""
 MAX_GRADIENT_NORM = 2.0
+"""Larger gradients are scaled down to this norm."""
 MAX_VALIDATION_SCENES = 168
-"""Limit of the number of validation scenes."""
+"""Maximum number of validation scenes."""
 INTERPOLATIONS = (1.0, 0.85, 0.7, 0.55, 0.4, 0.25)
 """Interpolations that are evaluated: 0 is the original weights, 1 the trained ones."""
 
 MakeOptimizer = Callable[[Sequence[nn.Parameter]], torch.optim.Optimizer]
 ComputeGradient = Callable[[Sequence[Any], np.random.Generator], None]
-"""Computes the gradient of a batch of items, and leaves it with the parameters."""
+"""Computes the gradient of a batch of items, and stores it in `grad` of the parameters.
+"""
 
 
 class Score(NamedTuple):
@@ -61,14 +63,15 @@ class Trainer(ABC):
         student: the copy that is trained.
         optimiser: creates the optimizer of the parameters, with a learning rate of its
             own; None for AdamW.
-        custom_items: items that are trained on along with the sampled ones.
-        n_further_scenes: scenes that are sampled in addition to each one of the
-            training.
+        custom_items: the user's own items, which each round trains on.
+        n_further_scenes: number of scenes that are sampled in addition to each training
+            scene.
         n_views: number of views of a training scene, and of a validation scene.
-        batch_size: items of a step.
+        batch_size: number of items of a step.
+        weight_decay: weight decay of AdamW.
         warm_up_fraction: fraction of the steps in which the learning rate rises.
-        average_decay: decay per step of the running average of the weights, which a
-            round ends with.
+        average_decay: decay per step of the running average of the weights, which is
+            the result of a round.
     """
 
     batch_size: ClassVar[int]
@@ -101,7 +104,7 @@ class Trainer(ABC):
 
     @property
     def n_further_scenes(self) -> int:
-        """Scenes that are sampled in addition to each one of the training."""
+        """Number of scenes that are sampled in addition to each training scene."""
         return 0
 
     @abstractmethod
@@ -156,7 +159,7 @@ class Trainer(ABC):
         Args:
             number: number of the round, which decides the order of the items.
             pool: all items of this and earlier rounds.
-            new: those that no earlier round has used.
+            new: items that no earlier round has used.
             tick: function that is called after each step, for the progress.
         """
         parameters = self.student.parameters()
@@ -168,8 +171,8 @@ class Trainer(ABC):
         with self.gradient_context(new) as compute_gradient:
             for n_steps, batch in enumerate(self._iterate_batches(pool, rng), start=1):
                 compute_gradient(batch, rng)
-                # A few very wrong images would otherwise make a step so large that it
-                # undoes others.
+                # Without a limit, a few very wrong images could make a step so large
+                # that it undoes others.
                 nn.utils.clip_grad_norm_(parameters, MAX_GRADIENT_NORM)
                 optimizer.step()
                 schedule.step()
@@ -180,10 +183,13 @@ class Trainer(ABC):
     def _iterate_batches(
         self, pool: Sequence[Any], rng: np.random.Generator
     ) -> Iterator[list[Any]]:
-        """Yield the batches of all epochs, each epoch in another order."""
-        indices = self._list_uses(pool)
+        """Yield the batches of all epochs, each epoch in another order.
+
+        An epoch has some items several times, see `uses_per_epoch`.
+        """
+        item_indices = self._list_uses(pool)
         for _ in range(self.config.epochs):
-            order = rng.permutation(indices)
+            order = rng.permutation(item_indices)
             for start in range(0, len(order), self.batch_size):
                 batch_indices = order[start : start + self.batch_size]
                 yield [pool[index] for index in batch_indices]
@@ -204,9 +210,9 @@ class Trainer(ABC):
         that the round began with.
 
         Args:
-            n_steps: steps so far, this one included.
-            average: average of each parameter; changed in place.
-            parameters: after the step.
+            n_steps: number of steps so far, including the last one.
+            average: average of each parameter, which is changed in place.
+            parameters: the parameters after the step.
         """
         decay = min(self.average_decay, n_steps / (n_steps + 5))
         for mean, parameter in zip(average, parameters, strict=True):
@@ -228,7 +234,7 @@ class Trainer(ABC):
             torch.optim.AdamW, lr=self.config.rate, weight_decay=self.weight_decay
         )
         optimizer = make_optimizer(parameters)
-        # The schedule makes a step after the last step of the optimizer.
+        # The schedule also makes a step after the last step of the optimizer.
         n_rates = n_steps + 1
         schedule = torch.optim.lr_scheduler.OneCycleLR(
             optimizer,
@@ -253,8 +259,8 @@ def _interpolate(
 ) -> dict[str, Tensor]:
     """Return weights between the original (0) and the trained ones (1).
 
-    Tensors that are not floating point, such as counters of batches, are the trained
-    ones.
+    Tensors that are not floating point, such as counters of batches, are not
+    interpolated but taken from the trained ones.
     """
     interpolated = {
         name: torch.lerp(original[name], weight, interpolation)
@@ -283,9 +289,7 @@ class Rounds:
     """
 
     def __init__(self, run: RunDirectory, trainer: Trainer) -> None:
-        """Prepare the rounds, with the results of those that an earlier session
-        ended.
-        """
+        """Prepare the rounds, with the results of those that are done already."""
         self.run = run
         self.trainer = trainer
         self.config = trainer.config
@@ -305,9 +309,10 @@ class Rounds:
 
     @property
     def best(self) -> int:
-        """The most robust round whose clean accuracy has fallen by no more than allowed.
+        """Number of the most robust round that has enough clean accuracy.
 
-        The last of several; 0, the original model, if there is none.
+        If several are as robust, it is the last. It is 0, the original model, if there
+        is no such round.
         """
         allowed = [
             number
@@ -320,7 +325,7 @@ class Rounds:
 
     def is_allowed(self, clean: float) -> bool:
         """Return whether a clean accuracy has fallen by no more than allowed."""
-        # 1e-9: a fall by exactly as much may be more by rounding.
+        # 1e-9 is for rounding errors: a fall by exactly `clean_loss` is allowed.
         return clean >= self.results[0].clean - self.config.clean_loss - 1e-9
 
     def execute(self) -> None:
@@ -328,7 +333,8 @@ class Rounds:
 
         Afterwards the student has the best weights.
         """
-        is_done = len(self.results) > self.config.rounds
+        n_trained_rounds = len(self.results) - 1  # round 0 is the original model
+        is_done = n_trained_rounds >= self.config.rounds
         if not is_done:
             self._run_rounds()
         network = self.trainer.student.network
@@ -345,12 +351,12 @@ class Rounds:
         trainer = self.trainer
         n_scenes = self.config.scenes
         held_back = trainer.sample_items(
-            "drawing scenes to choose weights by",
+            "drawing scenes for the choice of weights",
             VALIDATION,
             range(self.n_validation_scenes),
         )
         if not self.results:
-            self.progress.stage("judging the model as it is")
+            self.progress.stage("evaluating the original model")
             original_score = trainer.score(held_back)
             self.store_round(0, [], original_score, n_trained=0, interpolation=0.0)
         pool = list(trainer.custom_items)
@@ -380,8 +386,8 @@ class Rounds:
             number: number of the round.
             pool: items that it is trained on.
             n_used: number of items at the start of the pool that earlier rounds have
-                used. Their worst images are those that the earlier training found.
-            held_back: items of the validation.
+                used. Their search for worst images has begun already.
+            held_back: items of the validation, which are not trained on.
 
         Returns:
             The score on the held-back items, and the interpolation: 0 is the original
@@ -405,9 +411,9 @@ class Rounds:
     def select_interpolation(self, held_back: Sequence[Any]) -> tuple[Score, float]:
         """Load the best mixture of original and trained weights into the student.
 
-        Among the mixtures whose clean accuracy has not fallen by more than allowed, the
-        best one is right most often on the worst images. If the clean accuracy of all
-        has fallen more, the best one has the highest clean accuracy.
+        Among the mixtures with enough clean accuracy, the best one is right most often
+        on the worst images. If none has enough, the best one has the highest clean
+        accuracy.
 
         `INTERPOLATIONS` are tried from the trained weights towards the original ones.
         Mixtures nearer to the original weights have learned less, so once the accuracy
@@ -418,7 +424,7 @@ class Rounds:
             held_back: items of the validation split, which are not trained on.
 
         Returns:
-            Its score, and the interpolation: a member of `INTERPOLATIONS`.
+            The score of the best mixture, and its interpolation.
         """
         network = self.trainer.student.network
         original = self.read_weights(0)
@@ -489,7 +495,8 @@ class Rounds:
     def write_weights(self, name: str) -> None:
         """Write the student's weights into a file of the run."""
         state = self.trainer.student.network.state_dict()
-        # Two names may belong to one tensor, which safetensors rejects.
+        # Two names may belong to the same tensor, which safetensors rejects: so each
+        # gets a copy.
         cloned = {
             key: weight.clone(memory_format=torch.contiguous_format)
             for key, weight in state.items()

@@ -1,6 +1,6 @@
-"""Work of `harden` on single scenes, in this process or on workers.
+"""Jobs of `harden` on single scenes, in this process or on workers.
 
-A scene is sampled into lessons, attacked, or evaluated as it is.
+A job makes lessons from a scene, attacks it, or evaluates its plain images.
 """
 
 from __future__ import annotations
@@ -37,14 +37,15 @@ from advsearch.questions.harden.lessons import Lesson, make_lessons
 from advsearch.questions.harden.objects import OBJECTS
 from advsearch.questions.harden.result import ALL_OBJECTS, HardenConfig
 
+# names of the splits of scenes
 TRAINING = "training"
-"""Split that the weights are fitted to."""
+"""Split that the weights are trained on."""
 FURTHER = "further training"
-"""Split of further training scenes, mostly plain ones."""
+"""Split of further training scenes, each with a single view."""
 VALIDATION = "validation"
-"""Split that chooses among weights."""
+"""Split by which weights are chosen."""
 HELD_OUT = "held out"
-"""Split that is measured in the end."""
+"""Split on which the original and the hardened model are measured."""
 
 ROBUST = "robust"
 """Status of a scene in which no attack found a wrong prediction."""
@@ -53,16 +54,19 @@ RANDOM_RANGES: dict[str, dict[str, object]] = {
     "camera": {"azimuth": [0.0, 360.0], "elevation": [8.0, 55.0], "roll": [-6.0, 6.0]},
     "environment": {"rotation": [0.0, 360.0], "exposure": [-0.8, 0.5]},
 }
-"""Ranges that vary at random from view to view, unless they are searched."""
+"""Ranges of parameters that vary at random from view to view, unless they are searched.
+"""
 
 N_VALIDATION_TRIES = 6
 """Random configurations of a validation view that is rendered; the worst one counts."""
 CLEAN_SCENES = 4
-"""Held-out scenes whose plain images are evaluated, for each one that is attacked."""
+"""Number of held-out scenes whose plain images are evaluated, for each held-out scene
+that is attacked.
+"""
 CLEAN_VIEWS = 2
-"""Views of each of these scenes."""
+"""Plain images of each of these scenes."""
 CLEAN_SPP = 16
-"""Samples per pixel of these views."""
+"""Samples per pixel of these images."""
 
 STRONGER_POLICY = {
     "name": "portfolio",
@@ -73,21 +77,21 @@ STRONGER_STEPS_FACTOR = 3
 """Steps of the stronger search as a multiple of the usual steps."""
 
 Job = partial[Any]
-"""A job: a method of `SceneJobs` with its arguments, among which is a `number`."""
+"""A method of `SceneJobs` with keyword arguments, among them the scene's `number`."""
 
 
 @dataclass
 class SceneJobs:
-    """Runs jobs on single scenes with the original model, here or on workers.
+    """Runs jobs on single scenes, here or on workers.
 
-    The jobs are pure functions.
+    The result of a job depends only on its arguments and the settings.
 
     Attributes:
         config: the settings.
         model: the original model.
-        splits: splits by name.
+        splits: splits of scenes by name.
         progress: reports the jobs.
-        executor: runs the jobs on workers; None runs them here.
+        executor: runs the jobs on workers; None runs them in this process.
     """
 
     config: HardenConfig
@@ -107,10 +111,11 @@ class SceneJobs:
         Args:
             title: title of the stage that the progress reports.
             jobs: the jobs.
-            hint: how to shorten the stage.
+            hint: text about how to shorten the stage.
         """
         self.progress.stage(title, len(jobs), hint=hint)
-        # Results come in any order, and a worker's batch returns the job object itself.
+        # Results come in any order. A result has the job object itself, which is found
+        # by its `id`.
         index_of_job = {id(job): index for index, job in enumerate(jobs)}
         executor = self.executor or workbench.InProcess(self)
         # each job is a batch by itself
@@ -149,10 +154,15 @@ class SceneJobs:
             self.splits[split], number, controls, varying_controls
         )
         # Validation compares models on the same images, so it renders many random
-        # configurations once. In training the images are new in each round anyway.
-        tries = N_VALIDATION_TRIES if split == VALIDATION else None
+        # configurations once. Training renders two images of a view instead.
+        n_tries = N_VALIDATION_TRIES if split == VALIDATION else None
         return make_lessons(
-            problem, views, seed, n_plain=plain, n_tries=tries, shares_texture=shared
+            problem,
+            views,
+            seed,
+            n_plain=plain,
+            n_tries=n_tries,
+            shares_texture=shared,
         )
 
     def attack_held_out(
@@ -166,14 +176,13 @@ class SceneJobs:
         """Attack a held-out scene, and return the status of the attack.
 
         The status is `ROBUST` if the attack found nothing, and the model is right in
-        enough trials of the clean scene. These are as many as an adversarial scene
-        would need to be wrong in.
+        enough trials of the clean scene; see `attack_scene`.
 
         Args:
             control: control that is searched.
             number: number of the scene.
-            steps_factor: multiple of the usual steps; more than one is the stronger
-                search.
+            steps_factor: multiple of the usual steps; with more than 1 the stronger
+                search is used.
             weights: the model's weights as bytes of a safetensors file; None for the
                 original ones.
         """
@@ -185,7 +194,7 @@ class SceneJobs:
         seed = seeds.stream(self.config.seed, f"measured {control}", number)
         search: dict[str, Any] = {}
         if steps_factor > 1:
-            # The stronger search must not be misled where gradients are.
+            # Its policies do not all use gradients, which a hardened model may mask.
             search = {
                 "policy": STRONGER_POLICY,
                 "steps": steps_factor * self.config.steps,
@@ -204,18 +213,19 @@ class SceneJobs:
             weights: weights of the hardened model, as bytes of a safetensors file.
 
         Returns:
-            Under "before" and "after" whether each image is right, with the original
-            and with the hardened model; under "outcomes before" and "outcomes after"
-            what becomes of the object in those that are not.
+            Under "before" (the original model) and "after" (the hardened one) whether
+            the model is right about each image. Under "outcomes before" and "outcomes
+            after" what happens to the object in the other images, such as "missed".
         """
         split = self.splits[HELD_OUT]
-        # A problem needs a control; the images are of its start, so any will do.
-        any_control = tuple(self.config.controls)[:1]
-        problem, _ = self.make_problem(split, number, any_control)
+        # A problem needs a searched control. Plain images do not change it, so it may
+        # be any.
+        first_control = next(iter(self.config.controls))
+        problem, _ = self.make_problem(split, number, (first_control,))
         models = {"before": self.model, "after": self.with_weights(weights)}
         evaluations = dict[str, list[Any]]()
         for view in range(CLEAN_VIEWS):
-            # The seed is another one for each view of each scene, and the same for both
+            # Each view of each scene has its own seed, which is the same for both
             # models.
             seed = seeds.stream(split.seed, "plain", number * CLEAN_VIEWS + view)
             for when, evaluation in _evaluate_start(problem, seed, models).items():
@@ -226,14 +236,14 @@ class SceneJobs:
         return evaluations
 
     def with_weights(self, weights: bytes) -> Model:
-        """Return the model with other weights, safetensors."""
+        """Return the model with other weights, the bytes of a safetensors file."""
         network = self.model.copy_network()
         network.load_state_dict(safetensors.load(weights))
         return self.model.with_network(network)
 
     @cached_property
     def linear_controls(self) -> tuple[str, ...]:
-        """The controls whose images a matrix of light transport gives."""
+        """The controls whose images a matrix of light transport predicts."""
         return tuple(
             control for control in self.config.controls if self._has_matrix(control)
         )
@@ -249,7 +259,10 @@ class SceneJobs:
 
     @cached_property
     def random_controls(self) -> tuple[str, ...]:
-        """The rendered controls that can vary at random while a matrix is used."""
+        """The rendered controls that can vary at random in scenes with a matrix.
+
+        Each of the controls with a matrix has one even if this control varies.
+        """
         return tuple(
             name
             for name in self.rendered_controls
@@ -257,18 +270,19 @@ class SceneJobs:
         )
 
     def _has_matrix(self, control: str, varying_control: str | None = None) -> bool:
-        """Return whether a matrix of light transport gives the images of a control.
+        """Return whether a matrix of light transport predicts the images of a control.
 
         Args:
             control: the control that is searched.
-            varying_control: a control that varies at random meanwhile; False if it
-                cannot do so.
+            varying_control: a control that varies at random at the same time; None for
+                none. The method returns False if the two cannot be combined.
 
         Raises:
             InputError: the control alone cannot be searched in a training scene.
         """
         varying_controls = () if varying_control is None else (varying_control,)
         try:
+            # the first training scene stands for all
             problem, _ = self.make_problem(
                 self.splits[TRAINING], 0, (control,), varying_controls
             )
@@ -280,7 +294,7 @@ class SceneJobs:
 
     @cached_property
     def _held_out_fingerprints(self) -> frozenset[str]:
-        """The fingerprints of the objects that are measured."""
+        """Fingerprints of the objects in all held-out scenes."""
         n_scenes = CLEAN_SCENES * self.config.measured
         held_out_objects = self.splits[HELD_OUT].generate_objects(n_scenes)
         return frozenset(compute_fingerprint(asset) for asset in held_out_objects)
@@ -295,18 +309,17 @@ class SceneJobs:
         """Return the problem of a scene, and the root seed of its samples.
 
         In addition to the searched controls, those of `RANDOM_RANGES` vary at random,
-        such as the camera. A random range is left out if a control of the same kind is
-        searched or varied already. A scene of the training must not have an object that
-        is held out.
+        such as the camera. One of these is left out if a control of the same kind is
+        searched or varied already. Only held-out scenes may have a held-out object.
 
         Args:
             split: split that the scene belongs to.
             number: number of the scene.
             controls: controls that are searched.
-            varying_controls: controls of the run that vary at random meanwhile.
+            varying_controls: controls of the run that vary at random at the same time.
 
         Raises:
-            InputError: its object is held out.
+            InputError: the scene is not held out, but its object is.
         """
         name, scene = split.load_scene(
             number, workbench.collect_scene_parameters(self.config)
@@ -342,7 +355,7 @@ class SceneJobs:
         changed = {
             **self._select_run_settings(searched),
             "object": name,
-            # The scene is loaded already: these would change it again.
+            # The scene is loaded already, and these settings would change it again.
             "environment": None,
             "set_": {},
             "exposure": 0.0,
@@ -352,7 +365,7 @@ class SceneJobs:
         return AttackConfig.from_config(
             self.config,
             **changed,
-            # The parts of a run that a single attack inside of hardening does not need.
+            # what a single attack inside of a hardening does not need
             measure="no",
             baseline=False,
             workers=None,
@@ -362,21 +375,24 @@ class SceneJobs:
     def _select_run_settings(
         self, searched: Mapping[str, Mapping[str, object]]
     ) -> dict[str, Any]:
-        """Return the settings of the run that the searched controls take.
+        """Return the settings of the run that belong to the searched controls.
 
-        Settings that none of the controls takes are None.
+        Settings that belong to other controls of the run only are None.
 
         Args:
             searched: settings of the searched controls by their names.
         """
         selected: dict[str, Any] = {}
         for control, control_settings in searched.items():
+            # all such settings of the run; None if the control does not take one
             run_settings = workbench.select_run_settings(
                 self.config, control, control_settings
             )
             used_settings = {
                 name: value for name, value in run_settings.items() if value is not None
             }
+            # A setting that an earlier control takes stays. If both take one that is a
+            # mapping by control, such as `epsilon`, their entries are merged.
             all_unset = dict.fromkeys(run_settings)
             selected = settings.merge_mappings({**all_unset, **selected}, used_settings)
         return selected
@@ -404,23 +420,28 @@ def _evaluate_start(
 
 
 def load_scene_work(config_fields: Mapping[str, Any]) -> SceneJobs:
-    """Load what a worker needs to run jobs on scenes, by the fields of the settings."""
+    """Load what a worker needs to run jobs on scenes.
+
+    Args:
+        config_fields: fields of the settings.
+    """
     config = HardenConfig(**config_fields)
     (model, *_), _ = workbench.load_models(
         [config.model], workbench.make_task(config.task), config
     )
-    # Garbage is collected after each scene. A sixth of the time would go into visiting
-    # the objects that exist by now.
+    # Garbage is collected after each scene. Frozen objects are not visited then, which
+    # saves a sixth of the time.
     gc.freeze()
     return SceneJobs(config, model, make_splits(config, model))
 
 
 def attack_scene(config: AttackConfig, scene: workbench.Scene, model: Model) -> str:
-    """Attack a scene, and return the status of the model there.
+    """Attack a scene, and return the status of the model in it.
 
     It is "found" if the attack found an adversarial scene, and "already wrong" if the
-    model is wrong on the clean scene. Otherwise it is `ROBUST`, or "unsteady" if the
-    model is right in too few trials of the clean scene.
+    model is wrong about the clean scene. Otherwise it is `ROBUST`, or "unsteady" if the
+    model is right in too few trials of the clean scene. It has to be right in as many
+    trials as an adversarial scene has to be wrong in.
     """
     summary = workbench.attack_on(config, scene, model).summary
     if summary.ending == results.INTERRUPTED:
@@ -445,18 +466,18 @@ SCENE_RANGES = {
 }
 """Ranges from which scenes sample parameters, in degrees."""
 GROUND_BRIGHTNESS_RANGE = (0.1, 0.9)
-"""Range of the ground's brightness, sRGB, around which the channels differ."""
+"""Range of the ground's brightness, sRGB. Each channel differs a little from it."""
 
 
 @dataclass(frozen=True)
 class SceneSplit:
-    """One part of the split, which has scenes by number.
+    """A split of scenes, such as "training"; each scene has a number.
 
     Attributes:
-        name: name of the part.
+        name: name of the split.
         objects: names of bundled objects, or files.
-        environments: names or files.
-        seed: root of the samples.
+        environments: names of bundled environments, or files.
+        seed: root seed of all samples.
         varied: whether each scene has a random variation of an environment.
     """
 
@@ -480,8 +501,8 @@ class SceneSplit:
                 by name, such as "mug.bsdf.roughness". They override sampled ones.
         """
         name = self._get_object_name(number)
-        # A generator for each scene: it is the same in whatever order scenes are
-        # loaded.
+        # Each scene has its own generator, so that it does not depend on the order in
+        # which scenes are loaded.
         rng = self.make_generator(number)
         asset = OBJECTS[name].generate(rng) if name in OBJECTS else Path(name)
         environment = self.environments[int(rng.integers(len(self.environments)))]
@@ -510,7 +531,11 @@ class SceneSplit:
         )
 
     def generate_objects(self, count: int) -> Iterator[assets.ObjectAsset]:
-        """Yield the objects of the first `count` scenes, those in files only once."""
+        """Yield the objects of the first `count` scenes.
+
+        A bundled object is another instance in each scene. One in a file is always the
+        same, so it is yielded only once.
+        """
         for number in range(count):
             name = self._get_object_name(number)
             is_first_time = number == self.objects.index(name)
@@ -550,12 +575,12 @@ def make_splits(config: HardenConfig, model: Model) -> dict[str, SceneSplit]:
             from a file and no held-out objects are named.
     """
     objects = _select_objects(config, model)
-    # Objects of ours have random instances; a file is a single one.
+    # A bundled object has random instances, a file only one.
     files = [name for name in objects if name not in OBJECTS]
     if files and config.held_out is None:
         raise InputError(
-            f"held_out: {', '.join(files)} has no other instances; name objects of its "
-            "class that training never sees"
+            f"held_out: {', '.join(files)} has no other instances; name other objects "
+            "of its class, which are not trained on"
         )
     training_environments = _environments(config.environment, "train")
     splits = {
@@ -568,7 +593,7 @@ def make_splits(config: HardenConfig, model: Model) -> dict[str, SceneSplit]:
         )
         for name in (TRAINING, FURTHER, VALIDATION)
     }
-    # Without objects of its own, the held-out part has other instances of the same.
+    # Without the setting, the held-out split has other instances of the same objects.
     held_out_objects = objects
     if config.held_out is not None:
         held_out_objects = settings.split_names(config.held_out)
@@ -599,7 +624,7 @@ def _select_objects(config: HardenConfig, model: Model) -> tuple[str, ...]:
     if not known:
         raise InputError(
             f"object: model {model.name} has a class for none of "
-            f"{', '.join(objects)}; name others"
+            f"{', '.join(objects)}; name other objects"
         )
     return known
 
@@ -627,7 +652,7 @@ def compute_fingerprint(asset: assets.ObjectAsset) -> str:
 
 
 def check_disjoint(held_out: SceneSplit, training_splits: Sequence[SceneSplit]) -> None:
-    """Check that nothing is measured that is trained on.
+    """Check that the training has no environment and no object of the measurement.
 
     Only the first instance of each object is compared here. All others are compared
     when they are sampled, as generating them takes minutes.
@@ -646,9 +671,9 @@ def check_disjoint(held_out: SceneSplit, training_splits: Sequence[SceneSplit]) 
     if common:
         raise InputError(
             f"held_out_environment: {', '.join(common)} is an environment "
-            "of the training too; name others"
+            "of the training, too; name other environments"
         )
-    # One object of each kind; a file has only one.
+    # the first instance of each object, as objects take turns
     held_out_fingerprints = {
         compute_fingerprint(asset)
         for asset in held_out.generate_objects(len(held_out.objects))
@@ -661,16 +686,17 @@ def check_disjoint(held_out: SceneSplit, training_splits: Sequence[SceneSplit]) 
 def check_not_held_out(
     asset: assets.ObjectAsset, held_out_fingerprints: Set[str]
 ) -> None:
-    """Check that an object of the training is not measured.
+    """Check that an object of the training is not held out.
 
     Args:
         asset: the object.
-        held_out_fingerprints: fingerprints of what is measured.
+        held_out_fingerprints: fingerprints of the held-out objects.
 
     Raises:
-        InputError: it is.
+        InputError: the object is held out.
     """
     if compute_fingerprint(asset) in held_out_fingerprints:
         raise InputError(
-            f"held_out: {asset.name} is an object of the training too; name others"
+            f"held_out: {asset.name} is an object of the training, too; name other "
+            "objects"
         )

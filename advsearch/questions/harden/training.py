@@ -1,4 +1,8 @@
-"""Train a classifier on plain and worst images, and keep its plain predictions."""
+"""Train a classifier on plain and worst images.
+
+A part of the loss keeps its predictions of plain images near those of the original
+model.
+"""
 
 from __future__ import annotations
 
@@ -39,47 +43,41 @@ from advsearch.questions.harden.rounds import (
 from advsearch.questions.harden.scenes import FURTHER, TRAINING, Job, SceneJobs
 
 LESSONS_PER_PART = 6
-"""Lessons of a step that one thread works at."""
+"""Number of lessons of a batch that one thread computes."""
 N_FIRST_STEPS = 4
-"""Steps of the search of each texture before a training."""
+"""Steps of the search for each new texture before a round trains."""
 N_VALIDATION_STEPS = 8
-"""Steps of the search of the textures by which weights are chosen, from its start."""
+"""Steps of the search for textures of the validation; it begins anew for all weights."""
 AUGMENTATION = Augmentation(
     smallest_crop=0.75, largest_crop=1.15, turn=15.0, cutout=0.0
 )
-"""Of training images; the search for worse ones sees the same."""
+"""Augmentation of training images. The search for worse images has the same."""
 ORIGINAL_MODEL_WEIGHT = 1.0
-"""Weight of the original model's predictions of plain images, relative to the loss."""
+"""Weight of the divergence from the original model's predictions in the loss."""
 MIXUP_PROBABILITY = 0.5
-"""Fraction of the parts of a batch that mix their images."""
+"""Probability that a part of a batch mixes its images."""
 MIXUP_BETA = 0.4
 """Both parameters of the beta distribution of the mixing weights."""
 SHARED_TEXTURE_PROBABILITY = 0.25
-"""Fraction of the scenes with a texture in which all views have the same texture."""
+"""Probability that all views of a scene share one texture."""
 RANDOM_CONTROLS_PROBABILITY = 0.5
-"""Fraction of the scenes with a texture in which rendered controls vary too."""
+"""Probability that rendered controls vary, too, in a scene with a texture."""
 
 Examples = Iterable[tuple[Tensor, Tensor]]
-"""Batches of images (N, H, W, 3) sRGB in [0, 1] and class indices (N,), such as a
-`DataLoader`'s.
+"""Batches of images (N, H, W, 3) sRGB in [0, 1] and class indices (N,), such as those
+of a `DataLoader`.
 """
 
 
 class ClassifierTrainer(Trainer):
     """Train a classifier on lessons.
 
-    It keeps the original model's predictions of plain images.
-
-    Args:
-        work: samples lessons from scenes.
-        student: the copy that is trained.
-        optimiser: creates the optimizer; None for AdamW.
-        beside: further batches, of which one is taken with each step. They are
-            repeated from the start when they end.
+    Its predictions of plain images stay near those of the original model.
 
     Attributes:
-        n_views: views of a scene of the training, and of the validation, for controls
-            with a matrix of light transport.
+        n_views: number of views of a training scene, and of a validation scene, for
+            controls with a matrix of light transport.
+        beside: batches of the user's own images and class indices; None without any.
     """
 
     batch_size = 24
@@ -102,11 +100,10 @@ class ClassifierTrainer(Trainer):
             optimiser: function from a list of parameters to an optimizer; None for
                 AdamW.
             beside: batches of the user's own images and class indices. Each step also
-                trains with one of them.
+                trains with one of them. When they end, they are repeated.
         """
-        # numbers of views of a scene: the setting in training, and 2 in the validation,
-        # which only compares weights
         super().__init__(work, student, optimiser)
+        # The validation only compares weights, for which two views suffice.
         self.n_views = (self.config.views, 2)
         self.beside = beside
         self._example_batches: Iterator[tuple[Tensor, Tensor]] = iter(())
@@ -120,9 +117,9 @@ class ClassifierTrainer(Trainer):
     ) -> list[Lesson]:
         """Make lessons of scenes.
 
-        Controls of textures have a matrix of light transport: a scene has lessons for
-        each of them. All other controls together have lessons of rendered images. In
-        the training split there are also lessons of further scenes, as a new scene
+        Some controls, such as textures, have a matrix of light transport: a scene has
+        lessons for each of them. All other controls together have lessons with rendered
+        images. The training split also has lessons of further scenes, as a new scene
         teaches more than one more view of the same scene.
 
         Args:
@@ -134,7 +131,7 @@ class ClassifierTrainer(Trainer):
         jobs += self._rendered_jobs(split, scene_numbers)
         if split == TRAINING:
             jobs += self._further_jobs(scene_numbers)
-        # They end in any order.
+        # Jobs end in any order; the lessons are returned in the order of the jobs.
         lessons_of_job = dict(self.work.run_jobs(title, jobs))
         sampled_lessons: list[Lesson] = []
         for index in range(len(jobs)):
@@ -151,8 +148,6 @@ class ClassifierTrainer(Trainer):
             split: name of the split.
             scene_numbers: numbers of its scenes.
         """
-        # numbers of views of each scene: in the training split, and in the validation
-        # split
         training_views, validation_views = self.n_views
         jobs = list[Job]()
         for control, number in itertools.product(
@@ -186,8 +181,9 @@ class ClassifierTrainer(Trainer):
         """Return the jobs that make lessons by rendering, one for each scene.
 
         All controls without a matrix of light transport change together. In the
-        training split a scene has one such view, and one plain view on which the
-        student should predict as the original model does.
+        training split a scene has one such view, and one plain view, on which the
+        student should predict as the original model does. In the validation split it
+        has only such views.
         """
         controls = self.work.rendered_controls
         if not controls:
@@ -211,8 +207,8 @@ class ClassifierTrainer(Trainer):
         Args:
             scene_numbers: numbers of the scenes of the round, which follow each other.
         """
-        # Each scene of the round has `n_further_scenes` further ones, with numbers of
-        # their own.
+        # Each scene of the round has `n_further_scenes` further scenes. Their numbers
+        # count the scenes of the split `FURTHER`.
         first = self.n_further_scenes * scene_numbers[0]
         end = self.n_further_scenes * (scene_numbers[-1] + 1)
         if self.work.rendered_controls:
@@ -230,15 +226,18 @@ class ClassifierTrainer(Trainer):
         ]
 
     def sample_scene_options(self, control: str, number: int) -> tuple[bool, bool]:
-        """Return whether the views of a scene share a texture, and whether other
-        controls vary.
+        """Decide at random whether the views of a scene share a texture.
 
-        Both are random. If it were every fourth scene, for example, it would always be
-        those of the same objects, as objects take turns.
+        It is also decided whether other controls vary in it. If it were every fourth
+        scene, for example, it would always be the scenes of the same objects, because
+        objects take turns.
 
         Args:
-            control: control whose images a matrix of light transport gives.
+            control: control whose images a matrix of light transport predicts.
             number: number of the scene.
+
+        Returns:
+            Whether the views share a texture, and whether other controls vary.
         """
         seed = seeds.stream(self.config.seed, f"views of {control}", number)
         shared_sample, varied_sample = np.random.default_rng(seed).random(2)
@@ -254,15 +253,26 @@ class ClassifierTrainer(Trainer):
 
     @contextmanager
     def gradient_context(self, new: Sequence[Lesson]) -> Iterator[ComputeGradient]:
-        """Search worse images of the new lessons, then open threads for gradients."""
+        """Search for worse images of the new lessons, then open threads for gradients.
+
+        Args:
+            new: lessons that no earlier round has used.
+        """
+        # The images are to be hard for the student. The original model
+        # (`self.work.model`) is only compared with.
         lessons.search_worse_images(new, self.student.model, N_FIRST_STEPS)
         with open_single_threaded_pool() as pool:
-            gradients = GradientComputer(self.student, self.work.model, pool)
+            gradients = GradientComputer(
+                self.student, original_model=self.work.model, pool=pool
+            )
 
             def compute_gradient(
                 batch: Sequence[Lesson], rng: np.random.Generator
             ) -> None:
-                """Compute the gradient of a batch, and of one of further examples."""
+                """Compute the gradient of a batch of lessons, and store it in `grad`.
+
+                The user's next batch of examples is added, if there are any.
+                """
                 examples = self.next_examples()
                 seed = int(rng.integers(2**62))  # fits an int64
                 gradients.compute(batch, examples, seed)
@@ -270,7 +280,7 @@ class ClassifierTrainer(Trainer):
             yield compute_gradient
 
     def next_examples(self) -> tuple[Tensor, Tensor] | None:
-        """Return the next batch of further examples; None if there are none.
+        """Return the next batch of the user's examples; None if there are none.
 
         They begin again when they end.
         """
@@ -288,6 +298,7 @@ class ClassifierTrainer(Trainer):
         Textures are searched against the student. Plain lessons count only for the
         clean accuracy.
         """
+        # copies, since a search changes the lessons
         searched = [copy.copy(lesson) for lesson in held_back]
         model = self.student.model
         for lesson in searched:
@@ -362,19 +373,20 @@ def _accuracy(
 class GradientComputer:
     """Compute gradients of a network on several threads.
 
-    Each of the threads uses one of torch's threads, so that they do not wait for each
-    other at barriers, and has a copy of the network that shares its weights.
-
-    Args:
-        student: the network, whose parameters collect the gradients.
-        original_model: the model before it was trained.
-        pool: the threads.
+    A batch is divided into parts. Each part has a copy of the network, which shares its
+    weights.
     """
 
     def __init__(
         self, student: Trainable, original_model: Model, pool: Executor
     ) -> None:
-        """Set up without copies of the network; they are made as parts need them."""
+        """Set up without copies of the network; they are made when parts need them.
+
+        Args:
+            student: the network, whose parameters collect the gradients.
+            original_model: the model before it was trained.
+            pool: threads, in each of which torch uses a single thread.
+        """
         self._student = student
         self._original_model = original_model
         self._pool = pool
@@ -390,8 +402,7 @@ class GradientComputer:
         """Make the worst images of lessons worse, and compute the gradient of the loss.
 
         The gradient is stored in `grad` of each parameter. A further batch adds its
-        mean loss. The batch is divided into parts, which are computed at the same time
-        on threads.
+        mean loss. Parts of the batch are computed at the same time on threads.
 
         Args:
             batch: the lessons.
@@ -399,13 +410,14 @@ class GradientComputer:
                 None.
             seed: seed of the augmentation.
         """
-        # Textures come first, so that both passes have the same parts.
+        # Textures come first, so that the parts of the search below and those of the
+        # loss begin with the same lessons.
         batch = sorted(batch, key=lambda lesson: not isinstance(lesson, TextureLesson))
         self._ascend_textures(batch, seed)
 
-        # Each part adds its sum, weighted with the counts of the full batch, so that
-        # the sum of the parts' gradients is the gradient of the means.
-        # The loss is a mean over plain images plus one over worst images.
+        # The loss is a mean over plain images plus a mean over worst images. A part has
+        # a sum of losses, weighted by the counts of the full batch. So the sum of the
+        # parts' gradients is the gradient of the means.
         plain_weight = 1.0 / len(batch)
         worst_weight = 1.0 / max(1, len(select_hard_lessons(batch)))
 
@@ -499,9 +511,9 @@ class GradientComputer:
     ) -> Tensor:
         """Return the loss of a part of a batch.
 
-        In some steps all rendered images are mixed with each other (mixup, Zhang et al.
-        2018, arXiv 1710.09412). Rendered images stay the same in all epochs, so the
-        network could learn them by heart. Textures need no mixing, as they change in
+        At random, all rendered images of a part are mixed with each other (mixup, Zhang
+        et al. 2018, arXiv 1710.09412). Rendered images stay the same in all epochs, so
+        that the network could memorize them. Textures need no mixing, as they change in
         each step.
 
         Args:
@@ -511,7 +523,7 @@ class GradientComputer:
             worst_weight: weight of each worst image.
             seed: seed of the augmentation and the mixing.
         """
-        # of each image: first all plain ones, then the worst ones
+        # the lesson of each image: first the plain images, then the worst ones
         lesson_of_image: list[Lesson] = [*part, *select_hard_lessons(part)]
         right_classes = [lesson.right_classes for lesson in lesson_of_image]
         images = _augment_images(part, seed)
@@ -528,15 +540,16 @@ class GradientComputer:
             plain_weight * losses[: len(part)].sum()
             + worst_weight * losses[len(part) :].sum()
         )
-        # The student stays near the original model's predictions on plain images.
-        # Lessons that are rendered twice are left out: even their plain image has a
-        # changed control, on which the original model may be right but unsure.
-        unchanged = _find_unrendered(part)
-        if unchanged:
+        # The student stays near the original model's predictions on plain images. A
+        # `RenderedLesson` is left out: a control has changed even in its plain image,
+        # about which the original model may be right but unsure. Plain images come
+        # first, so that the index of a lesson is that of its plain image.
+        unrendered = _find_unrendered(part)
+        if unrendered:
             divergence = self._divergence_from_original(
-                images[unchanged],
-                logits[unchanged],
-                [right_classes[index] for index in unchanged],
+                images[unrendered],
+                logits[unrendered],
+                [right_classes[index] for index in unrendered],
             )
             loss = loss + plain_weight * ORIGINAL_MODEL_WEIGHT * divergence
         return loss
@@ -579,7 +592,7 @@ def _mix_images(
             weight.
 
     Returns:
-        The indices of the images that are mixed, none if it was decided so; the index
+        The indices of the images that are mixed, none in half of the cases; the index
         of the partner of each; and the weight of the partner, at most 1/2.
     """
     rng = np.random.default_rng(seed)
@@ -590,7 +603,6 @@ def _mix_images(
             for index, lesson in enumerate(lesson_of_image)
             if isinstance(lesson, RenderedLesson)
         ]
-    # All random numbers are drawn, whether images are mixed or not.
     partners = rng.permutation(mixed).astype(int).tolist()
     sampled_weight = float(rng.beta(MIXUP_BETA, MIXUP_BETA))
     # At most 1/2, so that the image itself always has the larger weight.
@@ -601,7 +613,7 @@ def _mix_images(
 
 
 def _find_unrendered(part: Sequence[Lesson]) -> list[int]:
-    """Return the indices of lessons that are not rendered."""
+    """Return the indices of the lessons that are no `RenderedLesson`."""
     return [
         index
         for index, lesson in enumerate(part)
@@ -612,9 +624,9 @@ def _find_unrendered(part: Sequence[Lesson]) -> list[int]:
 def _augment_images(part: Sequence[Lesson], seed: int) -> Tensor:
     """Return the plain images of lessons, then the worst ones, augmented (N, H, W, 3).
 
-    The three groups are augmented separately, each with the same seed. So a worst
-    texture gets the same crop and colors as in the search that found it. Under another
-    augmentation it might no longer be the worst.
+    Plain images, worst textures and worst renders are augmented separately, each with
+    the same seed. So a worst texture gets the same crop and colors as in the search
+    that found it. Under another augmentation it might no longer be the worst.
 
     Args:
         part: the lessons, textures first.

@@ -10,35 +10,35 @@ from torch import Tensor
 
 from advsearch.extend import InputError, seeds, statistics
 
-LEVELS = 6  # fractions by which faces move, each half of the one before
-ATTEMPTS = 4  # final checks at most
-PROBES = 8  # random points in the slab that a face would win
-USUAL_PROBED = 100  # images of growing for each parameter, usually
+LEVELS = 6  # number of fractions by which faces move, each half of the previous one
+ATTEMPTS = 4  # maximum number of final checks
+PROBES = 8  # random points in the slab that a face would add to the box
+USUAL_PROBED = 100  # usual number of images for each parameter while a box grows
 MAX_PROBED = 400
-"""Images of growing for each parameter, at most: more than twice what boxes, balls,
-planes and noise have taken.
+"""Maximum number of images for each parameter while a box grows. It is more than twice
+what regions that are boxes, balls, half-spaces or noise have needed.
 """
 MIN_STEP = 1e-3  # a face does not move by less
-# fraction of the distance between the center and an exception at which a face lies that
-# excludes it
+# A face that excludes a point is moved to this fraction of the distance from the center
+# to the point.
 PULLED_IN = 0.98
 
 IsSame = Callable[[Tensor, int], bool]
-"""(u, number) -> whether the prediction at u is that of the center; number numbers its
-seed.
+"""(u, number) -> whether the prediction at u is that of the center. The number is that
+of the evaluation, from 0, and decides its seed.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class GrownBox:
-    """A box in the unit box in which the prediction stays the same.
+    """A box inside the unit box in which the prediction stays the same.
 
     Attributes:
         center: the point that it grew around (d,).
         low, high: its corners (d,).
         n_same: how many of the final samples had the center's prediction.
-        samples: the final samples.
-        renders: images in all.
+        samples: number of the final samples.
+        renders: number of all images.
     """
 
     center: Tensor
@@ -50,10 +50,10 @@ class GrownBox:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """The 95 % interval of the share of the box with the center's prediction.
+        """The 95 % interval of the fraction of the box with the center's prediction.
 
-        It holds for all `ATTEMPTS` together, since the last box is the one that passed
-        (Bonferroni).
+        The last box is the best of up to `ATTEMPTS`, so the confidence is corrected for
+        as many checks (Bonferroni).
         """
         return statistics.intervals.clopper_pearson(
             self.n_same, self.samples, 1.0 - 0.05 / ATTEMPTS
@@ -82,13 +82,14 @@ def grow_box(
     parameter at the latest.
 
     Then the box is sampled. An exception is a sample with another prediction than the
-    center. For each, the face that cuts off the least of the box moves inwards, so that
-    the exception is outside. Then the box is sampled again with other seeds, at most
-    `ATTEMPTS` times. The last check is reported whatever it shows. The samples of a
-    check are independent of the box, so that a confidence interval from them is valid.
+    center. For each exception a face moves inwards, so that the exception is outside of
+    the box: of all faces, the one that cuts off the smallest part. Then the box is
+    sampled again with other seeds, at most `ATTEMPTS` times. The last check is reported
+    even if it has exceptions. The samples of a check are independent of the box, so
+    that a confidence interval from them is valid.
 
     Args:
-        is_same: function that tells whether a point (d,) has the prediction of the
+        is_same: function that returns whether a point (d,) has the prediction of the
             center.
         center: center in [0, 1] (d,).
         seed: seed of the random points.
@@ -139,7 +140,7 @@ class GrowingBox:
         """Start with a box that is only the center.
 
         Args:
-            is_same: function that tells whether a point has the center's prediction.
+            is_same: function that returns whether a point has the center's prediction.
             center: center in [0, 1] (d,).
             seed: seed of the random points.
         """
@@ -152,7 +153,7 @@ class GrowingBox:
         self.n_evaluated = 0
 
     def grow(self) -> None:
-        """Move faces out while the slabs that they win have the center's prediction."""
+        """Move faces out while the slabs that they add have the center's prediction."""
         n_faces = 2 * len(self._center)
         # A round of all faces begins only if it fits into the limit of images.
         max_before_round = MAX_PROBED * len(self._center) - n_faces * PROBES
@@ -160,7 +161,7 @@ class GrowingBox:
         for _ in range(LEVELS):
             has_moved = True
             while has_moved and self.n_evaluated <= max_before_round:
-                # all faces are pushed, whether or not others have moved
+                # A list, and not `any` of a generator: that would stop at the first.
                 moves = [self._push(face, fraction) for face in range(n_faces)]
                 has_moved = any(moves)
             fraction /= 2.0
@@ -177,7 +178,7 @@ class GrowingBox:
         A point that is outside already changes nothing.
 
         Args:
-            point: (d,) with another prediction than the center.
+            point: (d,) a point with another prediction than the center.
         """
         is_inside = bool(((point >= self.low) & (point <= self.high)).all())
         if not is_inside:
@@ -195,10 +196,10 @@ class GrowingBox:
         lost_fraction = torch.where(point == self._center, torch.inf, lost_fraction)
         axis = int(lost_fraction.argmin())
         is_upper = point[axis] > self._center[axis]
-        face = self.high if is_upper else self.low
+        corner = self.high if is_upper else self.low
         # The face moves a little beyond the point, towards the center (`PULLED_IN` <
         # 1).
-        face[axis] = torch.lerp(self._center[axis], point[axis], PULLED_IN)
+        corner[axis] = torch.lerp(self._center[axis], point[axis], PULLED_IN)
 
     def _push(self, face: int, fraction: float) -> bool:
         """Move a face outwards if the slab that this adds has the center's prediction.
@@ -208,8 +209,9 @@ class GrowingBox:
         step is less than `MIN_STEP`, the face stays.
 
         Args:
-            face: its index: 2 * axis, and 1 more for the upper face.
-            fraction: fraction of the distance to the bound, 0 or 1.
+            face: index of the face: 2 * axis, and 1 more for the upper face.
+            fraction: fraction of the distance between the face and its bound, which is
+                0 for a lower face and 1 for an upper one.
 
         Returns:
             Whether the face moved.
@@ -234,8 +236,8 @@ class GrowingBox:
         probes[0, axis] = outer
         if not all(self._evaluate(point) for point in probes):
             return False
-        corner = self.high if is_upper else self.low
         # Rounding may lead a little outside of [0, 1].
+        corner = self.high if is_upper else self.low
         corner[axis] = outer.clamp(0.0, 1.0)
         return True
 
@@ -246,7 +248,7 @@ class GrowingBox:
         return self._is_same(u, number)
 
     def _sample(self, low: Tensor, high: Tensor, count: int) -> Tensor:
-        """Return points (count, d) uniform in a box, other ones at every call."""
+        """Return points (count, d) uniform in a box; each call has new random numbers."""
         generator = torch.Generator().manual_seed(
             seeds.stream(self._seed, "region", self._n_draws)
         )
@@ -260,12 +262,12 @@ def _choose_step(distance: float, fraction: float) -> float | None:
 
     Args:
         distance: distance from the face to the bound.
-        fraction: fraction of it that the face tries.
+        fraction: fraction of this distance that the face tries to move.
     """
     if distance <= 0.0:
         return None
-    # A fraction of so little would soon be less than a step, and the bound never
-    # reached.
+    # Close to the bound, a fraction of the distance would be less than `MIN_STEP`, and
+    # the face would never reach the bound.
     is_close = distance < 4.0 * MIN_STEP
     if is_close:
         return distance

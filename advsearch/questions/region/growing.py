@@ -32,8 +32,8 @@ from advsearch.questions.region.result import (
     RegionResult,
 )
 
-MAX_PARAMETERS = 8  # in which a box is grown
-CENTER_TRIALS = 20  # renders of the center, which give its verdict
+MAX_PARAMETERS = 8  # maximum number of parameters in which a box grows
+CENTER_TRIALS = 20  # renders of the center, which decide its verdict
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,15 +65,16 @@ class VariedParameters:
 def find_region(context: RunContext[RegionConfig]) -> RegionResult:
     """Find the region around a configuration in which the prediction stays the same.
 
-    That is to load the problem, to grow and check the box, and to draw the map. After
-    an interrupt the result has no box.
+    The problem is loaded, the box is grown and checked, and the map is drawn. After an
+    interrupt the result has no box.
     """
     config = context.config
     stages = context.stages
     stages.begin("setup", workbench.LOADING)
-    problem, warnings = workbench.problem_from_config(
-        AttackConfig.from_config(config, **_read_budget(config))
-    )
+    # Budgets limit the ranges of controls. With that of the run in `around`, its
+    # adversarial configuration lies within the ranges.
+    attack_config = AttackConfig.from_config(config, **_read_budget(config))
+    problem, warnings = workbench.problem_from_config(attack_config)
     for text in warnings:
         stages.progress.message(text)
     varied = find_varied(problem, config)
@@ -91,6 +92,7 @@ def find_region(context: RunContext[RegionConfig]) -> RegionResult:
         task=problem.task.title,
         controls=[control.name for control in problem.space.controls],
         image_formation=problem.renderer.formation,
+        # values of the scene outside of a control's range, which were replaced
         clean={"moved": problem.space.adjusted_defaults},
         warnings=warnings,
         transport=_get_transport_summary(verifier),
@@ -100,10 +102,9 @@ def find_region(context: RunContext[RegionConfig]) -> RegionResult:
 
 
 def _read_budget(config: RegionConfig) -> dict[str, object]:
-    """Return the budget of the attack around whose scene the box grows.
+    """Return epsilon and norm of the attack whose run the setting `around` names.
 
-    The adversarial configuration has to lie within the ranges of the controls. Empty
-    around another configuration.
+    Empty without `around`: then the box grows around the scene's own configuration.
     """
     if config.around is None:
         return {}
@@ -116,19 +117,24 @@ def _read_budget(config: RegionConfig) -> dict[str, object]:
 def _get_transport_summary(verifier: workbench.Verifier) -> Any:
     """Return how images from new viewpoints were predicted, or why they were not.
 
-    None if no camera moves.
+    None if no prediction was tried, for example because no camera moves.
     """
     state = verifier.state
-    was_tried = state.predictor or state.predictor_refusal
+    was_tried = state.predictor is not None or state.predictor_refusal is not None
     return state.transport_summary if was_tried else None
 
 
 def count_renders(verifier: workbench.Verifier) -> dict[str, int]:
-    """Return how many images were rendered, and how many predicted, if any."""
+    """Return how many images were rendered, and how many predicted, if any.
+
+    The keys are those of all results: "verification" for rendered images, here also
+    those that prepared a predictor, and "products" for predicted ones.
+    """
     state = verifier.state
-    renders = {"verification": state.verification_renders}
+    n_rendered = state.verification_renders
     if state.predictor is not None:
-        renders["verification"] += state.predictor.n_traced
+        n_rendered += state.predictor.n_traced
+    renders = {"verification": n_rendered}
     if state.n_predicted_trials:
         renders["products"] = state.n_predicted_trials
     return renders
@@ -142,8 +148,8 @@ def find_varied(problem: Problem, config: RegionConfig) -> VariedParameters:
 
     Raises:
         UnknownNameError: `vary` names a parameter that the controls do not search.
-        InputError: there are too few or too many, or `around` is a run over other
-            controls.
+        InputError: there are too few or too many parameters, or the run in `around` is
+            over other controls.
     """
     coordinate_by_name = _list_coordinates(problem)
     names = tuple(coordinate_by_name)
@@ -229,25 +235,25 @@ class RegionSearch:
         self._run = context.run
         self._verifier = verifier
         self._varied = varied
-        self._is_checking = False  # whether the box has grown
-        self._is_wrong_at_center = False
+        self._is_checking = False  # True once the box has grown and is being checked
+        self._is_wrong_at_center = False  # the verdict at the center, set by `run`
 
     def run(self) -> GrownRegion:
         """Find the verdict at the center, grow the box, and draw the map.
 
-        The verdict is whether the model is right or wrong at the center; the box is
-        where it stays so.
+        The verdict is whether the model is right or wrong at the center. In the box the
+        verdict is the same.
         """
         config = self._config
         verifier = self._verifier
         varied = self._varied
-        # enough samples per pixel that noise does not decide the prediction at the
-        # center
+        # Choose enough samples per pixel that noise does not decide the prediction at
+        # the center.
         verifier.choose_spp({"centre": varied.center})
         self._is_wrong_at_center = find_verdict(verifier, varied.center)
         if config.specialise:
-            # the number of images that may be rendered faster if the light is prepared
-            # once
+            # Images may be predicted if the light on surfaces is prepared, which pays
+            # only for enough images: those of growing, and those of the map.
             n_images = boxes.USUAL_PROBED * len(varied.names) + config.map**2
             workbench.prepare_surface_light(
                 verifier, varied.center, varied.coordinates, n_images
@@ -292,13 +298,13 @@ class RegionSearch:
         )
 
     def _begin_check(self) -> None:
-        """Begin the stage of the check; later checks belong to it."""
+        """Begin the stage of the check; later checks belong to the same stage."""
         if self._is_checking:
             return
         self._is_checking = True
         limit = boxes.ATTEMPTS * self._config.samples
         hint = (
-            f"{self._config.samples} pictures, and as many again where one is an "
+            f"{self._config.samples} pictures, and as many again if any of them is an "
             "exception; `samples` shortens it"
         )
         title = "checking the box with fresh samples"
@@ -312,16 +318,18 @@ class RegionSearch:
 
         Args:
             values: values of the k parameters that vary, in [0, 1] (k,).
-            number: number of the point, which seeds its noise.
+            number: number of the point, which decides the seed of its render.
         """
         # While the box grows, images may be predicted from the prepared light. Those of
         # the check are rendered, as its result is reported.
         predictor = None if self._is_checking else self._verifier.state.predictor
         u = self._varied.with_values(values)
+        # The stored rows have no success, since no prediction is sought.
         (trial,) = self._verifier.try_configurations(
             "region", {number: u}, has_success=False, predictor=predictor
         )
         has_verdict = not trial.prediction.is_out_of_view and not trial.is_non_finite
+        # without a target, a success is a wrong prediction
         is_wrong = trial.success
         return has_verdict and is_wrong == self._is_wrong_at_center
 
@@ -341,18 +349,18 @@ def find_verdict(verifier: workbench.Verifier, center: Tensor) -> bool:
     n_hidden = sum(trial.prediction.is_out_of_view for trial in trials)
     if n_hidden:
         raise InputError(
-            f"the object is not to be seen in {n_hidden} of {CENTER_TRIALS} trials at "
-            "the centre, so there is no verdict; choose another centre"
+            f"the object is not visible in {n_hidden} of {CENTER_TRIALS} trials at the "
+            "centre, so there is no verdict; choose another centre"
         )
     n_non_finite = sum(trial.is_non_finite for trial in trials)
     if n_non_finite:
         raise InputError(
             f"the model's prediction is not a number in {n_non_finite} of "
             f"{CENTER_TRIALS} trials at the centre, so there is no verdict; choose "
-            "another centre, or mend the model"
+            "another centre, or fix the model"
         )
     n_wrong = sum(trial.success for trial in trials)
-    # None if both right and wrong are too frequent for a verdict
+    # True or False, or None if both right and wrong are too frequent for a verdict
     is_wrong = verifier.problem.rule.decide(n_wrong, CENTER_TRIALS)
     if is_wrong is None:
         raise InputError(
@@ -428,10 +436,10 @@ def draw_map(
 
     Args:
         verifier: verifier that evaluates the points.
-        size: points along each axis.
+        size: number of points along each axis.
         varied: the two parameters that are the axes of the map.
         box: the two sides of the box, in the same order.
-        run: where the figure is saved.
+        run: run directory in which the figure is saved.
     """
     rows = _measure_margins(verifier, size, varied)
     x_range, y_range = find_ranges(verifier.problem, varied, box)
@@ -450,9 +458,11 @@ def _measure_margins(
 ) -> list[list[float]]:
     """Return the margin on a grid over two parameters, row by row from the lowest.
 
+    Images are predicted if the light on surfaces was prepared, and rendered otherwise.
+
     Args:
         verifier: verifier that evaluates the points.
-        size: points along each axis.
+        size: number of points along each axis.
         varied: the parameters; the first changes along a row.
     """
     hint = (
@@ -460,7 +470,7 @@ def _measure_margins(
         "or `verify_spp` shorten it"
     )
     verifier.stages.begin("map", "drawing the map", size * size, hint=hint)
-    # A single point lies in the middle of the range.
+    # coordinates of the points; a single point is at the center of the range
     grid = torch.linspace(0.0, 1.0, size) if size > 1 else torch.tensor([0.5])
 
     def find_configuration(number: int) -> Tensor:
@@ -472,7 +482,7 @@ def _measure_margins(
         "map",
         size * size,
         find_configuration,
-        has_success=False,
+        has_success=False,  # no prediction is sought
         predictor=verifier.state.predictor,
     )
     margins = [-trial.score for trial in trials]  # a score is a negative margin

@@ -26,9 +26,7 @@ half of it, at the confidence of `questions.region.boxes.GrownBox.interval`.
 
 
 class RegionConfig(SceneConfig):
-    """The settings of `region`: a box around a configuration where the verdict
-    stays.
-    """
+    """The settings of `region`: a box in which the verdict does not change."""
 
     command: ClassVar[str] = "region"
     excluded_settings: ClassVar[tuple[str, ...]] = ("spp",)
@@ -36,17 +34,17 @@ class RegionConfig(SceneConfig):
     around: str | None = setting(
         None,
         "region",
-        "a run whose adversarial configuration is the centre; it brings scene, model "
-        "and controls with it",
+        "a run whose adversarial configuration is the centre; its scene, model and "
+        "controls are used",
         "the name or the folder of a run",
-        otherwise="the scene as it is",
+        otherwise="the clean scene",
     )
     vary: str | None = setting(
         None,
         "region",
         "the parameters in which the box grows, separated by commas",
         "names such as pose.yaw,camera.elevation",
-        otherwise="all that the controls search, up to eight",
+        otherwise="all parameters that the controls search, up to eight",
     )
     samples: int = setting(
         200,
@@ -59,7 +57,7 @@ class RegionConfig(SceneConfig):
     map: int = setting(
         0,
         "region",
-        "side of the map of the margin, where there are two parameters; 0 for none",
+        "side of the map of the margin, for two parameters; 0 for no map",
         unit="points",
         ge=0,
         le=512,
@@ -78,7 +76,7 @@ class RegionConfig(SceneConfig):
 
 
 class AxisRange(results.Fields):
-    """One parameter and the range of it that is shown."""
+    """A parameter and its range on an axis."""
 
     name: str
     unit: str
@@ -87,7 +85,7 @@ class AxisRange(results.Fields):
 
 
 class BoxSide(AxisRange):
-    """One parameter and the range of it in which the verdict stays."""
+    """A parameter and its range in which the verdict does not change."""
 
     centre: float = Field(description="the value that the box grew around")
 
@@ -97,39 +95,43 @@ class MarginMap(results.Fields):
 
     axes: tuple[AxisRange, AxisRange]
     margins: list[list[results.JsonFloat]] = Field(
-        description="logits, in rows of the second parameter from its lowest value"
+        description="margins in logits; a row for each value of the second parameter, "
+        "from its lowest value"
     )
 
 
 class GrownRegion(results.Fields):
-    """What is known of a region; nothing yet if it was interrupted."""
+    """A region in which the verdict does not change; all null after an interrupt."""
 
     verdict: str | None = Field(
-        default=None, description="`right` or `wrong`, at the centre"
+        default=None, description="verdict at the centre, `right` or `wrong`"
     )
     box: list[BoxSide] | None = Field(
-        default=None, description="for each parameter, the range of its values"
+        default=None, description="the range of each parameter"
     )
     n_same: int | None = Field(
-        default=None, description="fresh samples of the box that had that verdict"
+        default=None, description="fresh samples of the box with the same verdict"
     )
-    samples: int | None = Field(default=None, description="all fresh samples of it")
-    rate: float | None = Field(
-        default=None, description="the share of those that had it"
+    samples: int | None = Field(
+        default=None, description="number of fresh samples of the box"
     )
-    interval: results.Interval | None = Field(default=None, description="of that share")
+    rate: float | None = Field(default=None, description="`n_same` / `samples`")
+    interval: results.Interval | None = Field(
+        default=None, description="95 % interval of the rate"
+    )
     volume: float | None = Field(
-        default=None, description="share of the ranges that the box takes up"
+        default=None,
+        description="volume of the box, as a fraction of that of the full ranges",
     )
-    spp: int | None = Field(default=None, description="samples a pixel")
+    spp: int | None = Field(default=None, description="samples per pixel")
     map: MarginMap | None = Field(
         default=None,
-        description="the margin over two parameters; only where `map` asks for it",
+        description="the margin over two parameters; null without the setting `map`",
     )
 
 
 class RegionResult(views.InNotebook, GrownRegion, results.SceneResult):
-    """The box around a configuration in which the verdict stays."""
+    """The box around a configuration in which the verdict does not change."""
 
     command: ClassVar[str] = "region"
 
@@ -138,12 +140,12 @@ class RegionResult(views.InNotebook, GrownRegion, results.SceneResult):
     warnings: list[str] = Field(description="sentences that a reader has to know")
     transport: results.LinearTransport | None = Field(
         default=None,
-        description="what predicted pictures from new viewpoints; absent "
-        "where no camera moves",
+        description="how pictures from new viewpoints were predicted, or why they were "
+        "not; null if no camera moves",
     )
     renders: Annotated[dict[str, int], results.key_validator("verification")] = Field(
-        description="of the `verification`: all that were rendered; of the `products`: "
-        "all that were predicted"
+        description="number of all rendered pictures (`verification`) and of all "
+        "predicted ones (`products`)"
     )
 
     @property

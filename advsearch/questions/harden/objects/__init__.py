@@ -1,6 +1,7 @@
-"""The bundled classes of objects: parametric families in numpy.
+"""The bundled classes of objects, which are parametric families in numpy.
 
-Household objects, which the reference model is trained on, and things of the street.
+There are household objects, which the reference model is trained on, and things of the
+street.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ _HOUSEHOLD = (
     dumbbell,
 )
 HOUSEHOLD: dict[str, ObjectFamily] = {family.name: family for family in _HOUSEHOLD}
-"""What the reference model is trained on."""
+"""The families that the reference model is trained on."""
 STREET: dict[str, ObjectFamily] = {
     family.name: family for family in (car, stop_sign, person)
 }

@@ -1,8 +1,9 @@
-"""A car: a hatchback of five doors. Units are metres; it drives towards +x.
+"""A car: a hatchback with five doors. Units are metres; it drives towards +x.
 
 Body and cabin are stacks of outlines: superellipses seen from above, each with its own
-length and width, at heights that follow the lines of hood, waist and roof. Windows,
-lights, grilles and wheel arches are carved out of them.
+length and width, at heights that follow the lines of hood, waist and roof. The waist is
+the line below the windows. Windows, lights, grilles and wheel arches are carved out of
+body and cabin. Numbers without an explanation are measures of the car in metres.
 """
 
 from __future__ import annotations
@@ -33,13 +34,16 @@ WHEEL = 0.33  # radius of a wheel, and the height of its axle
 TYRE = 0.215  # width of a tyre
 RIM = 0.212  # radius of a rim
 ARCH = 0.385  # radius of a wheel arch
-WHEELS = tuple(product(AXLES, (1.0, -1.0)))  # x of the axle, and the side
+WHEEL_POSITIONS = tuple(product(AXLES, (1.0, -1.0)))  # (x of the axle, sign of y)
+WHEEL_SIDE = 0.852  # distance of a wheel's outer side from the middle of the car
 CABIN_X = -0.5  # x of the middle of the cabin
 COLUMNS = 92  # faces around the body
-ELSEWHERE = -1.0
-"""How far points lie inside an opening on another end or side of the car: not at all."""
+OUTSIDE = -1.0
+"""Value of `_inside...` functions for points at another end or side of the car: they
+are not inside the opening.
+"""
 FAR = 9.0
-"""Distance of what is on another side of the car, in metres."""
+"""Distance in metres that stands for "not on this side of the car"."""
 Height = Callable[[Array, Array, Array], Array]
 """Returns z from the fraction of the height, x and y, all (N,)."""
 
@@ -130,9 +134,16 @@ def _outline_angles(levels: Array, power: float, center_x: float) -> Array:
     """
     widest = levels[np.argmax(levels[:, 1])]
     _, half_width, front, rear = widest
+    # In `_outline`, -pi and pi are the rear. The center is moved to x = 0, which does
+    # not change lengths along the outline.
     fine_angle = np.linspace(-np.pi, np.pi, 8001)
     x, y = _outline(
-        fine_angle, front - center_x, rear - center_x, half_width, power, center_x=0.0
+        fine_angle,
+        front=front - center_x,
+        rear=rear - center_x,
+        half_width=half_width,
+        power=power,
+        center_x=0.0,
     )
     arc_length = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
     # the angles at which the length along the outline is a multiple of the spacing
@@ -175,25 +186,29 @@ def _shell_normals(points: Array) -> Array:
 
 
 def _line(knots: list[tuple[float, float]]) -> Callable[[Array], Array]:
-    """Return z as a function of x along a spline through knots (x, z), x ascending."""
+    """Return the function from x to z of a spline through knots (x, z), x ascending."""
     curve = shapes.spline(knots, count=200)
     return lambda x: np.interp(x, curve[:, 0], curve[:, 1])
 
 
-def _softest(*fields: Array) -> Array:
+def _soft_minimum(*fields: Array) -> Array:
     """Return the minimum of several distances (N,), with corners rounded by about 3 cm.
 
-    It is the smooth minimum -log(sum(exp(-30 d))) / 30, of distances cut to 1 m.
+    It is the smooth minimum -log(sum(exp(-30 d))) / 30, of distances clipped to 1 m. If
+    each distance is that to one edge of an opening, positive inside, the minimum is
+    positive inside of all edges.
     """
     sharpness = -30.0
     distances = np.clip(np.stack(fields), -1.0, 1.0)
     return np.asarray(logsumexp(sharpness * distances, axis=0) / sharpness)
 
 
-# Heights of the lower edge of the body, of the lower edge of the windows, and of the
-# roof, along x.
-_BOTTOM = _line([(-2.2, 0.30), (-1.7, 0.20), (0.0, 0.175), (1.7, 0.185), (2.2, 0.235)])
-_WAIST = _line(
+# Functions from x to the height of the body's lower edge, of the lower edge of the
+# windows (the waist), and of the roof.
+_bottom_z = _line(
+    [(-2.2, 0.30), (-1.7, 0.20), (0.0, 0.175), (1.7, 0.185), (2.2, 0.235)]
+)
+_waist_z = _line(
     [
         (-2.2, 1.0),
         (-1.9, 0.995),
@@ -207,7 +222,7 @@ _WAIST = _line(
         (2.2, 0.62),
     ]
 )
-_ROOF = _line(
+_roof_z = _line(
     [
         (-2.2, 1.26),
         (-1.75, 1.345),
@@ -248,43 +263,41 @@ _CABIN_POWER = 4.6
 
 def _deck(x: Array, y: Array) -> Array:
     """Return the height of the top of the body, a little higher in the middle."""
-    return np.asarray(_WAIST(x) + 0.045 * (1.0 - (y / 0.8) ** 2))
+    return np.asarray(_waist_z(x) + 0.045 * (1.0 - (y / 0.8) ** 2))
 
 
 def _body_height(height_fraction: Array, x: Array, y: Array) -> Array:
     """Return z at a fraction of the height between the body's bottom and its top."""
-    bottom = _BOTTOM(x)
+    bottom = _bottom_z(x)
     return np.asarray(bottom + height_fraction * (_deck(x, y) - bottom))
 
 
 def _cabin_height(height_fraction: Array, x: Array, y: Array) -> Array:
     """Return z at a fraction of the height between the deck and the curved roof."""
     bottom = _deck(x, y) - 0.03  # inside the body, so that no gap shows
-    roof = _ROOF(x) + 0.035 * (1.0 - (y / 0.6) ** 2)
+    roof = _roof_z(x) + 0.035 * (1.0 - (y / 0.6) ** 2)
     return np.asarray(bottom + height_fraction * (roof - bottom))
 
 
 def _inside(points: Array) -> dict[str, Array]:
     """Return how far points (N, 3) lie inside each opening, by its name in `OPENINGS`.
 
-    The values (N,) are about in metres, and below 0 outside. All numbers are measures
-    of the car.
+    The values (N,) are approximate distances to the edge in metres, below 0 outside.
     """
     x, y, z = points.T
     abs_y = np.abs(y)
+    headlight = _inside_headlight(abs_y, x, z)
+    taillight = _soft_minimum(abs_y - 0.40, -1.80 - x, z - 0.785, 0.955 - z)
+    # the height of the dark lower edge, which is larger at the back
+    valance_height = np.where(x < -1.6, 0.13, 0.075)
     return {
         "cabin": 0.72 * (1.0 - _cabin_radius(x, y)),
         "front arch": _inside_arch(AXLES[0], abs_y, x, z),
         "rear arch": _inside_arch(AXLES[1], abs_y, x, z),
-        "headlight": np.where(x > 1.2, _inside_headlight(abs_y, x, z), ELSEWHERE),
-        "taillight": np.where(
-            x < -1.0,
-            _softest(abs_y - 0.40, -1.80 - x, z - 0.785, 0.955 - z),
-            ELSEWHERE,
-        ),
+        "headlight": np.where(x > 1.2, headlight, OUTSIDE),
+        "taillight": np.where(x < -1.0, taillight, OUTSIDE),
         **_inside_grilles(abs_y, x, z),
-        # the dark lower edge, higher at the back
-        "valance": _BOTTOM(x) + np.where(x < -1.6, 0.13, 0.075) - z,
+        "valance": _bottom_z(x) + valance_height - z,
         **_inside_windows(abs_y, x, z),
     }
 
@@ -296,15 +309,17 @@ def _inside_grilles(abs_y: Array, x: Array, z: Array) -> dict[str, Array]:
         abs_y, x, z: coordinates of the points (N,); y without its sign, as a car is
             symmetric.
     """
-    low_grille = _softest(
+    # distances to the side, to the lower edge and to the upper edge
+    low_grille = _soft_minimum(
         0.62 - abs_y, z - 0.24 + 0.02 * abs_y, 0.37 - 0.02 * abs_y - z
     )
-    high_grille = _softest(
+    high_grille = _soft_minimum(
         0.41 - abs_y, z - 0.5 - 0.04 * abs_y, 0.64 + 0.04 * abs_y - z
     )
+    is_front = x > 1.5
     return {
-        "low grille": np.where(x > 1.5, low_grille, ELSEWHERE),
-        "high grille": np.where(x > 1.5, high_grille, ELSEWHERE),
+        "low grille": np.where(is_front, low_grille, OUTSIDE),
+        "high grille": np.where(is_front, high_grille, OUTSIDE),
     }
 
 
@@ -315,32 +330,43 @@ def _inside_windows(abs_y: Array, x: Array, z: Array) -> dict[str, Array]:
         abs_y, x, z: coordinates of the points (N,); y without its sign, as a car is
             symmetric.
     """
-    # about half the cabin's width at each height
+    # approximately half the cabin's width at each height
     half_width = np.interp(z, [0.93, 1.15, 1.36], [0.795, 0.735, 0.668])
-    windscreen = _softest(0.85 * half_width - abs_y, 1.36 - z)
-    rear_window = _softest(0.86 * half_width - abs_y, z - 1.045, 1.325 - z)
-    sill = _WAIST(x) + 0.04
-    lintel = sill + 0.83 * (_ROOF(x) - sill)
-    # distances behind the slanted line of the windscreen's pillar, and before that of
-    # the rear one
-    behind_pillar = (0.60 - x) * 0.58 - (z - 0.93) * 0.81
+
+    # Each distance is that to one edge of a window, positive inside.
+    windscreen = _soft_minimum(0.85 * half_width - abs_y, 1.36 - z)
+    rear_window = _soft_minimum(0.86 * half_width - abs_y, z - 1.045, 1.325 - z)
+
+    # The side windows lie between two heights and two slanted pillars. A pillar is a
+    # line in the x-z plane: the distance of a point is (point - point of the line) .
+    # normal.
+    lower_edge = _waist_z(x) + 0.04
+    upper_edge = lower_edge + 0.83 * (_roof_z(x) - lower_edge)
+    behind_front_pillar = (0.60 - x) * 0.58 - (z - 0.93) * 0.81
     before_rear_pillar = (x + 1.62) * 0.72 - (z - 0.98) * 0.69
-    side_windows = _softest(behind_pillar, before_rear_pillar, z - sill, lintel - z)
+    side_windows = _soft_minimum(
+        behind_front_pillar, before_rear_pillar, z - lower_edge, upper_edge - z
+    )
+
+    is_front = x > 0.0
+    is_rear = x < -1.5
+    is_side = abs_y > 0.45
     return {
-        "windscreen": np.where(x > 0.0, windscreen, ELSEWHERE),
-        "rear window": np.where(x < -1.5, rear_window, ELSEWHERE),
-        "side windows": np.where(abs_y > 0.45, side_windows, ELSEWHERE),
+        "windscreen": np.where(is_front, windscreen, OUTSIDE),
+        "rear window": np.where(is_rear, rear_window, OUTSIDE),
+        "side windows": np.where(is_side, side_windows, OUTSIDE),
     }
 
 
 def _inside_headlight(abs_y: Array, x: Array, z: Array) -> Array:
-    """Return how far points lie inside the outline of the headlights, seen from the
-    front.
+    """Return how far points lie inside the outline of the headlights.
 
     Arguments and result are (N,); `abs_y` is the distance from the middle of the car.
     """
-    lamp = abs_y - 0.42
-    return _softest(lamp, x - 1.66, z - (0.565 + 0.1 * lamp), 0.665 + 0.2 * lamp - z)
+    from_inner_edge = abs_y - 0.42
+    lower_edge = 0.565 + 0.1 * from_inner_edge
+    upper_edge = 0.665 + 0.2 * from_inner_edge
+    return _soft_minimum(from_inner_edge, x - 1.66, z - lower_edge, upper_edge - z)
 
 
 def _cabin_radius(x: Array, y: Array) -> Array:
@@ -361,7 +387,7 @@ def _inside_arch(axle: float, abs_y: Array, x: Array, z: Array) -> Array:
     Arguments and result are (N,); `axle` is its x, and `abs_y` the distance from the
     middle of the car.
     """
-    return np.where(abs_y > 0.4, ARCH - np.hypot(x - axle, z - WHEEL), ELSEWHERE)
+    return np.where(abs_y > 0.4, ARCH - np.hypot(x - axle, z - WHEEL), OUTSIDE)
 
 
 OPENINGS: dict[str, dict[str, str | None]] = {
@@ -377,7 +403,10 @@ OPENINGS: dict[str, dict[str, str | None]] = {
     },
     "cabin": dict.fromkeys(("windscreen", "rear window", "side windows"), "glass"),
 }
-"""What is carved out of the body and out of the cabin, and what it becomes."""
+"""Openings of the body and of the cabin, with the tags that they get.
+
+An opening without a tag (None) is removed.
+"""
 
 
 def _opening(name: str) -> shapes.Field:
@@ -427,18 +456,20 @@ def _wheels() -> list[Patch]:
     """Create the four wheels: one wheel, copied to its positions."""
     wheel = _wheel()
     patches = []
-    for axle, side in WHEELS:
-        # The wheel's axis is laid along y, outwards; then the wheel rolls a little.
-        turn = shapes.rotation("y", 17.0 * axle) @ shapes.rotation("x", -90.0 * side)
-        center = (axle, side * (0.852 - TYRE / 2), WHEEL)
-        patches += shapes.transform_patches(wheel, turn, center)
+    for axle_x, side in WHEEL_POSITIONS:
+        # The wheel's axis is laid along y, outwards. Then the wheel rolls a little:
+        # front and rear wheels by different angles, so that their spokes differ.
+        outwards = shapes.rotation("x", -90.0 * side)
+        rolled = shapes.rotation("y", 17.0 * axle_x)
+        center = (axle_x, side * (WHEEL_SIDE - TYRE / 2), WHEEL)
+        patches += shapes.transform_patches(wheel, rolled @ outwards, center)
     return patches
 
 
 def _wheel() -> list[Patch]:
     """Create a wheel around the z axis, its outer side up: tyre, rim, spokes and hub."""
-    outer_z = TYRE / 2  # of the outer side; 0 is the middle of the tyre
-    ground_z = outer_z - 0.06  # of the dark ground behind the spokes
+    outer_z = TYRE / 2  # z of the outer side; 0 is the middle of the tyre
+    ground_z = outer_z - 0.06  # z of the dark disc behind the spokes
     # profiles of points (r, z)
     rim_edge = [
         (RIM, outer_z - 0.008),
@@ -507,8 +538,8 @@ def _tyre_profile(rim: float, outer_z: float) -> list[tuple[float, float]]:
 def _wells() -> list[Patch]:
     """Create the insides of the four wheel arches, and the floor of the car."""
     patches = []
-    for axle, side in WHEELS:
-        patches += _well(axle, side)
+    for axle_x, side in WHEEL_POSITIONS:
+        patches += _well(axle_x, side)
     x, y = _outline(
         np.linspace(np.pi, -np.pi, 41)[:-1],
         front=1.97,
@@ -522,27 +553,30 @@ def _wells() -> list[Patch]:
 
 
 def _well(axle: float, side: float) -> list[Patch]:
-    """Create the inside of a wheel arch: a curved wall, and a flat one farther in.
+    """Create the inside of a wheel arch: a curved wall, and a flat wall at its inner end.
 
     Args:
         axle: x of the axle.
         side: 1 at +y, -1 at -y.
     """
-    # around the axle: from below it at the front, over the top, to below it at the rear
+    # 240 degrees around the axle, from below it at the front over the top to the rear
     angle = np.radians(np.linspace(-30.0, 210.0, 17))
     outwards = np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=1)
     arc = np.array([axle, 0.0, WHEEL]) + ARCH * outwards
-    # the edges of the curved wall: in the car's side, and farther in
+    # the edges of the curved wall: in the side of the car, and at its inner end
     outer_edge = arc + np.array([0.0, side * 0.79, 0.0])
     inner_edge = arc + np.array([0.0, side * 0.56, 0.0])
     edges = np.stack([outer_edge, inner_edge])
-    if side > 0:  # so that the faces of both sides look towards the wheel
+    # The order of points decides to which side faces look. At +y both parts are
+    # reversed, so that they look towards the wheel there, too.
+    if side > 0:
         edges = edges[::-1]
         inner_edge = inner_edge[::-1]
     curved_wall = shapes.grid(
         "well",
         edges,
         np.broadcast_to(-outwards, edges.shape),
+        # 4.2 radians are 240 degrees; the chart may be larger than the wall is deep
         size=(ARCH * 4.2, 0.32),
         down=np.array([0.0, 1.0]),
         across=np.linspace(0.0, 1.0, len(angle)),
@@ -687,7 +721,7 @@ def _lamps(t: Texels) -> Array:
     """Paint headlights: two bright lamps on each side, with dark rings around them."""
     _, y, z = t.xyz.T
     abs_y = np.abs(y)
-    # from the middle of the nearer lamp
+    # distance from the middle of the nearer lamp
     lamp_distance = np.minimum(
         np.hypot(abs_y - 0.58, z - 0.62), np.hypot(abs_y - 0.71, z - 0.64)
     )
@@ -714,9 +748,10 @@ def _slats(t: Texels) -> Array:
 
 @painter
 def _plate(t: Texels, ground: Array) -> Array:
-    """Paint a licence plate: dark strokes on a light ground, which are nobody's number.
+    """Paint a licence plate: dark strokes on a light ground, which are no real number.
 
-    It has eight cells along y, and the fourth one is empty.
+    It has eight cells along y, and the fourth one is empty. Each other cell has a sign
+    of two upright strokes and two bars between them.
     """
     # from -1 to 1 over the plate, which is painted before it is moved to its position
     y = t.xyz[:, 1] / 0.26
@@ -724,12 +759,11 @@ def _plate(t: Texels, ground: Array) -> Array:
     cell = (y + 0.86) / 0.215  # 8 cells from -0.86 to 0.86
     is_within_margin = (np.abs(y) < 0.86) & (np.abs(z) < 0.62)
     is_filled = np.floor(cell) != 3
-    has_strokes = is_within_margin & is_filled & (t.xyz[:, 0] > -1.0)
-    # from the middle of a cell: two upright strokes, and two bars between them
+    # distance from the middle of the cell, in units of its width
     from_middle = np.abs(cell % 1.0 - 0.5)
     is_upright = np.abs(from_middle - 0.27) < 0.09
     is_bar = (from_middle < 0.3) & (np.abs(np.abs(z) - 0.5) < 0.13)
-    strokes = has_strokes & (is_upright | is_bar)
+    strokes = is_within_margin & is_filled & (is_upright | is_bar)
     return mix(ground, parse_hex_color("16181c"), strokes.astype(np.float64))
 
 
@@ -747,6 +781,7 @@ FINISHES = {
 }
 
 
+# built in metres; the texture is 384 texels wide
 @family(metres=1.0, texels=384)
 def car(sampler: ParameterSampler) -> Instance:
     """Make a car of random proportions and paint.
@@ -780,9 +815,9 @@ def car(sampler: ParameterSampler) -> Instance:
     return Instance(
         shapes.stretch_patches(patches, stretch),
         paints,
-        material=FINISHES["paint"],
-        # Fewer texels per length than for the paint where little is seen; more for the
-        # words on the plate.
+        material=FINISHES["paint"],  # the main one; `finishes` has one for each tag
+        # texels per length, relative to the paint: fewer for parts that are hardly
+        # visible, more for the signs on the plate
         texel_density={
             "rubber": 0.3,
             "well": 0.15,
@@ -791,5 +826,5 @@ def car(sampler: ParameterSampler) -> Instance:
             "plate": 3.0,
         },
         finishes=FINISHES,
-        drives=True,
+        drives=True,  # it can move along a path as a vehicle does
     )

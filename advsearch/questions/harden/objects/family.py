@@ -21,11 +21,11 @@ from advsearch.questions.harden.objects.textures import Paint, ParameterSampler,
 DEFAULT_ATLAS_SIZE = 256
 """Default width of the atlas in texels."""
 N_BISECTIONS = 12
-"""Steps by which the largest scale of the charts is found."""
+"""Steps of the search for the largest scale of the charts."""
 GUTTER = 2
 """Texels around each chart, on every side."""
 DECIMALS = 6
-"""Coordinates are rounded to these: machines differ in the last bits of a sine."""
+"""Decimals of rounded coordinates: machines differ in the last bits of a sine."""
 
 
 @dataclass(frozen=True)
@@ -59,14 +59,12 @@ def _shelves(
 ) -> list[AtlasRectangle] | None:
     """Pack rectangles on shelves of a square; None if they do not fit.
 
-    The highest comes first. A rectangle goes on the lowest shelf that has room for it,
-    or opens a new shelf on top of the others.
-
-    The first shelf that has room is taken, which is not always the best packing, but
-    gives the same result on every machine.
+    The highest rectangle comes first. A rectangle goes on the lowest shelf that has room
+    for it, or opens a new shelf on top of the others. This is not always the best
+    packing, but the same on every machine.
 
     Args:
-        sizes: (width, height) of each, width >= height, in object units.
+        sizes: (width, height) of each rectangle, width >= height, in object units.
         scale: texels per unit.
         side: side of the square in texels.
 
@@ -76,7 +74,7 @@ def _shelves(
     texel_sizes = [
         (_to_texels(width, scale), _to_texels(height, scale)) for width, height in sizes
     ]
-    # by falling height, then width; equal ones stay in their order
+    # by decreasing height, then width; equal rectangles stay in their order
     highest_first = sorted(
         range(len(sizes)),
         key=lambda index: (-texel_sizes[index][1], -texel_sizes[index][0], index),
@@ -89,9 +87,9 @@ def _shelves(
         if width > side:
             return None
         # Every shelf is high enough, as the highest rectangles come first.
-        fitting = [shelf for shelf in shelves if shelf.filled + width <= side]
-        if fitting:
-            shelf = fitting[0]
+        fitting_shelves = [shelf for shelf in shelves if shelf.filled + width <= side]
+        if fitting_shelves:
+            shelf = fitting_shelves[0]
         elif top + height <= side:
             shelf = _Shelf(bottom=top, height=height, filled=0)
             shelves.append(shelf)
@@ -181,12 +179,13 @@ def paint_atlas(
         ]
         image[area] = color.reshape(rectangle.height, rectangle.width, 3)
         is_used[area] = True
-    # one color everywhere else, and rounded as machines differ in the last bits
+    # The rest gets the mean color. All values are rounded, since machines differ in the
+    # last bits.
     image[~is_used] = np.round(image[is_used].mean(axis=0), 2)
     top_down = image[::-1]
     # rounded to 4 decimals first, so that all machines round halves to the same level
     stable_levels = np.round(top_down * 255.0, 4)
-    # The conversion to integers cuts: with 1/2 added it rounds.
+    # The conversion to integers truncates: with 1/2 added it rounds.
     levels = np.clip(stable_levels + 0.5, 0.5, 255.5).astype(np.uint8)
     return np.asarray(levels.astype(np.float32) / np.float32(255.0))
 
@@ -214,10 +213,10 @@ def join_patches(
     rectangles: Sequence[AtlasRectangle],
     side: int = DEFAULT_ATLAS_SIZE,
 ) -> assets.Mesh:
-    """Join patches into a mesh of largest extent 1, centered and standing on z = 0.
+    """Join patches into a mesh with a largest extent of 1 that stands on z = 0.
 
-    Every value is rounded to `DECIMALS` decimals, so that all machines make the same
-    file.
+    It is centered in x and y. Every value is rounded to `DECIMALS` decimals, so that
+    all machines make the same file.
 
     Args:
         patches: patches of the object.
@@ -236,18 +235,18 @@ def join_patches(
     uvs = np.concatenate(all_uvs)
     normals = np.concatenate([patch.normals for patch in patches])
     vertices = np.concatenate([patch.vertices for patch in patches])
+    # the point below the center, at the lowest height, and the largest extent
     origin, extent = assets.find_footing(vertices)
     vertices = (vertices - origin) / extent
-    # Some vertices at poles belong to no triangle. They are removed, and the indices of
-    # the others are renumbered without gaps.
-    # No triangle uses some vertices at poles.
+    # Some vertices at poles belong to no triangle. They are removed, and the others are
+    # numbered without gaps.
     used = np.unique(faces)
     renumbered_faces = np.searchsorted(used, faces).astype(np.uint32)
     return assets.Mesh(
-        _exact(vertices[used]),
+        _round_exactly(vertices[used]),
         renumbered_faces,
-        _exact(normals[used]),
-        _exact(np.clip(uvs[used], 0.0, 1.0)),
+        _round_exactly(normals[used]),
+        _round_exactly(np.clip(uvs[used], 0.0, 1.0)),
     )
 
 
@@ -261,9 +260,10 @@ def _atlas_coordinates(patch: Patch, rectangle: AtlasRectangle, side: int) -> Ar
     return np.asarray((corner + GUTTER + chart_uvs * inner_size) / side)
 
 
-def _exact(values: Array) -> npt.NDArray[np.float32]:
-    """Round to `DECIMALS`, without negative zeros."""
-    return (np.round(values, DECIMALS) + 0.0).astype(np.float32)
+def _round_exactly(values: Array) -> npt.NDArray[np.float32]:
+    """Round values to `DECIMALS` decimals, with 0 instead of -0."""
+    rounded = np.round(values, DECIMALS)
+    return (rounded + 0.0).astype(np.float32)  # -0.0 + 0.0 is 0.0
 
 
 # ---- families
@@ -275,15 +275,16 @@ class Instance:
     """A member of a family before its texture is baked.
 
     Attributes:
-        patches: the surface.
+        patches: patches of the surface.
         paints: a paint for every tag of the patches.
-        material: the other surface parameters.
+        material: parameters of the surface other than its color.
         texel_density: texels per length by tag, relative to the rest of the object:
-            less for parts that are hardly visible.
-        finishes: materials by tag, of an object of several materials; its tags are then
+            lower for parts that are hardly visible.
+        finishes: materials by tag, if the object has several; then its tags are the
             names of materials.
-        rig: moves the vertices of all patches, in the order of the patches.
-        drives: as `ObjectAsset.drives`.
+        rig: moves the vertices of all patches, in the order of the patches; None if the
+            object has no pose.
+        drives: whether it moves as a vehicle does, see `ObjectAsset.drives`.
     """
 
     patches: Sequence[Patch]
@@ -301,9 +302,9 @@ class ObjectFamily:
 
     Attributes:
         name: name of the class, usable on the command line.
-        make: builds an instance from a `ParameterSampler`.
-        size_in_metres: length of the unit in which it is built.
-        texels: width of its texture.
+        make: function that builds an instance from a `ParameterSampler`.
+        size_in_metres: length of the unit in which instances are built, in metres.
+        texels: width of the texture.
     """
 
     name: str
@@ -313,13 +314,13 @@ class ObjectFamily:
 
     @property
     def label(self) -> str:
-        """The class in words: the name with spaces for hyphens."""
+        """Label of the class: the name with spaces instead of hyphens."""
         return self.name.replace("-", " ")
 
     def generate(self, rng: np.random.Generator | None) -> assets.ObjectAsset:
-        """Return the canonical instance (None), or a random one.
+        """Return the canonical instance, or a random one.
 
-        The mesh has largest extent 1 and rests on z = 0. The same state of the
+        The mesh has a largest extent of 1 and stands on z = 0. The same state of the
         generator gives the same asset.
 
         Args:
@@ -348,9 +349,9 @@ class ObjectFamily:
             material=instance.material,
             label=self.label,
             source=workbench.library.BUNDLED_OBJECT,
-            # `size_in_metres` is the length of one unit of the patches.
             surface=surface,
             finishes=instance.finishes,
+            # The size of the object is its extent times the length of a unit.
             size_in_metres=round(float(extent) * self.size_in_metres, 4),
             drives=instance.drives,
         )
@@ -367,9 +368,10 @@ def _scale_charts(instance: Instance) -> list[tuple[float, float]]:
 
 
 def _sort_by_material(instance: Instance) -> Instance:
-    """Return the instance with its patches sorted by material.
+    """Return an instance with `finishes` with its patches sorted by material.
 
-    Materials come in the order in which they are used first.
+    Tags of patches are then names of materials. Materials come in the order in which
+    they are used first.
     """
     tags = list(dict.fromkeys(patch.tag for patch in instance.patches))
     patches = sorted(instance.patches, key=lambda patch: tags.index(patch.tag))
@@ -377,7 +379,7 @@ def _sort_by_material(instance: Instance) -> Instance:
 
 
 def _faces_by_material(patches: Sequence[Patch]) -> dict[str, assets.IntArray]:
-    """Return the indices of the faces of each tag in the joined mesh."""
+    """Return the indices of the faces of each material, a tag, in the joined mesh."""
     tag_of_face = np.repeat(
         [patch.tag for patch in patches], [len(patch.faces) for patch in patches]
     )
@@ -390,10 +392,10 @@ def _faces_by_material(patches: Sequence[Patch]) -> dict[str, assets.IntArray]:
 def family(
     metres: float, texels: int = DEFAULT_ATLAS_SIZE
 ) -> Callable[[Callable[[ParameterSampler], Instance]], ObjectFamily]:
-    """Decorate a function that makes instances into a family of the function's name.
+    """Turn a function that makes instances into a family with the function's name.
 
     Args:
-        metres: length of the unit of its instances.
+        metres: length in metres of the unit in which instances are built.
         texels: width of their texture.
     """
     return lambda make: ObjectFamily(
@@ -410,10 +412,10 @@ def sample_material(
     """Sample a material: its roughness, seldom its clearcoat, and rarely a metal.
 
     Args:
-        sampler: samples it; the canonical instance has the values that are passed.
-        roughness: canonical value.
-        clearcoat: canonical value, which most others have, too.
-        spread: how far the roughness may be from its canonical value.
+        sampler: samples the values; the canonical instance has those that are passed.
+        roughness: canonical roughness.
+        clearcoat: canonical clearcoat, which most other instances have, too.
+        spread: maximum difference from the canonical roughness.
     """
     sampled_roughness = sampler(
         roughness, low=roughness - spread, high=roughness + spread
@@ -426,7 +428,7 @@ def sample_material(
     if sampler.chance(0.06):
         metallic = sampler(0.0, low=0.3, high=0.8)
     values = {
-        # neither a mirror, whose reflections are noisy, nor completely dull
+        # no mirror, whose reflections would be noisy, and not completely dull
         "roughness": min(max(sampled_roughness, 0.12), 0.95),
         "metallic": metallic,
         "specular": sampler(0.5, low=0.3, high=0.7),

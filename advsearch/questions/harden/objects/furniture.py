@@ -31,18 +31,18 @@ from advsearch.questions.harden.objects.textures import (
 
 Point = tuple[float, float, float]
 LEG_INSET = 0.4
-"""Distance from a leg's outside to the edge of the seat."""
+"""Distance from the outside of a leg to the edge of the seat."""
 
 
 class _Legs(NamedTuple):
-    """The legs of a chair; posts of its back continue the two at -x upwards.
+    """The legs of a chair. The two at -x are continued by the posts of its back.
 
     Attributes:
         x, y: position of the top of the leg at +x and +y; the others mirror it.
-        splay: by how much a foot lies farther out than its top, along x and y.
+        splay: how much farther out a foot is than the top of its leg, along x and y.
         radius: radius at the top.
         foot_radius: radius at the floor.
-        section: (M, 2), for a radius of 1.
+        section: section of a leg (M, 2), for a radius of 1.
     """
 
     x: float
@@ -74,9 +74,9 @@ def _post(
     return shapes.sweep(tag, path, section, scale, first=first_axis, caps=True)
 
 
-@family(metres=0.01)
+@family(metres=0.01)  # built in centimeters
 def chair(sampler: ParameterSampler) -> Instance:
-    """Make a chair that faces +x, with its back at -x.
+    """Make a chair that faces +x, with its back at -x, and turn it a little about z.
 
     Lengths are in centimeters, angles in degrees. `sampler(x, low=..., high=...)`
     returns x for the canonical chair and a uniform sample for a random one.
@@ -88,7 +88,7 @@ def chair(sampler: ParameterSampler) -> Instance:
     seat_thickness = sampler(3.6, low=2.4, high=5.5)
     leg_radius = sampler(2.1, low=1.5, high=3.0)
     splay = sampler(1.5, low=0.0, high=6.0)
-    lean = sampler(5.0, low=1.0, high=11.0)
+    lean = sampler(5.0, low=1.0, high=11.0)  # how far the back's top is behind the seat
     section = _leg_section(sampler)
     legs = _Legs(
         x=depth / 2 - leg_radius - LEG_INSET,
@@ -249,7 +249,7 @@ class _ChairBack(NamedTuple):
     Attributes:
         bottom, top: heights of the seat, and of the top of the back.
         bottom_x: x at the height of the seat.
-        lean: by how much the top lies farther back (towards -x) than that.
+        lean: how far the top is behind (towards -x) `bottom_x`.
         width: width between the posts.
         board_thickness: thickness of the boards in it.
     """
@@ -307,7 +307,7 @@ def _chair_back(
         legs: legs that the posts continue upwards.
         seat_height: height of the upper side of the seat.
         total_height: height of the top of the back.
-        lean: by how much the top lies farther back than the seat.
+        lean: how far the top is behind the seat.
     """
     style = sampler.pick("slats", "ladder", "panel", "arch")
     back = _ChairBack(
@@ -596,7 +596,8 @@ def lamp(sampler: ParameterSampler) -> Instance:
     """Make a table lamp of random proportions, shade and base.
 
     Lengths are in centimeters. `sampler(x, low=..., high=...)` returns x for the
-    canonical lamp and a uniform sample for a random one.
+    canonical lamp and a uniform sample for a random one, and `sampler.pick` the first
+    choice or a random one.
     """
     total_height = sampler(48.0, low=42.0, high=58.0)
     shade_height = sampler(20.0, low=14.0, high=24.0)
@@ -611,7 +612,7 @@ def lamp(sampler: ParameterSampler) -> Instance:
     )
     foot_radius = sampler(7.4, low=6.0, high=9.5)
     stem_radius = sampler(0.8, low=0.6, high=1.3)
-    style = sampler.pick("body", "disc", "gourd")
+    style = sampler.pick("body", "disc", "gourd")  # style of the base
     # The base reaches into the shade, to just under the bulb.
     base_height = size.bottom + 0.25 * shade_height
     patches = _lamp_base(sampler, style, base_height, foot_radius, stem_radius)
@@ -628,7 +629,7 @@ def lamp(sampler: ParameterSampler) -> Instance:
         patches,
         _lamp_paints(sampler, size.bottom, total_height, style),
         sample_material(sampler, roughness=0.4, clearcoat=0.3),
-        texel_density={"lining": 0.6},
+        texel_density={"lining": 0.6},  # fewer texels: it is hardly visible
     )
 
 

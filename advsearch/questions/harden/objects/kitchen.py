@@ -37,7 +37,7 @@ VIEW_DEGREES = 118.0
 def _spout(sampler: ParameterSampler, radius: float, height: float) -> list[Patch]:
     """Create a spout along +x with an open, hollow end.
 
-    One closed ring is swept along the path to the tip, then over the lip and back down
+    A closed ring is swept along the path to the tip, then over the lip and back down
     the inside for a few points, where it shrinks to a point.
 
     Args:
@@ -72,8 +72,8 @@ def _spout_rings(outer_radii: Array) -> tuple[assets.IntArray, Array, Array]:
         path, its radius, and how far it lies ahead of that point.
     """
     tip = SPOUT_POINTS - 1
-    # Two rings round the lip at the tip; four go back down inside the wall; the last
-    # one closes the hollow.
+    # Two rings make the round lip at the tip, four go back down inside of the wall, and
+    # the last one closes the hollow.
     inside = [tip, tip - 1, tip - 2, tip - 3]
     ring_index = np.array([*range(SPOUT_POINTS), tip, tip, *inside, tip - 4])
     lip_radii = [outer_radii[tip] - 0.06, outer_radii[tip] - 0.12]
@@ -88,11 +88,11 @@ def _spout_rings(outer_radii: Array) -> tuple[assets.IntArray, Array, Array]:
 def _spout_path(sampler: ParameterSampler, radius: float, height: float) -> Array:
     """Sample the path of a spout in the x-z plane, from the body to the tip.
 
-    A curved one has the shape of an S: it bulges out and downwards in its lower half,
+    A curved spout has the shape of an S: it bulges out and downwards in its lower half,
     and is bent back a little before the tip.
 
     Args:
-        sampler: samples its style and its ends.
+        sampler: samples the style of the spout and its ends.
         radius, height: radius and height of the teapot's body.
 
     Returns:
@@ -178,11 +178,9 @@ def _lid_profile(
         sampler: samples the lid's dome and the knob's radius.
         mouth, height: radius and height of the mouth.
     """
-    # A ring of the outside, then rings of the inside: `ahead` is how far each is moved
-    # along the path.
     dome = sampler(1.5, low=0.7, high=2.4)
     knob_radius = sampler(1.0, low=0.7, high=1.4)
-    top = height + dome + 0.2  # of the lid
+    top = height + dome + 0.2  # height of the lid's top
     # over the edge of the mouth, with a narrow groove where the lid begins
     rim = [
         (mouth, height),
@@ -379,9 +377,9 @@ def _pan_handle(
 
     Args:
         sampler: samples its curve and its section.
-        root: where it begins (3,).
-        length: along x.
-        rise: by how much it is higher at its end, about.
+        root: point at which it begins (3,).
+        length: its length along x.
+        rise: approximate height of its end above the root.
     """
     end_rise = rise * sampler(1.05, low=0.8, high=1.2)
     knots = [(0.0, 0.0), (0.22 * length, 0.55 * rise), (0.6 * length, rise)]

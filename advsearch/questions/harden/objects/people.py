@@ -67,9 +67,11 @@ def _patches(person: Any) -> list[Patch]:
     reference = _reference_vertices(data)
     charts = data["charts"].astype(np.float64)
     faces = data["faces"].astype(np.int64)
-    # where the vertices and the faces of each chart begin
+    # Vertices and faces come chart by chart; the data has their counts. These are the
+    # indices of the first ones of each chart.
     first_vertex = np.cumsum([0, *data["points"]])
     first_face = np.cumsum([0, *data["triangles"]])
+    # A point of the body at a seam has a vertex in each of its charts.
     point_of_vertex = data["index"].astype(np.int64)
     normals = _smooth_normals(
         vertices, point_of_vertex, faces, first_vertex, first_face
@@ -85,6 +87,7 @@ def _patches(person: Any) -> list[Patch]:
                 uvs=charts[in_chart],
                 faces=faces[first_face[number] : first_face[number + 1]],
                 size=(float(data["sizes"][number][0]), float(data["sizes"][number][1])),
+                # The paint of a texel depends on its point of the reference body.
                 rest=_interpolate_chart(charts[in_chart], reference[in_chart]),
             )
         )
@@ -94,16 +97,18 @@ def _patches(person: Any) -> list[Patch]:
 def _reference_vertices(data: Any) -> Array:
     """Return the vertices (V, 3) of the reference body, in metres, standing on z = 0.
 
-    It is of one fixed phenotype, and stands as MakeHuman's body does.
+    It has a fixed phenotype, and stands as MakeHuman's body does. A body is the mean of
+    all bodies plus a sum over a basis, weighted by the shares of its phenotype.
 
     Args:
         data: the arrays of the file of bodies.
     """
     point_of_vertex = data["index"].astype(np.int64)
-    # the mean of all bodies, stored in tenths of millimetres, plus what the shares of
-    # the phenotype add
-    mean = data["mean"][point_of_vertex] * 1e-4
+    mean = data["mean"][point_of_vertex] * 1e-4  # stored in tenths of millimetres
+    # The table of shares has an axis for each property of the phenotype. This is the
+    # phenotype with index 1 along each.
     shares = data["shares"][1, 1, 1, 1]
+    # r: index of the basis; p: vertex; c: coordinate
     vertices = mean + np.einsum("r,rpc->pc", shares, data["basis"][:, point_of_vertex])
     vertices[:, 2] -= vertices[:, 2].min()
     return np.asarray(vertices)
@@ -166,10 +171,10 @@ def _woven(t: Texels, color: Array, depth: float) -> Array:
 def _jeans(t: Texels, color: Array) -> Array:
     """Paint woven cloth with seams down the legs and a hem at both ankles."""
     x, _, z = t.xyz.T
+    # On both legs, inside and outside, the seam is where x is 0.005.
     has_seam = (z < 0.88) & (z > 0.08)
-    far = 9.0  # metres; no seam
-    # The seam is in the plane x = 0.005.
-    seam_distance = np.where(has_seam, np.minimum(np.abs(x - 0.005), far), far)
+    far = 9.0  # a distance in metres that stands for no seam
+    seam_distance = np.where(has_seam, np.abs(x - 0.005), far)
     hem_distance = np.abs(z - 0.085)
     line = step(0.004 - np.minimum(seam_distance, hem_distance), 0.0, soft=0.003)
     return mix(_woven(color, depth=0.25)(t), 0.6 * color, 0.8 * line)
@@ -206,7 +211,7 @@ def _face(t: Texels, color: Array, hair: Array) -> Array:
     skin = mix(skin, cheek_color, 0.5 * step(in_cheeks, 0.0, soft=0.6))
 
     brow_height = 1.659 - 14.0 * (abs_y - 0.034) ** 2  # an arch over each eye
-    has_brow = is_front & (np.abs(abs_y - 0.034) < 0.021)  # over the eye
+    has_brow = is_front & (np.abs(abs_y - 0.034) < 0.021)  # above an eye
     in_brow = np.where(has_brow, 0.0038 - np.abs(z - brow_height), -1.0)
     return mix(skin, hair, 0.8 * step(in_brow, 0.0, soft=0.0015))
 
@@ -233,8 +238,8 @@ def _irises(t: Texels, color: Array) -> Array:
     metres.
     """
     x, y, z = t.xyz.T
-    middle_z = float(0.5 * (z.min() + z.max()))  # of the eyes
-    # from the nearest pupil; all that is not at the front is white
+    middle_z = float(0.5 * (z.min() + z.max()))  # height of the eyes' middle
+    # distance from the nearest pupil; all that is not at the front is white
     is_front = x > 0.128
     pupil_distance = np.where(is_front, np.hypot(np.abs(y) - 0.031, z - middle_z), 1.0)
     iris = step(0.0065 - pupil_distance, 0.0, soft=0.001)

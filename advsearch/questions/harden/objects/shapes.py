@@ -1,10 +1,9 @@
-"""Geometric primitives of the bundled objects: patches with a chart of the texture
-each.
+"""Geometric primitives of the bundled objects: patches, each with a chart.
 
-A `Patch` is a piece of mesh with local texture coordinates in [0, 1]^2 and a function
-that says which point of the surface a texture coordinate is, so that textures are
-painted in object coordinates and meet without seams. Everything is float64 and z up;
-lengths are in whatever unit the object was written in (centimetres, mostly). Faces are
+A `Patch` is a piece of a mesh. Its chart is a rectangle of the texture, with chart
+coordinates in [0, 1]^2. A function maps chart coordinates to points of the surface, so
+that textures are painted in object coordinates and have no visible seams. Everything is
+float64, with z up. Lengths are in the unit of the object, mostly centimetres. Faces are
 counter-clockwise seen from outside, and the charts are not mirrored.
 """
 
@@ -171,7 +170,8 @@ def polygon(sides: int, bevel: float = 0.12, steps: int = 2) -> Array:
 
     Its circumradius is 1, and a flat side is at the bottom.
     """
-    # two corners more than there are: the outermost are not rounded, and cut off
+    # The first and last corner are not rounded. So the polygon is continued by two more
+    # corners, and these two are cut off.
     angle = 2 * np.pi * (np.arange(sides + 2) - 0.5) / sides - np.pi / 2
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return round_corners(ring, radius=bevel, steps=steps)[1:-1]
@@ -212,7 +212,7 @@ def ellipse(half_width: float, half_height: float, count: int = 20) -> Array:
 
 ChartToPoints = Callable[[Array, Array], Array]
 HARD_ANGLE = 40.0
-"""Degrees; where two parts of a profile meet at more, the edge stays hard."""
+"""Angle in degrees. If two parts of a profile meet at more, their edge stays hard."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,14 +220,16 @@ class Patch:
     """A piece of surface with one chart.
 
     Attributes:
-        tag: selects the paint; any string. It is the same in all functions here.
+        tag: any string, which selects the paint. In all functions of this module `tag`
+            has this meaning.
         vertices: positions (V, 3).
         normals: unit normals (V, 3), outwards.
         uvs: chart coordinates (V, 2) in [0, 1].
         faces: vertex indices (F, 3).
-        size: width and height of the chart in object units, which its size in the atlas
-            follows from.
-        rest: maps u (N,) and v (N,) to surface points (N, 3) before any transform.
+        size: width and height of the chart in object units, which decide its size in
+            the atlas.
+        rest: maps u (N,) and v (N,) to surface points (N, 3) before any transform. The
+            patch is painted at these points.
     """
 
     tag: str
@@ -244,12 +246,14 @@ def transform_patches(
     rotation: Array | None = None,
     offset: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> list[Patch]:
-    """Rotate patches, then translate them, together with what is painted on them.
+    """Return patches rotated and then translated.
+
+    Their paint moves with them, because it depends on `rest`, which stays.
 
     Args:
         patches: patches to move; they are not changed.
         rotation: matrix (3, 3); None for no rotation.
-        offset: (3,).
+        offset: translation (3,).
     """
     matrix = np.eye(3) if rotation is None else rotation
     translation = np.asarray(offset, dtype=np.float64)
@@ -266,7 +270,10 @@ def transform_patches(
 def stretch_patches(
     patches: Iterable[Patch], factors: Sequence[float] | Array
 ) -> list[Patch]:
-    """Scale patches along x, y and z, with what is painted on them."""
+    """Return patches scaled along x, y and z.
+
+    Their paint is scaled with them, because it depends on `rest`, which stays.
+    """
     scale = np.asarray(factors, dtype=np.float64)
     return [
         replace(
@@ -343,18 +350,14 @@ def _grid_faces(vertices: Array, rows: int, columns: int) -> assets.IntArray:
 
 
 def _along(curve: Array) -> tuple[Array, float]:
-    """Return the arc lengths (K,) of a polyline as fractions of its length, and the
-    length.
-    """
+    """Return the arc lengths (K,) of a polyline as fractions, and its total length."""
     arc_length = arc_lengths(curve)
     return arc_length / arc_length[-1], float(arc_length[-1])
 
 
 def _fan(count: int) -> assets.IntArray:
-    """Return the faces (count, 3) between vertex 0 and a ring of `count` vertices after
-    it.
-    """
-    index = np.arange(count)  # of the vertices of the ring
+    """Return the faces (count, 3) between vertex 0 and a ring of the next vertices."""
+    index = np.arange(count)  # indices within the ring
     following = (index + 1) % count
     faces = np.stack([np.zeros_like(index), 1 + index, 1 + following], axis=1)
     return faces.astype(np.int64)
@@ -419,35 +422,46 @@ def _around(curve: Array, theta: Array) -> Array:
 def _disc(tag: str, profile: Array, normals: Array, columns: int) -> Patch:
     """Create a piece of a surface of revolution that starts or ends on the axis.
 
-    Its chart is a disc with the pole in the middle; the distance from there is the arc
-    length along the profile, as a fraction of the whole.
+    Its chart is a disc with the pole in the middle. The distance from the pole in the
+    chart is the arc length along the profile, as a fraction.
 
     Args:
         tag: tag of the paint.
         profile: (K, 2) points (r, z).
         normals: (K, 2), as (r, z), at these points.
-        columns: faces around.
+        columns: number of faces around the axis.
     """
-    # A profile that ends on the axis faces up; one that begins there faces down.
-    # 1e-9 stands for 0: the end of the profile is on the axis.
+    # A profile that ends on the axis (r is 0) faces up; one that begins there faces
+    # down. Here both curve and normals begin on the axis.
     faces_up = profile[-1, 0] < 1e-9
-    from_axis = slice(None, None, -1) if faces_up else slice(None)
-    curve = profile[from_axis]
-    mirror = 1.0 if faces_up else -1.0  # of the chart, seen from above
+    curve = profile
+    curve_normals = normals
+    if faces_up:
+        curve = profile[::-1]
+        curve_normals = normals[::-1]
+
+    # A disc that faces down is seen from below. There x has the other direction: so its
+    # chart is mirrored, and its triangles have the reverse order.
+    triangles = _disc_triangles(columns, curve)
+    chart_x_sign = 1.0
+    if not faces_up:
+        triangles = triangles[:, ::-1]
+        chart_x_sign = -1.0
+
     radial_fraction, length = _along(curve)
     theta = 2 * np.pi * np.arange(columns) / columns
     chart_radius = 0.5 * radial_fraction[1:, None]
     ring_uvs = [
-        0.5 + chart_radius * mirror * np.cos(theta),
+        0.5 + chart_radius * chart_x_sign * np.cos(theta),
         0.5 + chart_radius * np.sin(theta),
     ]
-    uvs = np.concatenate([[[0.5, 0.5]], np.stack(ring_uvs, axis=-1).reshape(-1, 2)])
-    triangles = _disc_triangles(columns, curve)
+    pole_uv = [[0.5, 0.5]]
+    uvs = np.concatenate([pole_uv, np.stack(ring_uvs, axis=-1).reshape(-1, 2)])
 
     def rest(u: Array, v: Array) -> Array:
         """Return the points (N, 3) at chart coordinates (N,)."""
-        # The chart is [0, 1] x [0, 1]; here its disc has radius 1 around the pole.
-        x = (2 * u - 1) * mirror
+        # from [0, 1] to [-1, 1], so that the disc has radius 1 around the pole
+        x = (2 * u - 1) * chart_x_sign
         y = 2 * v - 1
         # The corners of the chart are outside of the disc and get the color of its rim.
         pole_distance = np.minimum(np.hypot(x, y), 1.0)
@@ -459,9 +473,9 @@ def _disc(tag: str, profile: Array, normals: Array, columns: int) -> Patch:
     return Patch(
         tag=tag,
         vertices=_revolve_from_pole(curve, theta),
-        normals=_revolve_from_pole(normals[from_axis], theta),
+        normals=_revolve_from_pole(curve_normals, theta),
         uvs=uvs,
-        faces=triangles if faces_up else triangles[:, ::-1],
+        faces=triangles,
         size=(2 * length, 2 * length),
         rest=rest,
     )
@@ -516,7 +530,8 @@ def _wall(tag: str, profile: Array, normals: Array, columns: int) -> list[Patch]
     points = _around(profile, theta)
     normal = _around(normals, theta)
     down, length = _along(profile)
-    # a typical circumference: nearly the largest, whatever the profile does at its ends
+    # A typical circumference: at three quarters of the points the profile is narrower.
+    # A maximum would depend on single points, such as a lip.
     width = 2 * np.pi * float(np.quantile(profile[:, 0], 0.75))
     can_be_quartered = columns % 4 == 0
     n_pieces = 1
@@ -538,19 +553,22 @@ def lathe(profile: Sequence[tuple[str, Points]], columns: int = 56) -> list[Patc
     """Rotate a profile about the z axis.
 
     Args:
-        profile: consecutive pieces (tag, (K, 2) points (r, z)), walked with the
-            material on the left: along the bottom away from the axis, up the outside,
-            over the lip, down the inside. A piece becomes a disc where it is mostly
-            flat and touches the axis, a band otherwise.
-        columns: faces around the axis.
+        profile: consecutive pieces (tag, (K, 2) points (r, z)), in the order in which
+            the material is on the left: along the bottom away from the axis, up the
+            outside, over the lip, down the inside. A piece becomes a disc if it is
+            mostly flat and one of its ends is on the axis, otherwise a band.
+        columns: number of faces around the axis.
     """
     tags = [tag for tag, _ in profile]
     curves = [np.asarray(curve, dtype=np.float64) for _, curve in profile]
     patches = []
     for tag, curve, normals in zip(tags, curves, _profile_normals(curves), strict=True):
-        end_radii = (curve[0, 0], curve[-1, 0])
-        touches_axis = min(end_radii) < 1e-9 <= max(end_radii)
-        is_flat = abs(end_radii[1] - end_radii[0]) > 0.5 * _along(curve)[1]
+        starts_on_axis = curve[0, 0] < 1e-9  # a radius of 0, up to rounding
+        ends_on_axis = curve[-1, 0] < 1e-9
+        touches_axis = starts_on_axis != ends_on_axis  # with one of its ends
+        radius_change = abs(curve[-1, 0] - curve[0, 0])
+        _, length = _along(curve)
+        is_flat = radius_change > 0.5 * length
         if touches_axis and is_flat:
             patches.append(_disc(tag, curve, normals, columns))
         else:
@@ -570,7 +588,7 @@ def vessel(
             lip.
         wall: thickness of the wall.
         floor: height of the floor inside.
-        columns: faces around the axis.
+        columns: number of faces around the axis.
         step: longest edge along the profile.
     """
     normal, inner = _inner_profile(outside, wall)
@@ -620,12 +638,11 @@ def _bezier(start: Array, control: Array, end: Array) -> Array:
 
 
 def _inner_profile(outside: Array, wall: float) -> tuple[Array, Array]:
-    """Return the normals (K, 2) of a profile, and the inside of its wall from the lip
-    down.
+    """Return the normals (K, 2) of a profile, and the profile of the inside of its wall.
 
-    The inside is the profile moved inwards by the thickness of the wall. In tight bends
-    it would run backwards; the points that do so are removed, and again those that then
-    do, but never the last one.
+    The inside is the profile moved inwards by the thickness of the wall, from the lip
+    downwards. In tight bends it would run backwards. The points at which such a step
+    begins are removed, until no step runs backwards any more.
     """
     normal = _profile_normals([outside])[0]
     inner = outside - wall * normal
@@ -636,7 +653,9 @@ def _inner_profile(outside: Array, wall: float) -> tuple[Array, Array]:
         is_backward = (inner_steps * outer_steps).sum(axis=1) <= 0.0
         if not is_backward.any():
             break
-        remaining = np.append(remaining[:-1][~is_backward], remaining[-1])
+        # Each step begins at a point; the last point, at the lip, begins none and stays.
+        forward_starts = remaining[:-1][~is_backward]
+        remaining = np.append(forward_starts, remaining[-1])
     inner = inner[remaining][::-1]
     return normal, inner
 
@@ -644,7 +663,7 @@ def _inner_profile(outside: Array, wall: float) -> tuple[Array, Array]:
 def _round_lip(outside: Array, wall: float, normal: Array) -> Array:
     """Return five points (5, 2) of the half circle over the lip of a wall.
 
-    It leads from the outside to the inside; its ends are left out.
+    The half circle leads from the outside to the inside; its ends are left out.
 
     Args:
         outside: profile (K, 2) that ends at the lip.
@@ -693,8 +712,7 @@ def sphere(
 
 
 def compute_frames(path: Array, first: Sequence[float]) -> tuple[Array, Array, Array]:
-    """Return unit tangents and two normals along a path, with as little twist as
-    possible.
+    """Return unit tangents and two normals along a path, with minimal twist.
 
     Args:
         path: (N, 3).
@@ -707,7 +725,7 @@ def compute_frames(path: Array, first: Sequence[float]) -> tuple[Array, Array, A
     normal = np.empty_like(path)
     current = np.asarray(first, dtype=np.float64)
     for i, direction in enumerate(tangent):
-        # the normal before, less what of it is along the new tangent
+        # the previous normal without its component along the new tangent
         current = normalize(current - (current @ direction) * direction)
         normal[i] = current
     return tangent, normal, np.cross(tangent, normal)
@@ -730,10 +748,10 @@ def sweep(
         path: the centers of the section.
         section: (M, 2) counter-clockwise, coordinates along the first and second
             normal.
-        scale: one number, (N,) or (N, 2): the section's scale at each center; 0 closes
-            the surface in a point.
+        scale: a number, (N,) or (N, 2): the section's scale at each center, (N, 2) for
+            both axes of the section; 0 closes the surface in a point.
         first: direction (3,) of the section's first axis at the start of the path.
-        caps: close both ends with flat faces and a hard edge.
+        caps: whether both ends are closed with flat faces and a hard edge.
         frame: tangents and normals to use in place of `compute_frames(path, first)`.
     """
     centers = np.asarray(path, dtype=np.float64)
@@ -743,9 +761,10 @@ def sweep(
     scales = _to_axis_scales(scale, len(centers))
     points = _sweep_points(section, scales, centers, first_normal, second_normal)
     ring_fraction, ring_length = _along(_repeat_first(section, axis=0))
-    # nearly the largest circumference, whatever the scale is at the ends
-    # `scales.mean` is the mean of the two axes' scales at each center.
+    # A typical circumference: the mean scale of both axes is smaller at three quarters
+    # of the centers. The ends, which may shrink to a point, hardly matter.
     width = ring_length * float(np.quantile(scales.mean(axis=1), 0.75))
+    # distance along the path of each ring, for the chart's coordinate v
     down = mean_lengths(points)
     patches = [
         grid(
@@ -758,6 +777,8 @@ def sweep(
         )
     ]
     if caps:
+        # Rings are counter-clockwise seen from the end of the path. The first face is
+        # seen from the other side, so its ring is reversed.
         patches += [
             cap(tag, points[0][::-1], -tangent[0]),
             cap(tag, points[-1], tangent[-1]),
@@ -810,7 +831,7 @@ def _sweep_normals(points: Array, tangent: Array) -> Array:
     normals = np.cross(ring_tangent, np.gradient(points, axis=0))
     normal_length = np.linalg.norm(normals, axis=-1)
     normals = normalize(normals)
-    negligible_length = 1e-7 * float(normal_length.max())  # all points are one
+    negligible_length = 1e-7 * float(normal_length.max())  # the ring is a single point
     # outwards is backwards at the first ring, and forwards at the last
     for row, direction in ((0, -1.0), (-1, 1.0)):
         is_point = normal_length[row] < negligible_length
@@ -819,11 +840,10 @@ def _sweep_normals(points: Array, tangent: Array) -> Array:
 
 
 def mean_lengths(points: Array, axis: int = 0) -> Array:
-    """Return how far the rows of a grid of points (R, C, 3) are from the first one,
-    (R,).
+    """Return the lengths (R,) along a grid of points (R, C, 3) to each of its rows.
 
-    It is the length along the grid, and the mean over its columns. With axis 1 it is
-    that of the columns (C,), and the mean over rows.
+    They are arc lengths from the first row, averaged over the columns. With axis 1,
+    they are the lengths (C,) to each column, averaged over the rows.
     """
     steps = np.linalg.norm(np.diff(points, axis=axis), axis=-1).mean(axis=1 - axis)
     return np.concatenate([[0.0], np.cumsum(steps)])
@@ -882,14 +902,14 @@ def box(
     Args:
         tag: tag of the paint.
         center: center of the box.
-        size: along x, y and z.
+        size: extent along x, y and z.
         bevel: radius of the edges.
-        steps: cells across half of an edge's rounding; the other half belongs to the
-            next face.
-        cells: cells across the flat part of a face, along each of its axes.
+        steps: number of cells across half of an edge's rounding; the other half belongs
+            to the next face.
+        cells: number of cells across the flat part of a face, along each of its axes.
     """
     half = np.asarray(size, dtype=np.float64) / 2
-    # 0.95: a flat part, however small, must be left.
+    # With 0.95 a small flat part is left between the edges.
     bevel = min(bevel, 0.95 * float(half.min()))
     flat = half - bevel  # half the size of the flat parts
     coordinates = [
@@ -898,16 +918,18 @@ def box(
     ]
     patches = []
     for axis, side in product(range(3), (1.0, -1.0)):
-        # the two axes of the face
+        # the two axes of the face: columns follow i (chart coordinate u), rows j (v)
         i = (axis + 1) % 3
         j = (axis + 2) % 3
         normals, points = _rounded_face(
             axis, side, coordinates[i], coordinates[j], half, bevel
         )
+        # from coordinates in [-half, half] to [0, 1]
         down = (coordinates[j] + half[j]) / (2 * half[j])
         across = (coordinates[i] + half[i]) / (2 * half[i])
         if side < 0:
-            # `_rounded_face` turns the lower face around, and with it u
+            # `_rounded_face` returns the columns of a lower face in reverse order.
+            # Their u has to increase all the same.
             across = 1.0 - across[::-1]
         patches.append(
             grid(
@@ -925,17 +947,21 @@ def box(
 def _edge_coordinates(flat: float, bevel: float, steps: int, cells: int) -> Array:
     """Return ascending coordinates along an axis of a box's face, around its middle.
 
-    The rounded edges at both ends take equal angles of up to 45 degrees, where the next
-    face begins.
+    The cells of the rounded edges at both ends have equal angles. The rounding ends at
+    45 degrees, where the next face begins.
 
     Args:
         flat: half the length of the flat part.
         bevel: radius of the edges.
-        steps: cells across half of an edge's rounding.
-        cells: cells across the flat part.
+        steps: number of cells across half of an edge's rounding.
+        cells: number of cells across the flat part.
     """
-    edge = flat + bevel * np.tan(np.linspace(0.0, np.pi / 4, steps + 1))
-    return np.concatenate([-edge[:0:-1], np.linspace(-flat, flat, cells + 1), edge[1:]])
+    angle = np.linspace(0.0, np.pi / 4, steps + 1)
+    edge = flat + bevel * np.tan(angle)
+    upper_edge = edge[1:]  # without its start, which is the end of the flat part
+    lower_edge = -upper_edge[::-1]
+    flat_part = np.linspace(-flat, flat, cells + 1)
+    return np.concatenate([lower_edge, flat_part, upper_edge])
 
 
 def _rounded_face(
@@ -948,7 +974,7 @@ def _rounded_face(
 
     Args:
         axis: axis that the face is perpendicular to: 0, 1 or 2.
-        side: 1 of the upper face, -1 of the lower one.
+        side: 1 for the upper face, -1 for the lower one.
         u, v: coordinates (U,) and (V,) along the next two axes, `axis` + 1 and + 2.
         half: half the size of the box (3,).
         bevel: radius of the edges.
@@ -962,8 +988,8 @@ def _rounded_face(
     normals = normalize(sharp_points - core_points)
     points = core_points + bevel * normals
     if side < 0:
-        # The upper face, turned by half a turn about the axis of v, is the lower one:
-        # it still looks outwards.
+        # The lower face is the upper one, rotated by 180 degrees about the axis of v:
+        # so it looks outwards, too.
         points = points[:, ::-1].copy()
         normals = normals[:, ::-1].copy()
         points[..., axis] *= -1.0
@@ -973,32 +999,31 @@ def _rounded_face(
 
 # ---- cutting
 # ----------------------------------------------------------------------------------
-# Cutting patches along curves: what is carved out of a smooth surface becomes a part
-# with an edge of its own.
+# Cutting patches along curves. What is carved out of a smooth surface becomes a part of
+# its own.
 #
-# A curve is where a function of the surface's points is zero. Triangles that it crosses
-# are split there, so that the edge is as smooth as the function and not as coarse as
-# the grid.
+# A curve is where a function of the surface's points, a field, is zero. Triangles that
+# it crosses are split there, so that the cut is as smooth as the field and not as coarse
+# as the grid.
 
 
 Field = Callable[[Array], Array]
-"""Maps points (N, 3) to values (N,): about the distance to the edge, positive
-inside.
+"""Maps points (N, 3) to values (N,): approximate distances to the cut, positive inside.
 """
 SNAP = 0.1
 """Fraction of an edge's length within which a cut is moved to the edge's end.
 
-That avoids slivers.
+That avoids thin triangles.
 """
 
 
 def carve_patches(
     patches: Iterable[Patch], inside: Field, tag: str | None
 ) -> list[Patch]:
-    """Cut patches along the surface where a field is 0, and tag the inside anew.
+    """Cut patches along the curves where a field is 0, and change the tag of the inside.
 
     Args:
-        patches: smooth ones that are not transformed yet.
+        patches: smooth patches that are not transformed yet.
         inside: function of points (V, 3) that returns values (V,), which are positive
             inside the region to cut out. For example, a window in a car.
         tag: tag of the inside; None removes it.
@@ -1023,9 +1048,9 @@ def carve_patches(
 
 
 def _snap_to_vertices(patch: Patch, value: Array) -> Array:
-    """Set the value of a vertex to 0 where a cut is very near to it (`SNAP`).
+    """Set the value of a vertex to 0 if a cut is very near to it (`SNAP`).
 
-    The cut then goes through that vertex, which saves a sliver.
+    The cut then goes through that vertex, which avoids a thin triangle.
 
     Args:
         patch: the patch that is cut.
@@ -1084,9 +1109,8 @@ def _split(patch: Patch, value: Array) -> tuple[Patch, assets.BoolArray]:
     edges = _edges(patch)
     crossed_edges = edges[value[edges[:, 0]] * value[edges[:, 1]] < 0.0]
     first, second = crossed_edges.T
-    # where the value is 0, from the first vertex to the second
-    # Linear interpolation: value(first) + fraction * (value(second) - value(first)) =
-    # 0.
+    # The cut is where the value is 0, at a fraction of the edge from its first vertex:
+    # value(first) + fraction * (value(second) - value(first)) = 0.
     fraction = (value[first] / (value[first] - value[second]))[:, None]
 
     def add_cuts(attribute: Array) -> Array:

@@ -1,9 +1,8 @@
 """Procedural base colors: functions from surface points to display-referred sRGB.
 
-A `Paint` maps `Texels` to (N, 3) colors in [0, 1]. Painting in object coordinates
-(`xyz`) makes patterns run on across the edges of charts; painting in chart coordinates
-(`u`, `v` times `size`) suits patterns that should wrap around a part. Lengths are in
-the object's units.
+A `Paint` maps `Texels` to (N, 3) colors in [0, 1]. A pattern in object coordinates
+(`xyz`) continues across the edges of charts. A pattern in chart coordinates (`u`, `v`
+times `size`) wraps around a part. Lengths are in the object's units.
 """
 
 from __future__ import annotations
@@ -57,13 +56,11 @@ class ParameterSampler:
         return choices[int(self.rng.integers(len(choices)))]
 
     def chance(self, probability: float, canonical: bool = False) -> bool:
-        """Return True with a probability, or the canonical one."""
+        """Return True with a probability; without a generator `canonical`."""
         return canonical if self.rng is None else bool(self.rng.random() < probability)
 
     def offset(self) -> Array:
-        """Return an offset (3,) into the noise, so that no two instances have the same
-        clouds.
-        """
+        """Return an offset (3,) into the noise, so that instances have other clouds."""
         if self.rng is None:
             return np.array([1.7, 9.2, 5.5])
         return self.rng.uniform(0.0, 16.0, 3)
@@ -71,7 +68,7 @@ class ParameterSampler:
     def sample_color(
         self, canonical: str, *others: str, p_random: float = 0.4
     ) -> Color:
-        """Return a color near one of those named, or with `p_random` any color (3,).
+        """Return a color near one of the named colors, or any color (3,).
 
         Without a generator it is the canonical one.
 
@@ -119,9 +116,10 @@ Mask = Callable[[Texels], Array]  # (N,) weights in [0, 1]
 def painter(
     paint: Callable[Concatenate[Texels, Options], Array],
 ) -> Callable[Options, Paint]:
-    """Decorate a function of texels and options into a function of the options alone.
+    """Turn a function of texels and options into a function of the options alone.
 
-    What that returns is a function of texels: a paint or a mask with these options.
+    That function returns a paint or a mask, a function of texels. For example,
+    `rings(a, b, period=2.0)` is a paint, and `rings(a, b, period=2.0)(t)` are colors.
     """
 
     @wraps(paint)
@@ -250,8 +248,8 @@ def wood(
     stretch[axis] = 0.12 / scale  # the grain is long along the axis
     grain_position = t.xyz * stretch + offset
     first_cross, second_cross = (i for i in range(3) if i != axis)
-    # The factors are chosen by eye.
-    # growth rings are a slanted plane wave, bent by noise
+    # Growth rings are a slanted plane wave that is bent by noise. The factors here and
+    # below are chosen by eye.
     ring_phase = (
         grain_position[:, first_cross]
         + 0.6 * grain_position[:, second_cross]
@@ -349,8 +347,13 @@ def over(t: Texels, base: Paint, mask: Mask, top: Paint) -> Array:
 def between(
     t: Texels, low: float, high: float, axis: int = 2, soft: float = 0.02
 ) -> Array:
-    """Return the mask of texels between two values of a coordinate, with edges `soft`
-    wide.
+    """Return the mask of texels between two values of a coordinate.
+
+    Args:
+        t: points to paint.
+        low, high: the two values.
+        axis: axis of the coordinate: 0 is x, 1 is y, 2 is z.
+        soft: width of the ramp at both edges.
     """
     return band_mask(t.xyz[:, axis], low, high, soft=soft)
 
@@ -391,7 +394,7 @@ def sample_paint(sampler: ParameterSampler, size: float) -> Paint:
         sampler: sampler with a generator.
         size: approximate size of the object, which the patterns are scaled by.
     """
-    # with `p_random` 1 any color; "808080" is never used
+    # With `p_random` 1 it is any color, and "808080" is never used.
     a = sampler.sample_color("808080", p_random=1.0)
     b = sampler.sample_color("808080", p_random=1.0)
     cell = size * sampler(0.1, low=0.05, high=0.2)

@@ -1,4 +1,4 @@
-"""Ball, banana, book and stop sign. Units are centimetres, but for the stop sign."""
+"""Ball, banana and book in centimetres, and a stop sign in metres."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ PENTAGONS = shapes.normalize(
         ]
     )
 )
-"""The 12 unit directions of an icosahedron's corners: the middles of a football's dark
+"""The 12 unit directions of an icosahedron's corners: the centers of a football's dark
 panels.
 """
 _NEAR = PENTAGONS @ PENTAGONS.T > 0.4
@@ -53,7 +53,7 @@ _FACES = [
 HEXAGONS = shapes.normalize(
     np.array([PENTAGONS[list(face)].sum(axis=0) for face in _FACES])
 )
-"""The 20 unit directions of its face middles: the middles of the light panels."""
+"""The 20 unit directions of its face centers: the centers of the light panels."""
 PENTAGON_DISTANCE = 0.9393
 """Distance of the pentagons from the center of a truncated icosahedron whose corners are
 at a distance of 1.
@@ -62,7 +62,7 @@ HEXAGON_DISTANCE = 0.9149
 """The same of its hexagons."""
 BANANA_POINTS = 44  # points of the path of a banana
 COVER_SHIFT = 0.25
-"""By how much the covers of a book are farther at +x than its middle."""
+"""Distance of the covers' middle from the origin of a book, along +x."""
 
 
 def football_seams(directions: Array) -> tuple[Array, Array]:
@@ -73,8 +73,8 @@ def football_seams(directions: Array) -> tuple[Array, Array]:
     center, is largest.
 
     Returns:
-        About the distance to the nearest seam (N,), and whether the panel is a pentagon
-        (N,).
+        Approximate distances to the nearest seam (N,), and whether each panel is a
+        pentagon (N,).
     """
     to_pentagons = directions @ PENTAGONS.T / PENTAGON_DISTANCE
     to_hexagons = directions @ HEXAGONS.T / HEXAGON_DISTANCE
@@ -85,10 +85,10 @@ def football_seams(directions: Array) -> tuple[Array, Array]:
 
 
 def basketball_seams(directions: Array) -> Array:
-    """Return about the distance (N,) of unit directions (N, 3) to the nearest seam.
+    """Return the approximate distance (N,) of unit directions (N, 3) to the nearest seam.
 
-    A basketball has two great circles as seams, and a curve on either side of y = 0
-    that comes closest to it, 0.42, where z is 0.
+    A basketball has two great circles as seams, and a curve on either side of y = 0.
+    The curve is nearest to y = 0 where z is 0: there y is 0.42.
     """
     x, y, z = np.abs(directions).T
     curved_seam = np.abs(y - (0.42 + 0.38 * z**2))
@@ -96,13 +96,14 @@ def basketball_seams(directions: Array) -> Array:
 
 
 def tennis_seam(directions: Array) -> Array:
-    """Return about the distance (N,) of unit directions (N, 3) to the seam.
+    """Return the approximate distance (N,) of unit directions (N, 3) to the seam.
 
-    The seam of a tennis ball is where a polynomial is 0; half its value is about the
-    distance.
+    The seam of a tennis ball is where a polynomial is 0. Half of its absolute value is
+    approximately the distance. Its factors decide how far the seam winds.
     """
     x, y, z = directions.T
-    return np.asarray(np.abs(x**2 - y**2 - 0.75 * z * (1.2 - 0.2 * z**2)) * 0.5)
+    polynomial = x**2 - y**2 - 0.75 * z * (1.2 - 0.2 * z**2)
+    return np.asarray(np.abs(polynomial) * 0.5)
 
 
 def _press_seams(
@@ -116,10 +117,10 @@ def _press_seams(
     Args:
         patches: patches of the sphere, around the origin.
         radius: radius of the sphere.
-        depth: depth of the groove, as a fraction of the radius; it falls with the
+        depth: depth of the groove, as a fraction of the radius; it decreases with the
             distance from the seam as a Gaussian.
-        seam: returns the distance (N,) of directions (N, 3) of about length 1 to the
-            seam.
+        seam: function that returns the distance (N,) to the seam of directions (N, 3),
+            which have a length of approximately 1.
     """
     pressed = []
     for patch in patches:
@@ -135,7 +136,7 @@ def _football(t: Texels, light: Array, dark: Array, offset: Array) -> Array:
     """Paint dark pentagons, light hexagons and gray seams on a sphere at the origin."""
     seam_distance, is_pentagon = football_seams(shapes.normalize(t.xyz))
     panels = mix(light, dark, is_pentagon.astype(np.float64))
-    clouds = 1.0 - 0.06 * noise(t.xyz / 2.0 + offset)  # a little darker
+    clouds = 1.0 - 0.06 * noise(t.xyz / 2.0 + offset)  # up to 6 % darker
     off_seam = step(seam_distance, 0.012, soft=0.016)
     return mix(parse_hex_color("3a3a3a"), panels * clouds[:, None], off_seam)
 
@@ -203,16 +204,19 @@ def _press_ball(sphere: list[Patch], style: str, radius: float) -> list[Patch]:
     Balls of other styles stay smooth.
     """
     if style == "basket":
-        return _press_seams(sphere, radius, 0.015, basketball_seams)
+        return _press_seams(sphere, radius, depth=0.015, seam=basketball_seams)
     if style == "football":
-        # 1.5: grooves narrower than those of a basketball
-        return _press_seams(
-            sphere,
-            radius,
-            0.008,
-            lambda directions: football_seams(shapes.normalize(directions))[0] * 1.5,
-        )
+        return _press_seams(sphere, radius, depth=0.008, seam=_narrow_football_seam)
     return sphere
+
+
+def _narrow_football_seam(directions: Array) -> Array:
+    """Return 1.5 times the distance (N,) of directions (N, 3) to a football's seam.
+
+    With a larger distance a groove is narrower, narrower than that of a basketball.
+    """
+    seam_distance, _ = football_seams(shapes.normalize(directions))
+    return seam_distance * 1.5
 
 
 def _ball_paint(
@@ -327,7 +331,8 @@ def _banana_radius(
     """
     # distance from the end of the stem
     position = np.linspace(0.0, 1.0, BANANA_POINTS) * length
-    # from 0 to 1 over a quarter of the length: from the stem, and from the tip
+    # From 0 to 1 over about a quarter of the length: from the stem, and from the tip.
+    # With powers below 1 the ends are plumper.
     rise = np.clip((position - stem_length) / (0.26 * length), 0.0, 1.0) ** 0.75
     fall = np.clip((length - position) / (0.24 * length), 0.0, 1.0) ** 0.62
     # the tip ends with 26 % of the largest radius, not in a point
@@ -337,10 +342,10 @@ def _banana_radius(
     neck = sampler(0.3, low=0.24, high=0.4)
     stem = neck * (1.0 + 0.25 * np.exp(-position / 0.5))
     radius = max_radius * np.maximum(stem, body)
-    # over the neighbors, so that stem and body join without an edge; `edge` repeats the
-    # ends
-    # smoothed by a mean of five
-    return np.convolve(np.pad(radius, 2, mode="edge"), np.ones(5) / 5, mode="valid")
+    # Each radius is replaced by the mean of five neighbors, so that stem and body join
+    # without an edge. The first and the last radius are repeated for that.
+    padded_radius = np.pad(radius, 2, mode="edge")
+    return np.convolve(padded_radius, np.ones(5) / 5, mode="valid")
 
 
 def _banana_section(sampler: ParameterSampler) -> Array:
@@ -391,7 +396,7 @@ def _flecks(points: Array, offset: Array, amount: float) -> Array:
     Args:
         points: points of the surface.
         offset: (3,) into the noise.
-        amount: how much of the surface they take; not a fraction.
+        amount: with a larger amount flecks cover more of the surface; not a fraction.
     """
     large_noise = noise(points * np.array([1.9, 1.9, 3.1]) + offset)
     small_noise = noise(points * 3.7 + offset)
@@ -426,26 +431,23 @@ def book(sampler: ParameterSampler) -> Instance:
     height = 22.5
     size = _BookSize(width, height, thickness=sampler(4.2, low=2.2, high=6.0))
     board = sampler(0.34, low=0.2, high=0.45)  # thickness of a cover
-    overhang = sampler(0.4, low=0.2, high=0.6)  # of the covers over the pages
+    overhang = sampler(0.4, low=0.2, high=0.6)  # how far covers extend over the pages
     bulge = sampler(0.35, low=0.0, high=0.7)
     patches: list[Patch] = []
     for z in (board / 2, size.thickness - board / 2):
         patches += shapes.box(
             "cover", (COVER_SHIFT, 0.0, z), (width, height, board), bevel=0.12
         )
-    patches += shapes.box(
-        "pages",
-        # Along x the pages end 0.2 + `overhang` before the covers' free edge, and at -x
-        # they begin near the inner side of the spine.
-        (0.3 - overhang / 2, 0.0, size.thickness / 2),
-        (
-            width - overhang - 0.5,
-            height - 2 * overhang,
-            size.thickness - 2 * board + 0.04,  # no gap to the covers
-        ),
-        bevel=0.05,
-        steps=1,
+    # Along x the pages reach from 0.55 - width / 2, near the inner side of the spine, to
+    # width / 2 + 0.05 - overhang, which is 0.2 + `overhang` before the edge of the
+    # covers.
+    pages_center = (0.3 - overhang / 2, 0.0, size.thickness / 2)
+    pages_size = (
+        width - overhang - 0.5,
+        height - 2 * overhang,
+        size.thickness - 2 * board + 0.04,  # 0.02 inside of each cover, without a gap
     )
+    patches += shapes.box("pages", pages_center, pages_size, bevel=0.05, steps=1)
     patches += _round_spine(size, bulge, board)
     # -122 degrees: seen from the usual camera, the spine is at the side and the front
     # cover is readable.
@@ -466,8 +468,8 @@ def _round_spine(size: _BookSize, bulge: float, board: float) -> list[Patch]:
 
     Args:
         size: the size of the book.
-        bulge: by how much it bulges.
-        board: its thickness, which is that of the covers.
+        bulge: how far it bulges.
+        board: thickness of the spine, which is that of the covers.
     """
     half = size.thickness / 2
     angle = np.linspace(-np.pi / 2, np.pi / 2, 9)
@@ -535,7 +537,7 @@ def _spine_paint(t: Texels, cloth: Paint, gold: Array, size: _BookSize) -> Array
     in_length = step(0.16 - end_fraction, 0.0, soft=0.01)
     from_middle = np.abs(z - size.thickness / 2)
     in_thickness = step(0.22 * size.thickness - from_middle, 0.0, soft=0.05)
-    # noise that changes along the spine only, nearly: bars instead of letters
+    # noise that changes mostly along the spine: it gives bars instead of letters
     position = np.stack([y * 1.8, z * 0.2, 0 * end_fraction], axis=1)
     words = step(noise(position + 3.0), 0.36, soft=0.1)
     return mix(cloth(t), gold, np.maximum(bands, in_length * in_thickness * words))
@@ -549,32 +551,49 @@ def _spine(outer: Array, inner: Array, height: float) -> list[Patch]:
         inner: (K, 2) points (x, z) of its inner side, downwards.
         height: height of the book; the extent along y.
     """
+    upward_inner = inner[::-1]
+    # Up the outer side and down the inner one is clockwise; a section has to be
+    # counter-clockwise.
     section = np.concatenate([outer, inner])[::-1]
     # the path leads along -y, and the section's axes are x and z
-    frame = (
-        np.tile([0.0, -1.0, 0.0], (2, 1)),
-        np.tile([1.0, 0.0, 0.0], (2, 1)),
-        np.tile([0.0, 0.0, 1.0], (2, 1)),
-    )
+    tangent = np.tile([0.0, -1.0, 0.0], (2, 1))
+    first_normal = np.tile([1.0, 0.0, 0.0], (2, 1))
+    second_normal = np.tile([0.0, 0.0, 1.0], (2, 1))
     path = [(0.0, height / 2, 0.0), (0.0, -height / 2, 0.0)]
-    patches = shapes.sweep("spine", path, section, frame=frame)
-    end_size = (
-        float(np.ptp(outer[:, 1])),
-        float(np.ptp(outer[:, 0])) + float(np.linalg.norm(outer[0] - inner[-1])),
+    patches = shapes.sweep(
+        "spine", path, section, frame=(tangent, first_normal, second_normal)
     )
     for side in (1.0, -1.0):
-        # the face at this end, as a grid of two rows: the outer and the inner curve
-        rows = [
-            np.insert(curve, 1, side * height / 2, axis=1)
-            for curve in (outer, inner[::-1])
-        ]
-        # the order of the rows decides to which side the face looks
-        points = np.stack(rows if side > 0 else rows[::-1])
-        normals = np.broadcast_to([0.0, side, 0.0], points.shape)
-        down = np.array([0.0, 1.0])
-        across = np.linspace(0.0, 1.0, len(outer))
-        patches.append(shapes.grid("spine", points, normals, end_size, down, across))
+        patches.append(_spine_end(outer, upward_inner, side, height))
     return patches
+
+
+def _spine_end(outer: Array, inner: Array, side: float, height: float) -> Patch:
+    """Create the face at one end of the spine, between its outer and its inner curve.
+
+    Args:
+        outer, inner: (K, 2) points (x, z) of both sides, upwards.
+        side: 1 for the end at +y, -1 for that at -y.
+        height: height of the book.
+    """
+    outer_row, inner_row = (
+        np.insert(curve, 1, side * height / 2, axis=1) for curve in (outer, inner)
+    )
+    # The order of the two rows decides to which side the face looks.
+    rows = [outer_row, inner_row] if side > 0 else [inner_row, outer_row]
+    points = np.stack(rows)
+    # The chart is as wide as the curves are high, and as high as the spine is deep.
+    chart_width = float(np.ptp(outer[:, 1]))
+    bulge = float(np.ptp(outer[:, 0]))
+    thickness = float(np.linalg.norm(outer[0] - inner[0]))
+    return shapes.grid(
+        "spine",
+        points,
+        normals=np.broadcast_to([0.0, side, 0.0], points.shape),
+        size=(chart_width, bulge + thickness),
+        down=np.array([0.0, 1.0]),
+        across=np.linspace(0.0, 1.0, len(outer)),
+    )
 
 
 def _cover_paint(
@@ -598,7 +617,8 @@ def _cover_paint(
         color = cloth(t)
         if style == "plain":
             return color
-        # from the middle of the cover, which is a little beside that of the book
+        # From the middle of the cover, with y downwards: the spine is at -x, so that
+        # the upper edge of the front cover is at +y of the book.
         x = t.xyz[:, 0] - COVER_SHIFT
         y = -t.xyz[:, 1]
         is_front = (t.xyz[:, 2] > size.thickness - 0.1).astype(np.float64)
@@ -628,8 +648,8 @@ def _in_rectangle(x: Array, y: Array, half_width: float, half_height: float) -> 
 
 def _picture_mask(x: Array, y: Array, size: _BookSize) -> Array:
     """Return the mask of a picture above the middle."""
-    center_y = y + 0.12 * size.height
-    return _in_rectangle(x, center_y, 0.36 * size.width, 0.26 * size.height)
+    from_picture_middle = y + 0.12 * size.height
+    return _in_rectangle(x, from_picture_middle, 0.36 * size.width, 0.26 * size.height)
 
 
 def _picture_spot(x: Array, y: Array, size: _BookSize) -> Array:
@@ -648,13 +668,16 @@ def _frame_mask(x: Array, y: Array, size: _BookSize) -> Array:
 
 def _word_mask(x: Array, y: Array, size: _BookSize) -> Array:
     """Return the mask of lines of words below the middle."""
-    # lines 2 units high; along a line noise decides where there is a word
+    # Lines are 2 units apart. Along a line, noise decides where there is a word; 7.0 is
+    # any offset into the noise.
     line_number = np.floor(y / 2.0)
-    word_noise = noise(np.stack([x * 1.5, 0 * x, line_number], axis=1) + 7.0)
-    words = step(word_noise, 0.3, soft=0.08)
-    lines = step(np.abs((y / 2.0) % 1.0 - 0.5), 0.22, soft=0.1) * words
-    center_y = y - 0.24 * size.height
-    block = _in_rectangle(x, center_y, 0.32 * size.width, 0.09 * size.height)
+    no_change = np.zeros_like(x)
+    noise_position = np.stack([x * 1.5, no_change, line_number], axis=1)
+    words = step(noise(noise_position + 7.0), 0.3, soft=0.08)
+    from_line_middle = np.abs((y / 2.0) % 1.0 - 0.5)
+    lines = step(from_line_middle, 0.22, soft=0.1) * words
+    from_block_middle = y - 0.24 * size.height  # y is downwards
+    block = _in_rectangle(x, from_block_middle, 0.32 * size.width, 0.09 * size.height)
     return np.clip(block * lines, 0.0, 1.0)
 
 
@@ -667,11 +690,11 @@ def _seal_mask(x: Array, y: Array, size: _BookSize) -> Array:
 
 # ---- stop sign
 # ----------------------------------------------------------------------------------
-# A stop sign as it stands at road works, on a low stand. Units are metres; it is read
-# from +x.
+# A stop sign as it stands at road works, on a low stand. Units are metres; its plate
+# looks along +x.
 #
-# The stand is low because data sets draw the box of a stop sign around its plate: on a
-# tall post the box of all that is there would be another one.
+# The stand is low because data sets draw the box of a stop sign around its plate: with a
+# tall post the box of the object would be much larger.
 
 _STROKES = {  # letters in a cell 1 high and 0.6 wide: runs of points (x, y)
     "S": [
@@ -731,8 +754,10 @@ def _word_strokes(letters: str, height: float) -> list[Array]:
         letters: keys of `_STROKES`.
         height: height of a letter.
     """
-    spacing = 0.74  # from letter to letter, in heights; a letter is 0.6 wide
-    half_gap = 0.07  # at the left of each letter
+    # in heights of a letter, which is 0.6 wide: distance between letters, and half of
+    # the gap between them
+    spacing = 0.74
+    half_gap = 0.07
     strokes = []
     for index, letter in enumerate(letters):
         left = ((index - len(letters) / 2) * spacing + half_gap) * height
@@ -743,9 +768,10 @@ def _word_strokes(letters: str, height: float) -> list[Array]:
 
 @painter
 def _face(t: Texels, red: Array, radius: float) -> Array:
-    """Paint the plate of a stop sign, which faces +x and has its center at the origin.
+    """Paint the plate of a stop sign, which faces +x.
 
-    The word and a rim are white on red.
+    The word and a rim are white on red. The plate is painted before it is moved, so its
+    center is at the origin.
 
     Args:
         t: points of the plate.
@@ -754,7 +780,9 @@ def _face(t: Texels, red: Array, radius: float) -> Array:
     """
     _, y, z = t.xyz.T
     apothem = radius * np.cos(np.pi / 8)  # from the middle of the octagon to its sides
-    # directions of the eight sides' normals, in the plane of y and z
+    # Directions of the eight sides' normals, in the plane of y and z. Corners are at 22.5
+    # degrees and every 45 degrees from there. A normal is half of that, pi / 8, after
+    # each corner.
     side_angles = np.pi * (np.arange(8) + 0.5) / 4 + np.pi / 8
     # apothem of the octagon whose outline goes through each texel
     texel_apothem = np.max(
@@ -772,12 +800,12 @@ def _face(t: Texels, red: Array, radius: float) -> Array:
 
 @family(metres=1.0, texels=192)
 def stop_sign(sampler: ParameterSampler) -> Instance:
-    """Make a stop sign on a post.
+    """Make a stop sign on a post, turned a little about z.
 
     Lengths are in metres; the angle is in degrees.
     """
     radius = sampler(0.45, low=0.4, high=0.5)
-    height = sampler(0.74, low=0.66, high=0.84)  # of the middle of the plate
+    height = sampler(0.74, low=0.66, high=0.84)  # height of the plate's middle
     red = sampler.sample_color("b3121d", "a8161f", "c0202a", p_random=0.0)
     patches = [
         *_sign_plate(radius, height),

@@ -39,8 +39,8 @@ def _claw(
         sampler: samples how far they spread.
         half_head: half the width of the head.
         start: y of their roots.
-        length: along +y.
-        drop: by how much their tips are lower than their roots.
+        length: their extent along +y.
+        drop: how far their tips are below their roots, along -x.
     """
     spread = sampler(0.34, low=0.2, high=0.5)
     t = np.linspace(0.0, 1.0, 14)  # from the root to the tip
@@ -75,7 +75,7 @@ def _peen(
         sampler: chooses between both.
         half_head: half the width of the head.
         start: y of its root.
-        length: along +y.
+        length: its extent along +y.
     """
     if sampler.chance(0.5):
         return _ball_peen(half_head, start, length)
@@ -120,11 +120,12 @@ def _ball_peen(half_head: float, start: float, length: float) -> list[Patch]:
 
 @family(metres=0.01)
 def hammer(sampler: ParameterSampler) -> Instance:
-    """Make a hammer whose handle runs along -x, and whose head lies along y.
+    """Make a hammer that lies on its side.
 
-    The head is at the origin, and its striking face at -y. Lengths are in centimeters,
-    angles in degrees. `sampler(x, low=..., high=...)` returns x for the canonical
-    hammer and a uniform sample for a random one.
+    It is built with the head at the origin along y, the striking face at -y, and the
+    handle along -x. Then it is laid down and turned about z. Lengths are in
+    centimeters, angles in degrees. `sampler(x, low=..., high=...)` returns x for the
+    canonical hammer and a uniform sample for a random one.
     """
     half_head = sampler(1.35, low=1.15, high=1.7)
     length = sampler(27.0, low=20.0, high=31.0)
@@ -138,13 +139,15 @@ def hammer(sampler: ParameterSampler) -> Instance:
     head = _hammer_head(sampler, style, half_head, half_eye, front, face_radius)
     half_grip, handle = _hammer_handle(sampler, half_head, length)
 
-    # It lies on the head and on the swelling of the handle, at 0.8 of its length.
+    # It lies on the head and on the swelling of the handle, at 0.8 of its length. The
+    # head is thicker: the handle is tilted down by the difference. The factors are those
+    # of `_sledge_block`, nearly, and of `_eye_block`.
     half_face = face_radius * 1.2 if style == "sledge" else face_radius
-    rise = max(half_head * 1.05, half_face) - half_grip
-    tilt = -float(np.degrees(np.arctan2(rise, 0.8 * length)))
+    drop = max(half_head * 1.05, half_face) - half_grip
+    tilt = -float(np.degrees(np.arctan2(drop, 0.8 * length)))
+    patches = shapes.transform_patches([*head, *handle], shapes.rotation("y", tilt))
     patches = shapes.transform_patches(
-        shapes.transform_patches([*head, *handle], shapes.rotation("y", tilt)),
-        shapes.rotation("z", sampler(58.0, low=20.0, high=90.0)),
+        patches, shapes.rotation("z", sampler(58.0, low=20.0, high=90.0))
     )
     return Instance(
         patches,
@@ -276,7 +279,7 @@ def _hammer_handle(
         length: length from the head to the end.
 
     Returns:
-        Half its thickness where it is held, about; and its patches.
+        Approximately half its thickness where it is held, and its patches.
     """
     t = np.linspace(0.0, 1.0, 30)  # from the head to the end
     swelling = sampler(0.16, low=0.0, high=0.3)
@@ -384,7 +387,7 @@ def _weights(
         sampler: chooses the nut of "plates".
         style: "hex", "globe", "plates" (three, each smaller, and a nut) or "round".
         start: z of its inner side.
-        length: along z, but for a globe, which is as long as it is thick.
+        length: its extent along z. A globe does not use it: its size is `radius`.
         radius: radius of the weight.
     """
     if style == "hex":
@@ -428,7 +431,7 @@ def _plate(start: float, spacing: float, radius: float) -> list[Patch]:
     """
     thickness = spacing * 0.94
     end = start + thickness
-    hub_radius = 0.55 * radius  # of the flat middle of both sides
+    hub_radius = 0.55 * radius  # radius of the flat middle of both sides
     # profiles of points (r, z)
     side = shapes.round_corners(
         [(hub_radius, start), (radius, start), (radius, end), (hub_radius, end)],
@@ -469,7 +472,7 @@ def dumbbell(sampler: ParameterSampler) -> Instance:
     style = sampler.pick("hex", "plates", "hex", "round", "globe")
     radius = sampler(4.6, low=3.6, high=6.2)
     half_grip = sampler(5.6, low=5.0, high=7.0)  # half the bar between the weights
-    length = sampler(5.6, low=3.8, high=7.0)  # of a weight
+    length = sampler(5.6, low=3.8, high=7.0)  # length of a weight
     bar = _dumbbell_bar(sampler, half_grip)
     weight = _weights(sampler, style, half_grip, length, radius)
     other_weight = shapes.transform_patches(weight, shapes.rotation("y", 180.0))
@@ -526,8 +529,10 @@ def _dumbbell_paints(
         offset=offset,
         amount=sampler(0.08, low=0.0, high=0.2),
     )
-    # z of the outer side of a weight; a globe is as long as it is thick
-    tip = half_grip + (length if style != "globe" else 1.75 * radius)
+    # z of the outer side of a weight. A globe has a radius of 0.95 `radius`, and its
+    # center is 0.8 `radius` outside of the grip: see `_weights`.
+    weight_length = 1.75 * radius if style == "globe" else length
+    tip = half_grip + weight_length
     accent = sampler.sample_color("c9ccd0", "f2f2f0", "d9a02b", "c23b4a")
     if sampler.chance(0.5, canonical=True):
         weight = over(weight, _end_rings(tip, radius), solid(accent))

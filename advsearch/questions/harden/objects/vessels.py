@@ -1,8 +1,8 @@
 """Open containers of revolution: mug, bowl, bottle, vase, wine glass.
 
-Lengths are in centimeters, and z is up. A number `sampler(9.4, low=7.6, high=12.0)` is
-9.4 of the canonical instance, and uniform between the bounds of others. Profiles are
-points (r, z).
+Lengths are in centimeters, and z is up. `sampler(9.4, low=7.6, high=12.0)` is 9.4 for
+the canonical instance, and uniform between the bounds for others. Profiles are points
+(r, z).
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from advsearch.questions.harden.objects.textures import (
     zigzag,
 )
 
-# turns the seam of a lathe away from the default camera, at azimuth 40
+# turns the seam of a lathe away from the default camera, which is at an azimuth of 40
 SEAM_ROTATION = shapes.rotation("z", 220.0)
 HANDLE_POINTS = 26  # points of the curve of a handle
 LABEL_AZIMUTH = 180.0  # degrees about z; opposite the seam of the texture
@@ -226,6 +226,7 @@ def mug(sampler: ParameterSampler) -> Instance:
     style = sampler.pick("ear", "round", "square", "loop")
     handle_top = height * sampler(0.85, low=0.76, high=0.88)
     if style == "loop":
+        # never the canonical mug, whose handle is an "ear": so 0.3 is not used
         handle_bottom = height * sampler(0.3, low=0.34, high=0.42)
     else:
         handle_bottom = height * sampler(0.2, low=0.16, high=0.3)
@@ -618,9 +619,9 @@ def _seal(t: Texels, bottom: float, height: float) -> Array:
         bottom, height: lower edge and height of the label.
     """
     x, y, z = t.xyz.T
-    # from the middle of the label, wrapped to [-180, 180) degrees
+    # azimuth from the middle of the label, wrapped to [-180, 180) degrees
     degrees = (np.degrees(np.arctan2(y, x)) - LABEL_AZIMUTH + 180.0) % 360.0 - 180.0
-    radius = float(np.hypot(x, y).max())  # of the bottle
+    radius = float(np.hypot(x, y).max())  # radius of the bottle
     center_distance = np.hypot(
         np.radians(degrees) * radius, z - (bottom + 0.2 * height)
     )
