@@ -320,8 +320,7 @@ def _find_charts(
         texel_size, distortion = measured
         image = _extend_inside(texture[box], inside)
         # A chart whose texture coordinates are mirrored has a negative signed area.
-        chart_faces = np.unique(raster.face[box][inside])
-        is_mirrored = uv_areas[chart_faces].sum() < 0.0
+        is_mirrored = uv_areas[np.unique(raster.face[box][inside])].sum() < 0.0
         if is_mirrored:  # mirror it back; the size of its texels stays the same
             image = image[:, ::-1]
             inside = inside[:, ::-1]

@@ -1,4 +1,4 @@
-"""`advsearch report`: runs as evidence for a model card or a safety case."""
+"""`advsearch report`: write the evidence of runs for a model card or a safety case."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from advsearch.cli.main import argument, command
 from advsearch.extend import InputError
 
 NAME = "evidence"
-# the file that says where photographs were taken, and its most bytes
+# The file with the camera poses of photographs, and its maximum size in bytes.
 POSES = "poses.csv"
 LARGEST_POSES = 1 << 20
 
@@ -193,10 +193,14 @@ def _add_photographs(folder: str, name: str) -> None:
 
 
 def _check_photographs(files: Sequence[Path], folder: str) -> None:
-    """Check that there are photographs, and that each names its rendering.
+    """Check that there are photographs, and that each is matched to a rendering.
+
+    The name of a photograph has the number of its rendering, such as
+    "rendering-12.jpg". If the folder has the file `POSES`, the photographs were given
+    such names before (`_copy_named_by_pose`).
 
     Raises:
-        InputError: there are none, or one does not.
+        InputError: there are no photographs, or one has no number in its name.
     """
     unnumbered_files = [
         file.name for file in files if not file.stem.startswith("rendering-")
@@ -206,7 +210,7 @@ def _check_photographs(files: Sequence[Path], folder: str) -> None:
             f"photographs: {unnumbered_files[0]}: expected the number of a "
             "rendering in its "
             "name, such as rendering-12.jpg, "
-            f"or {POSES} beside it; advsearch dashboard aligns photographs by phone"
+            f"or {POSES} in the folder; advsearch dashboard aligns photographs by phone"
         )
     if not files:
         raise InputError(
@@ -283,10 +287,16 @@ def _has_pose(values: Mapping[str, object], pose: Mapping[str, str | None]) -> b
 
 
 def _is_equal_value(value: object, text: str | None) -> bool:
-    """Return whether a text writes a value: the same name, or nearly the same number."""
-    if text is None or value is None or isinstance(value, str):
-        return text is not None and value == text.strip()
+    """Return whether a text is a value: the same name, or nearly the same number.
+
+    A missing text or a missing value (None) equals nothing.
+    """
+    if text is None or value is None:
+        return False
+    if isinstance(value, str):
+        return value == text.strip()
     try:
+        # the text may be rounded
         return math.isclose(float(str(value)), float(text), rel_tol=1e-3, abs_tol=1e-3)
     except ValueError:
         return False

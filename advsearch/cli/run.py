@@ -1,5 +1,5 @@
-"""`advsearch run`: do what a YAML file describes; `resume`: go on with a run that was
-stopped; `runs`: those here.
+"""The commands `advsearch run`, which runs an experiment from a YAML file; `resume`,
+which continues a run that was stopped; and `runs`, which lists the runs in a folder.
 """
 
 from __future__ import annotations
@@ -60,15 +60,18 @@ def parse_changes(words: Sequence[str]) -> dict[str, object]:
     Args:
         words: words of the command line, such as "steps=80" or "controls.pose.yaw=3".
 
+    Returns:
+        The values by name as it was typed: ``{"controls.pose.yaw": 3}``.
+
     Raises:
         InputError: a word is no such assignment.
     """
     changes = dict(parse_assignment(text, f"change {text!r}") for text in words)
-    # the nested mapping that dotted names stand for
-    typed = dict[str, object]()
+    # `allow_named` expects settings in nested form: {"controls": {"pose": {"yaw": 3}}}
+    nested_changes = dict[str, object]()
     for name, value in changes.items():
-        set_dotted(typed, name, value)
-    allow_named(typed)
+        set_dotted(nested_changes, name, value)
+    allow_named(nested_changes)
     return changes
 
 
@@ -93,8 +96,10 @@ def run_file(
             as one that connects to other machines.
     """
     config = read_file_config(read_command(file), file, changes)
-    # `left_out` has the settings that count only when typed; they are not set. If such
-    # a setting decides no number of the result, a run is continued without it.
+    # `left_out` has the settings of the file that count only when a person types them,
+    # such as an address to connect to. The configuration lacks them. A new run would
+    # silently differ from the file, so it is an error. A run that is resumed was
+    # started with them; it goes on if they do not change its numbers.
     for setting in config.left_out:
         decides_numbers = setting.name not in config.changeable_settings
         if resumed is None or decides_numbers:
@@ -172,7 +177,7 @@ def resume(args: argparse.Namespace) -> int:
     return run_file(path / CONFIG, changes, args, resumed=path)
 
 
-MOST_NAMES = 4  # controls of a run that the table names
+MOST_NAMES = 4  # maximum number of controls of a run that the table names
 
 
 @command(
