@@ -14,8 +14,8 @@ JsonObject = dict[str, JsonValue]
 MESHES = tuple(
     f".{name}" for name in (*list_built_ins("reader"), *list_built_ins("converter"))
 )
-"""Endings of the files that an object can be read from, but for those of other
-packages' readers.
+"""Suffixes of the files from which an object can be read, without those of readers in
+other packages.
 """
 
 
@@ -26,7 +26,7 @@ def either(names: Sequence[str], word: str = "or") -> str:
 
 
 PATH_ENDINGS = (".csv", ".txt", ".tum", ".kitti")
-"""How the name of a file ends along which something travels, in small letters."""
+"""Suffixes of files with a motion path, in lower case."""
 
 
 def split_paths(name: str) -> list[str]:

@@ -1,7 +1,9 @@
-"""The result of a run: `summary.json` (docs/results.md), and
-`artifacts/adversarial.npy`, the configuration, so that it can be rendered again
-elsewhere. And what a run is made with: versions, and digests of the files that its
-settings name.
+"""Read and write the result of a run, and find out what it depends on.
+
+The result is in `summary.json` (docs/results.md). `artifacts/adversarial.npy` has the
+adversarial configuration, with which it can be rendered again. A run depends on the
+versions of packages, and on the files that its settings name, of which digests are
+computed.
 """
 
 from __future__ import annotations
@@ -69,10 +71,12 @@ def read_result(folder: Path) -> Result:
 def read_stored_result(folder: Path) -> Result:
     """Return the result of the run in a folder as its `summary.json` states it.
 
-    Its ending is then not `RUNNING`, even if a process works on the run.
+    The status in it (`ending`) is that of the file. It is not replaced by `RUNNING` if
+    a process works on the run; `read_result` does that.
 
     Raises:
-        FileFormatError: there is none, or it is not what this version writes.
+        FileFormatError: there is no such file, or its contents are not those that this
+            version writes.
     """
     path = folder / NAME
     try:
@@ -85,18 +89,21 @@ def read_stored_result(folder: Path) -> Result:
         raise make_summary_error(path, str(error)) from None
     if not isinstance(values, dict):
         raise make_summary_error(path, type(values).__name__)
-    if (kind := kind_of(values)) is None:
+    result_type = kind_of(values)  # the class of the experiment's result
+    if result_type is None:
         raise make_summary_error(
             path, f"one of the command {str(values.get('command'))[:40]!r}"
         )
     try:
-        return kind.from_values(values)
+        return result_type.from_values(values)
     except ValidationError as error:
         # The message states the first error only, and no values, which may be long.
         first = error.errors(include_url=False, include_input=False)[0]
-        what = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"[:120]
+        field_name = ".".join(map(str, first["loc"]))
+        reason = f"{field_name}: {first['msg']}"[:120]
         got = (
-            f"one with a part that is missing or of another type ({what}); run it again"
+            f"one with a part that is missing or of another type ({reason}); run it "
+            "again"
         )
         raise make_summary_error(path, got) from None
 
@@ -108,15 +115,16 @@ def make_summary_error(path: Path, got: str) -> FileFormatError:
 CONFIGURATION = "adversarial.npy"
 FOLDER = "artifacts"
 MAX_CONFIGURATION_BYTES = 1 << 30
-MAGIC = b"\x93NUMPY\x01\x00"  # how a file of numpy's begins, of version 1.0
-MAX_HEADER_BYTES = 1 << 10  # bytes within which a header ends
+MAGIC = b"\x93NUMPY\x01\x00"  # first bytes of a file of numpy, version 1.0
+MAX_HEADER_BYTES = 1 << 10  # maximum size of the header after these bytes
 HEADER = re.compile(
     re.escape(MAGIC)
     + rb"..\{'descr': '<f4', 'fortran_order': False, 'shape': \((\d{1,12}),\), \} *\n",
     re.DOTALL,
 )
-"""What is before the numbers. numpy's own reader makes room for whatever shape is
-named, and parses the header as Python, which ends in errors of any kind.
+"""The header before the numbers. The reader of numpy is not used: it allocates memory
+for any shape that the header states, and parses the header as Python code, which may
+raise errors of any kind.
 """
 
 
@@ -148,7 +156,9 @@ def read_configuration(run: Path) -> NDArray[np.float32]:
         raise FileFormatError(f"{expected} no such file; did the run end?") from None
     except OSError as error:
         raise FileFormatError(f"{expected} {str(error)[:120]}") from None
-    if not data.startswith(MAGIC) or b"\n" not in data[: len(MAGIC) + MAX_HEADER_BYTES]:
+    # The header ends with a newline. Without one the file is truncated.
+    has_header_end = b"\n" in data[: len(MAGIC) + MAX_HEADER_BYTES]
+    if not data.startswith(MAGIC) or not has_header_end:
         raise FileFormatError(f"{expected} something else, or the beginning of one")
     u = _parse_array(data)
     if u is None or not bool(((u >= 0.0) & (u <= 1.0)).all()):
@@ -176,18 +186,18 @@ def _parse_array(data: bytes) -> NDArray[np.float32] | None:
     return numbers
 
 
-VERSIONS_NOTE = "made with"  # the note of versions and of digests of files
-MAX_FILES = 20_000  # files of a folder that a digest is taken of, at most
+VERSIONS_NOTE = "made with"  # the note with versions and digests of files
+MAX_FILES = 20_000  # maximum number of files of a folder that are in its digest
 FOLDERS = {"task": "*/*", "model": "*"}
-"""Settings that may name a folder, and which files in it decide: a task's pictures, or
-what `hf:FOLDER` consists of.
+"""Settings that may name a folder, with a pattern of the files in it on which the run
+depends: the reference pictures of a task, or the files of a model `hf:FOLDER`.
 """
 
 PACKAGES = ("advsearch", "mitsuba", "drjit", "torch", "numpy")
 
 NOT_READ_AGAIN = ("recipe", "suite")
-"""Settings whose file a run keeps in its store and goes on with, whatever became of the
-file.
+"""Settings whose file is copied into the store of the run. A resumed run reads the copy,
+even if the file has changed.
 """
 
 
@@ -209,7 +219,7 @@ def collect_versions(settings: Mapping[str, object]) -> dict[str, str]:
 
 
 BUNDLED = {"objects": "object", "environments": "environment"}
-"""Folders of `advsearch.bundled`, and what stands in them."""
+"""Folders of `advsearch.bundled`, with the kind of their entries."""
 NAMES_BUNDLED = (
     "object",
     "environment",
@@ -221,7 +231,7 @@ NAMES_BUNDLED = (
     "over",
     "set",
 )
-"""Settings that name objects and environments."""
+"""Settings that may name bundled objects and environments."""
 
 
 def compute_bundled_digests(settings: Mapping[str, object]) -> dict[str, str]:
@@ -238,7 +248,7 @@ def compute_bundled_digests(settings: Mapping[str, object]) -> dict[str, str]:
         Digests by name, such as "bundled object mug".
     """
     package = Path(__file__).parent.parent
-    names = _list_bundled_names(settings)
+    names = _list_object_and_environment_names(settings)
     digests = dict[str, str]()
     for folder, kind in BUNDLED.items():
         for entry in sorted((package / "bundled" / "data" / folder).iterdir()):
@@ -251,16 +261,19 @@ def compute_bundled_digests(settings: Mapping[str, object]) -> dict[str, str]:
     return digests
 
 
-def _list_bundled_names(settings: Mapping[str, object]) -> set[str]:
-    """Return the words in settings that may name bundled objects and environments."""
+def _list_object_and_environment_names(settings: Mapping[str, object]) -> set[str]:
+    """Return the words in settings that may name bundled objects and environments.
+
+    There may be other words among them, since they are not compared with known names.
+    """
     names = {
         name
         for setting in NAMES_BUNDLED
         for name in _find_bundled_names(settings.get(setting))
     }
-    has_no_environment = "environment" in settings and not settings["environment"]
-    # a scene whose environment is not stated has the default one
-    if settings.get("object") and has_no_environment:
+    # The setting exists and is None: then the scene has the default environment.
+    uses_default_environment = "environment" in settings and not settings["environment"]
+    if settings.get("object") and uses_default_environment:
         names.add(DEFAULT_ENVIRONMENT)
     return names
 
@@ -351,13 +364,15 @@ def compute_file_digests(settings: Mapping[str, object]) -> dict[str, str]:
 
 
 def _iterate_digests(setting: str, path: str) -> Iterator[tuple[str, str]]:
-    """Yield path and digest of each file that a value of a setting stands for.
+    """Yield path and digest of each file on which a run depends by a path in a setting.
 
-    It may be a folder, a file, and the files that were read for that file.
+    The path may be a folder, which has a single digest, or a file. In addition, files
+    are yielded that this process has read for that file, such as the materials of a
+    mesh.
 
     Args:
-        setting: name of the setting, by which it is known whether it may name a file
-            or a folder.
+        setting: name of the setting. Only some may name a folder (`FOLDERS`) or a file
+            (`FILES`).
         path: the path, a part of the setting's value.
 
     Raises:
@@ -365,20 +380,28 @@ def _iterate_digests(setting: str, path: str) -> Iterator[tuple[str, str]]:
         ValueError: it is no possible path.
     """
     absolute_path = os.path.abspath(path)
-    # If this process has read the file: the file itself, and those read for it.
+    # The file itself and those read for it; empty if this process has not read it.
     opened_files = list_opened_files(absolute_path)
+
+    # Only an absolute path counts as a folder, and the folder of a model hf:FOLDER.
     folder = ""
     if os.path.isabs(path):
         folder = path
     elif path.startswith("hf:"):
         folder = path.removeprefix("hf:")
     if folder and setting in FOLDERS and Path(folder).is_dir():
-        yield folder, _digest_folder(Path(folder), FOLDERS[setting])
-    if (opened_files or setting in FILES) and Path(path).is_file():
+        file_pattern = FOLDERS[setting]
+        yield folder, _digest_folder(Path(folder), file_pattern)
+
+    # A file that was read is one, whatever the setting.
+    may_be_file = bool(opened_files) or setting in FILES
+    if may_be_file and Path(path).is_file():
         yield path, _digest_file(Path(path))
+
     for opened_file in opened_files:
         if opened_file != absolute_path and Path(opened_file).is_file():
-            # named like the file itself: relative or absolute as in the setting
+            # Its name in the result is relative to the current directory if `path` is,
+            # and absolute otherwise.
             relative = os.path.relpath(opened_file, os.path.dirname(absolute_path))
             file_name = os.path.join(os.path.dirname(path), relative)
             yield file_name, _digest_file(Path(opened_file))
@@ -389,8 +412,9 @@ def _digest_folder(folder: Path, pattern: str) -> str:
 
     Args:
         folder: the folder.
-        pattern: pattern of the paths of its files that count, such as "*/*". At most
-            `MAX_FILES` do.
+        pattern: pattern of the paths of its files that count, such as "*/*". Only the
+            first `MAX_FILES` count; of more files, the order of the file system decides
+            which.
     """
     paths = sorted(islice(folder.glob(pattern), MAX_FILES))
     lines = [
