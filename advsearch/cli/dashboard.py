@@ -1,5 +1,5 @@
-"""`advsearch dashboard`: look at runs in a browser; `advsearch view`: make the page of
-a run anew.
+"""The commands `advsearch dashboard`, which serves the pages of runs to a browser, and
+`advsearch view`, which makes the page of a run again.
 """
 
 from __future__ import annotations
@@ -23,10 +23,9 @@ PORT = 8265
 PHOTOGRAPH_PAGES = "advsearch.questions.photographs.pages:PhotographPages"
 
 PRIVACY_NOTE = (
-    "Whoever has this address sees the runs and can send photographs. Each is judged "
-    "on this machine, by the model "
-    "that the run's settings name, and kept in the run's folder, as a picture and as "
-    "rows; nothing else is written."
+    "Anyone with this address can see the runs and send photographs. Each photograph is "
+    "evaluated on this machine, by the model in the settings of the run, and stored in "
+    "the folder of the run, as a picture and as rows. Nothing else is written."
 )
 
 
