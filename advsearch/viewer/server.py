@@ -444,7 +444,7 @@ class Dashboard(HTTPServer):
         self.token = None if is_local(host) else secrets.token_urlsafe(24)
         self._secret = secrets.token_bytes(32)  # from which `make_key` makes keys
         self.photographs = photographs
-        # held while the list of runs is made, which only one request does at a time
+        # Held while the list of runs is read. Other requests then find cached entries.
         self._listing = threading.Lock()
         self.host_name = host
         self.fingerprint = None
