@@ -21,8 +21,8 @@ class BuiltIn(NamedTuple):
         kind: "experiment", "control", "policy", "task", "model source", "recognizer" of
             networks from Python, "exporter", "reader" of mesh files, or "converter" of
             files to glTF.
-        name: its name on the command line. For a reader or converter it is the suffix of
-            its files, and for a recognizer the library of its networks.
+        name: its name on the command line. For a reader or converter it is the suffix
+            of its files, and for a recognizer the library of its networks.
         target: "module:attribute" that is imported when the part is used.
         help: what it does, in a line that begins in lower case and has no full stop.
     """

@@ -64,7 +64,8 @@ PYTHON_TYPES = {
     "compared": "str | Path | Sequence[str | Path]",
     "sweeps": "str | Path | Sequence[str | Path]",
 }
-"""Types that Python callers may pass for positional settings, which are stored as text."""
+"""Types that Python callers may pass for positional settings, which are stored as text.
+"""
 
 
 class RunContext(ExitStack, Generic[Settings]):

@@ -19,8 +19,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 
-# A second signal within this many seconds belongs to the same Ctrl-C: the terminal sends
-# it to all processes, and some programs also pass it on.
+# A second signal within this many seconds belongs to the same Ctrl-C: the terminal
+# sends it to all processes, and some programs also pass it on.
 DUPLICATE_SECONDS = 0.5
 
 

@@ -1,5 +1,5 @@
-"""Read options on the command line: those of a policy or a task, which are fields of its
-dataclass, and Mitsuba's scene parameters.
+"""Read options on the command line: those of a policy or a task, which are fields of
+its dataclass, and Mitsuba's scene parameters.
 """
 
 from __future__ import annotations
@@ -319,7 +319,8 @@ class Outcome(Enum):
     """
 
     FOUND = "found"  # a right box, or enough right pixels
-    # A box of a right class overlaps the object too little, or too few pixels are right.
+    # A box of a right class overlaps the object too little, or too few pixels are
+    # right.
     LOOSE = "loose"
     WRONG_CLASS = "wrong class"  # a good box of another class
     # A box of a right class is somewhere else, or the object is not visible.

@@ -1,5 +1,5 @@
-"""Display the progress of an experiment in a terminal, in a notebook or as lines of text
-(`progress=True`).
+"""Display the progress of an experiment in a terminal, in a notebook or as lines of
+text (`progress=True`).
 """
 
 from __future__ import annotations
@@ -113,8 +113,8 @@ class Stages:
 
 
 ProgressOption = Progress | bool | None
-"""The argument `progress` of functions: True for a display, False for none, None for one
-on a terminal only, or an object that displays the progress.
+"""The argument `progress` of functions: True for a display, False for none, None for
+one on a terminal only, or an object that displays the progress.
 """
 
 
@@ -131,8 +131,8 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 ANNOUNCE_SECONDS = 2.0
 MAX_BARS = 5  # maximum number of bars that are visible at once in a terminal
 MIN_UPDATE_SECONDS = 0.2  # minimum seconds between two updates of a notebook's line
-# Minimum time between two lines without a terminal: in seconds, and as a fraction of the
-# time that the stage has lasted.
+# Minimum time between two lines without a terminal: in seconds, and as a fraction of
+# the time that the stage has lasted.
 LINE_INTERVAL = 5.0
 LINE_FRACTION = 0.1
 

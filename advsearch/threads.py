@@ -1,4 +1,5 @@
-"""Set the numbers of threads of torch and Dr.Jit, so that they do not compete for cores.
+"""Set the numbers of threads of torch and Dr.Jit, so that they do not compete for
+cores.
 
 By default, idle OpenMP threads of torch wait in a busy loop, and occupy the cores that
 others need. Here they sleep instead. After a render Dr.Jit's workers are busy for a
@@ -27,8 +28,8 @@ OPENMP_DEFAULTS = {"OMP_WAIT_POLICY": "PASSIVE", "KMP_BLOCKTIME": "0"}
 """
 _CPU_MAX = Path("/sys/fs/cgroup/cpu.max")
 _CPU_INFO = Path("/proc/cpuinfo")
-# The number of threads that the user has set; empty if there is none. `configure` changes
-# the variable later.
+# The number of threads that the user has set; empty if there is none. `configure`
+# changes the variable later.
 _USERS_COUNT = os.environ.get("OMP_NUM_THREADS", "")
 
 # A user who has set this variable has chosen how threads wait.
@@ -169,8 +170,8 @@ def apply_to_drjit() -> None:
 
 
 def _get_default() -> int:
-    """Return the number of threads that the user has set by OMP_NUM_THREADS, or else the
-    number of cores that this process may use.
+    """Return the number of threads that the user has set by OMP_NUM_THREADS, or else
+    the number of cores that this process may use.
     """
     if _USERS_COUNT.isdecimal() and int(_USERS_COUNT) > 0:
         return int(_USERS_COUNT)

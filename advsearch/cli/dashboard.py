@@ -39,25 +39,25 @@ PRIVACY_NOTE = (
     argument(
         "--host",
         default="127.0.0.1",
-        help="address to listen at (default: %(default)s); at others, whoever has the "
-        "printed "
-        "token sees the runs and can add photographs, which the run's model judges here",
+        help="address to listen at (default: %(default)s); at other addresses, anyone "
+        "with the printed token can see the runs and add photographs, which the model "
+        "of the run evaluates on this machine",
     ),
     argument(
         "--port",
         type=int,
         default=PORT,
-        help="port; 0 takes a free one (default: %(default)s)",
+        help="port; 0 for any free one (default: %(default)s)",
     ),
     argument(
         "--https",
         action="store_true",
-        help="speak HTTPS on this machine too; at other addresses that is always so",
+        help="use HTTPS on this machine, too; at other addresses it is always used",
     ),
     argument("--json", action="store_true", help="print the address as JSON"),
     output.add_code_flag,
-    more=". It keeps the photographs that are taken on a run's page, writes nothing "
-    "else, and ends with Ctrl-C",
+    more=". It stores the photographs that are taken on the page of a run, writes "
+    "nothing else, and ends with Ctrl-C",
     examples=(
         "dashboard",
         "dashboard mug-sweep-001 mug-sweep-002",
@@ -124,7 +124,7 @@ def dashboard(args: argparse.Namespace) -> int:
     argument(
         "--bundle",
         metavar="DIR",
-        help="write a folder: a page, the rows and the small pictures",
+        help="write a folder with a page, the rows and the small pictures",
     ),
     output.add_flags,
     examples=("view mug-sweep-001", "view mug-sweep-001 mug-sweep-002 --bundle site"),

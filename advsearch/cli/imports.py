@@ -35,7 +35,7 @@ Understood = tuple[dict[str, Any], list[str]]
     argument(
         "--out",
         metavar="FILE",
-        help="a picture of all that is in it, from four sides (.png)",
+        help="picture to write of the contents, from four sides (.png)",
     ),
     output.add_flags,
     more=". Nothing is written but the picture",
@@ -207,7 +207,8 @@ def _format_nodes(file: str, nodes: Sequence[Any]) -> list[str]:
 
 
 def _describe_mitsuba_file(file: str, out: Path | None) -> Understood:
-    """Describe what advsearch reads from a Mitsuba file, and render it if `out` is given.
+    """Describe what advsearch reads from a Mitsuba file, and render it if `out` is
+    given.
 
     The first shape that is no light is loaded as the object.
 
@@ -273,9 +274,11 @@ def _describe(parser: argparse.ArgumentParser) -> None:
 
 @command(
     _describe,
-    argument("folder", metavar="FOLDER", help="what 3DB wrote"),
+    argument("folder", metavar="FOLDER", help="folder that 3DB wrote"),
     argument("--run", help="name or folder of the run (default: runs/FOLDER-3db-NNN)"),
-    argument("--overwrite", action="store_true", help="replace the run that is there"),
+    argument(
+        "--overwrite", action="store_true", help="replace a run that exists already"
+    ),
     output.add_flags,
 )
 def threedb(args: argparse.Namespace) -> int:

@@ -549,7 +549,7 @@ def make_parser_without_commands() -> tuple[
         dest="command",
         metavar="COMMAND",
         title="commands",
-        help="one of those below; advsearch COMMAND --help explains it",
+        help="one of the commands below; advsearch COMMAND --help explains it",
         parser_class=Parser,
     )
     return parser, subparsers

@@ -153,7 +153,7 @@ def end_output() -> None:
 def _screen(stream: Any, *, raises_errors: bool) -> TextIO:
     """Return a `Screen` that writes to a stream; the stream itself if it is one.
 
-    Without a stream, everything is dropped: Python has none where the descriptor was
+    Without a stream, everything is dropped. Python has none if its descriptor was
     closed.
     """
     if isinstance(stream, Screen):

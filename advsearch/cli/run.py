@@ -28,17 +28,18 @@ from advsearch.viewer.pages import write_page
     argument(
         "file",
         metavar="FILE",
-        help="YAML with settings and values, such as a run's run.yaml",
+        help="YAML file with settings, such as the run.yaml of a run",
     ),
     argument(
         "change", metavar="NAME=VALUE", nargs="*", help="a setting to change: steps=80"
     ),
     argument(
         "--run",
-        help="where the run is kept: a name (kept in runs/) or the path of a folder",
+        help="where the run is stored: a name (for a folder in runs/) or the path of a "
+        "folder",
     ),
     argument(
-        "--overwrite", action="store_true", help="replace a run that is there already"
+        "--overwrite", action="store_true", help="replace a run that exists already"
     ),
     output.add_code_flag,
     output.add_quiet_flags,
@@ -125,11 +126,11 @@ def run_file(
         "change",
         metavar="NAME=VALUE",
         nargs="*",
-        help="a setting to change that decides no number: threads=2",
+        help="a setting to change on which no result depends: threads=2",
     ),
     output.add_code_flag,
     output.add_quiet_flags,
-    more="; what it has evaluated is not rendered again",
+    more="; configurations that were evaluated before are not rendered again",
     examples=(
         "resume mug-texture-001",
         "resume mug-check-001 seconds=600",
@@ -182,7 +183,7 @@ MOST_NAMES = 4  # maximum number of controls of a run that the table names
 
 @command(
     argument(
-        "folder", nargs="?", metavar="FOLDER", help="where to look (default: runs)"
+        "folder", nargs="?", metavar="FOLDER", help="folder of runs (default: runs)"
     ),
     output.add_flags,
 )

@@ -515,7 +515,7 @@ def list_all(args: argparse.Namespace) -> int:
         "word",
         metavar="WORD",
         nargs="?",
-        help="what the names should be like; all without it",
+        help="word that the names should resemble; without it, all names",
     ),
     partial(add_settings, only=("model", "labels")),
     output.add_flags,

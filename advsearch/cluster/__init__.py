@@ -32,8 +32,8 @@ class WorkerTask:
     # "package.module:function", which takes the settings and returns a `BatchFunction`
     function: str
     settings: JsonObject
-    # names of settings that may hold paths, separated by commas; these files are sent to
-    # workers that lack them
+    # names of settings that may hold paths, separated by commas; these files are sent
+    # to workers that lack them
     files: tuple[str, ...] = ()
     threads: int = 1  # number of threads with which a worker renders
     # Seconds that a batch may take at least before its worker is stopped. None if the
@@ -81,8 +81,8 @@ class WorkerStats:
     refused: int = 0  # number of workers that cannot do the task
     retried: int = 0  # number of batches that were submitted again
     batches: int = 0  # number of finished batches
-    # Seconds, summed over all workers: computing batches, loading scenes and models, and
-    # being connected (without loading).
+    # Seconds, summed over all workers: computing batches, loading scenes and models,
+    # and being connected (without loading).
     busy: float = 0.0
     loading: float = 0.0
     alive: float = 0.0

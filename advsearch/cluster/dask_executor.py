@@ -201,7 +201,8 @@ class DaskExecutor(WorkerExecutor):
             try:
                 self._client = self._connect(security, deadline)
                 break
-            # Dask raises these if nothing answers at the address, or something else does
+            # Dask raises these if nothing answers at the address, or something else
+            # does
             except (
                 OSError,
                 TimeoutError,
@@ -324,7 +325,8 @@ class DaskExecutor(WorkerExecutor):
             address: address of the worker.
             version: its version, or the error that reading the version raised. An
                 ImportError or AttributeError means that advsearch is missing or old.
-                After another error, as of a slow worker, the next look asks again.
+                After any other error, such as that of a slow worker, the version is
+                read again later.
         """
         if isinstance(version, str):
             self._refuse(

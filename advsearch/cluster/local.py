@@ -96,8 +96,8 @@ class WorkerProcess:
 
 
 class LocalExecutor(WorkerExecutor):
-    """An executor whose processes are started when they are needed, and replaced if they
-    die.
+    """An executor whose processes are started when they are needed, and replaced if
+    they die.
     """
 
     def __init__(self, count: int) -> None:

@@ -291,8 +291,8 @@ PREDICTED_COLOR = (255, 110, 0)
 """Colors of the ground truth and of predictions, which people with any type of color
 blindness can distinguish.
 """
-# Minimum length of the longest side in pixels. Smaller images are magnified, so that text
-# is readable.
+# Minimum length of the longest side in pixels. Smaller images are magnified, so that
+# text is readable.
 MIN_IMAGE_SIDE = 512
 TINT = 0.45  # opacity of a mask over an image
 LETTERS_PER_SIDE = 28  # the longest side divided by the height of a letter

@@ -159,10 +159,9 @@ def write_sheets(
     pages = list(arrange_pages(pieces, PAPERS[paper]))
     if len(pages) > max_sheets:
         raise InputError(
-            f"sheets: it takes {len(pages)} sheets of {paper}, and up to {max_sheets} are "
-            "written; say that so many are "
-            f"wanted (`sheets={len(pages)}`), or give a larger `paper` or a smaller "
-            "`size`"
+            f"sheets: it takes {len(pages)} sheets of {paper}, but at most "
+            f"{max_sheets} are written; raise the limit (`sheets={len(pages)}`), or "
+            "use a larger `paper` or a smaller `size`"
         )
     with PdfPages(path, metadata={"Title": title, "CreationDate": None}) as file:
         file.savefig(_make_cover(pieces, title, PAPERS[paper], len(pages), profile))

@@ -738,8 +738,8 @@ def _make_image(png: bytes, width: int, alt: str) -> Html:
 CHART_HEIGHT = 300
 WIDE_WIDTH = 720
 NARROW_WIDTH = 350
-"""Height and widths of a chart in CSS pixels. A page has a wide chart for a screen and a
-narrow one for a phone, on which the letters of the wide one would be too small. The
+"""Height and widths of a chart in CSS pixels. A page has a wide chart for a screen and
+a narrow one for a phone, on which the letters of the wide one would be too small. The
 style sheet displays one of them.
 """
 COLORS = {

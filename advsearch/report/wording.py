@@ -301,9 +301,9 @@ def _similarity_text(probability: float, payload: Any) -> str:
     """Return how similar the image is to the best reference, and the rank of the right
     one.
 
-    With reference images it is the probability of the best name. The rank is left out if
-    the right name is the best. Without them, the image is compared with the clean one,
-    and only the cosine is known.
+    With reference images it is the probability of the best name. The rank is left out
+    if the right name is the best. Without them, the image is compared with the clean
+    one, and only the cosine is known.
 
     Args:
         probability: probability of the best reference.
@@ -439,7 +439,8 @@ def format_mistake(
     if outcome is Outcome.LOOSE:
         return f"sees {thing}, but in a loose box"
     if outcome is Outcome.PHANTOM:
-        # the label is "mug elsewhere": "sees a mug elsewhere, and none where this mug is"
+        # the label is "mug elsewhere": "sees a mug elsewhere, and none where this mug
+        # is"
         return f"sees {add_article(label)}, and none where {thing} is"
     if task == CLASSIFICATION:
         return f"calls {thing} {add_article(label)}"
@@ -659,9 +660,7 @@ def format_formation(
 
 
 def format_number(value: Any) -> str:
-    """Return a value as text; a number with the digits that mean something to a
-    reader.
-    """
+    """Return a value as text; a float with four significant digits."""
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 

@@ -58,7 +58,7 @@ class Exporter(ABC):
             run: the run's name or directory, see `advsearch.runs.directory.find_run`.
             out: the file or directory to write.
             options: the values of `options`; None where one was not given.
-            progress: is told of long work.
+            progress: object that displays the progress of long work.
 
         Raises:
             AdvsearchError: the run cannot be exported, or `out` cannot be written.

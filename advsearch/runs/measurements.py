@@ -128,8 +128,8 @@ class Measurements:
         """
         context = self._context
         collected_rows: list[Row] = []
-        # The status of the summaries that are written inside of the loop. It is replaced
-        # when the rows end, or the time is up.
+        # The status of the summaries that are written inside of the loop. It is
+        # replaced when the rows end, or the time is up.
         context.ending = INTERRUPTED
         try:
             with interruptible():
@@ -143,8 +143,8 @@ class Measurements:
         except OutOfTime:
             context.ending = OUT_OF_TIME
         result = make_result(collected_rows)
-        # Stored rows come first. If the user interrupted before any new row, some stored
-        # rows may not have been read, and the earlier result may have more rows.
+        # Stored rows come first. If the user interrupted before any new row, some
+        # stored rows may not have been read, and the earlier result may have more rows.
         may_lack_stored_rows = context.ending == INTERRUPTED and not self.n_new
         if may_lack_stored_rows and (context.run.path / NAME).is_file():
             earlier = read_stored_result(context.run.path)

@@ -43,7 +43,8 @@ LAST_FIELDS = ("warnings", "seconds", "seed", "command_line")
 JsonFloat = Annotated[
     float, BeforeValidator(lambda value: math.nan if value is None else value)
 ]
-"""A number that may be NaN or infinite. In JSON it is null then, which is read as NaN."""
+"""A number that may be NaN or infinite. In JSON it is null then, which is read as NaN.
+"""
 
 Interval = tuple[JsonFloat, JsonFloat]  # lower and upper bound of a 95 % interval
 
@@ -76,7 +77,8 @@ def as_fact(form: str = "{}") -> dict[str, JsonValue]:
 
 
 def optional_field(description: str, **more: Any) -> Any:
-    """Return a field whose default is None, and which is left out of JSON if it is None.
+    """Return a field whose default is None, and which is left out of JSON if it is
+    None.
 
     Args:
         description: description of the field.
@@ -97,7 +99,9 @@ class Fields(BaseModel):
 
     @classmethod
     def from_values(cls, source: object) -> Self:
-        """Return an instance with the values of an object's attributes, or of a mapping."""
+        """Return an instance with the values of an object's attributes, or of a
+        mapping.
+        """
         return cls.model_validate(source)
 
     @classmethod
@@ -145,8 +149,8 @@ class Result(Fields):
 
     @property
     def is_unfinished(self) -> bool:
-        """Whether the run has not come to its end: it is running, or was stopped and can
-        be resumed.
+        """Whether the run has not come to its end: it is running, or was stopped and
+        can be resumed.
         """
         return getattr(self, "ending", None) in (INTERRUPTED, OUT_OF_TIME, RUNNING)
 
@@ -525,8 +529,8 @@ class PlannedGradient(Fields):
 
 
 class PathCut(Fields):
-    """The error of light paths with a maximum length, as the worst case over the measured
-    configurations.
+    """The error of light paths with a maximum length, as the worst case over the
+    measured configurations.
     """
 
     depth: int = Field(description="maximum length of a path in segments")

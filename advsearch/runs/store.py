@@ -34,8 +34,8 @@ from advsearch.trust.stored_files import parse_json
 from advsearch.trust.writing import check_not_moved, note_open, storage_errors
 
 NAME = "results.sqlite"
-# Minimum seconds between two writes that wait for the disk. A power cut may lose the rows
-# in between.
+# Minimum seconds between two writes that wait for the disk. A power cut may lose the
+# rows in between.
 SYNC_INTERVAL = 1.0
 SYNC_SHARE = 0.02  # maximum fraction of the time that waiting for the disk may take
 
@@ -115,8 +115,8 @@ class CachedEvaluation:
     picture: NDArray[np.uint8] | None = None
 
 
-# Cached evaluations are in the table "told", which has these columns after the id of the
-# row.
+# Cached evaluations are in the table "told", which has these columns after the id of
+# the row.
 _CACHED_COLUMNS = "number, u, non_finite, cost, gradient, picture, height"
 _AS_JSON = ("payload", "values", "metrics")
 _COLUMNS = tuple(
@@ -138,8 +138,8 @@ _INSERT_CACHED = (
 class Store:
     """The open database `results.sqlite` of a run.
 
-    Close it, or use it in a `with` block. With `read_only`, it may be read while another
-    process writes it.
+    Close it, or use it in a `with` block. With `read_only`, it may be read while
+    another process writes it.
     """
 
     FILE: ClassVar[str] = NAME  # FILE in the directory of a run
@@ -172,8 +172,8 @@ class Store:
 
     @classmethod
     def open_to_read(cls, run: Path) -> Store:
-        """Open the results in a run directory for reading, beside a process that may
-        write.
+        """Open the results in a run directory for reading, while another process may
+        write them.
         """
         return cls(run / NAME, read_only=True)
 
@@ -476,10 +476,12 @@ _TYPES: dict[str, tuple[type, ...]] = {
     )
     for name, hint in get_type_hints(Row).items()
 } | {"payload": (str, type(None)), "metrics": (str, type(None)), "values": (str,)}
-"""The types of the values in each column. SQLite itself accepts any type in any column."""
+"""The types of the values in each column. SQLite itself accepts any type in any column.
+"""
 
 _INFINITE = (math.inf, -math.inf)
-# Maximum magnitude of a number in a row. Results computed from larger ones may overflow.
+# Maximum magnitude of a number in a row. Results computed from larger ones may
+# overflow.
 MAX_NUMBER = 1e300
 
 MAX_STEP = (1 << 32) - 1

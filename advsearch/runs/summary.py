@@ -196,8 +196,8 @@ depends: the reference pictures of a task, or the files of a model `hf:FOLDER`.
 PACKAGES = ("advsearch", "mitsuba", "drjit", "torch", "numpy")
 
 NOT_READ_AGAIN = ("recipe", "suite")
-"""Settings whose file is copied into the store of the run. A resumed run reads the copy,
-even if the file has changed.
+"""Settings whose file is copied into the store of the run. A resumed run reads the
+copy, even if the file has changed.
 """
 
 

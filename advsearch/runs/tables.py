@@ -48,11 +48,13 @@ class Units:
     """Which rows of a sweep belong to one unit, that is, are not independent.
 
     A draw is a sampled configuration. The images of a draw form a unit: its frames, its
-    repetitions with other noise, and its image with the adversarial scene. If scenes are
-    rendered into the photographs of a folder, all images of a photograph form a unit.
+    repetitions with other noise, and its image with the adversarial scene. If scenes
+    are rendered into the photographs of a folder, all images of a photograph form a
+    unit.
 
     Attributes:
-        sizes: number of values along each axis of the grid; the last one varies fastest.
+        sizes: number of values along each axis of the grid; the last one varies
+            fastest.
         frames: index of the axis whose values are the frames of a drive; None without.
         samples: number of draws at each point of the grid.
         models: number of models, each of which has a row for every image.
@@ -183,8 +185,8 @@ def read_units(store: Store, *, is_sampled: bool = True) -> Units | None:
 
 KIND = "sweep"  # rows of the sweep itself
 EDGES_NOTE = "parts of ranges"
-"""The note of a run with the edges of the intervals into which the range of each sampled
-parameter is divided, by name of the parameter.
+"""The note of a run with the edges of the intervals into which the range of each
+sampled parameter is divided, by name of the parameter.
 """
 
 FIXED_COLUMNS = (
@@ -300,7 +302,8 @@ def make_sweep_frame(
         rows: rows of the sweep.
         extra_columns: function that returns more columns of a row.
     """
-    # units of measurement by column, which `_make_cells` fills while `cells` is iterated
+    # units of measurement by column, which `_make_cells` fills while `cells` is
+    # iterated
     units = dict[str, str]()
     cells = (
         {

@@ -93,8 +93,9 @@ class Tracker:
             self._put((self._compute_metrics(kind, group), group[-1].step))
 
     def close(self) -> None:
-        """Wait, at most `MAX_CLOSE_SECONDS` seconds, until all is told; a second call does
-        nothing.
+        """Wait until all messages are sent, at most `MAX_CLOSE_SECONDS`.
+
+        A second call does nothing.
         """
         self._put(None)
         self._thread.join(MAX_CLOSE_SECONDS)
@@ -131,7 +132,7 @@ class Tracker:
         try:
             self._queue.put_nowait(message)
         except Full:
-            return  # a tracker that is that slow is told less; the run has all of it
+            return  # the tracker is slow; the rows themselves are in the run
 
     def _work(self, folder: Path, settings: Mapping[str, str]) -> None:
         """Send messages until None comes; this is what the thread runs.
@@ -149,7 +150,7 @@ class Tracker:
             close()
         except Exception as error:  # whatever a tracker does, the run goes on
             _LOG.warning(
-                "%s is told nothing more: %s",
+                "nothing more is sent to %s: %s",
                 self._name,
                 str(error)[:300] or type(error).__name__,
             )

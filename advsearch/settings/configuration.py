@@ -45,8 +45,8 @@ if TYPE_CHECKING:
 
 
 ReadTexts = Callable[[Sequence[str], str], Mapping[str, object]]
-"""A function that parses texts such as "NAME=VALUE" to a mapping. Its second argument is
-the name of the setting, for errors. It raises ValueError for texts of another form.
+"""A function that parses texts such as "NAME=VALUE" to a mapping. Its second argument
+is the name of the setting, for errors. It raises ValueError for texts of another form.
 """
 
 
@@ -54,8 +54,8 @@ the name of the setting, for errors. It raises ValueError for texts of another f
 class Setting:
     """The declaration of a setting. `settings` completes the fields that are empty."""
 
-    # The default value, or a function that creates it. `...` if the setting is required,
-    # which `settings` replaces by None.
+    # The default value, or a function that creates it. `...` if the setting is
+    # required, which `settings` replaces by None.
     default: Any
     group: str  # heading in the help
     description: str  # description in the help
@@ -307,8 +307,8 @@ class SettingsError(InputError):
 
 
 class PythonOnly(NamedTuple):
-    """An object of a Python session that a run uses, and that no file and no command can
-    name.
+    """An object of a Python session that a run uses, and that no file and no command
+    can name.
 
     Attributes:
         role: role of the object in the run: "model", "scene", "objective", "policy",

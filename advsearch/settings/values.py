@@ -28,8 +28,8 @@ def to_python(value: Any) -> Any:
 
     The value must not be nested too deeply (`is_shallow`), since this is recursive.
     """
-    # The quantiles of a Python function: this mapping also has the function itself, which
-    # a copy as a plain dict would lose.
+    # The quantiles of a Python function: this mapping also has the function itself,
+    # which a copy as a plain dict would lose.
     if isinstance(value, PythonQuantiles):
         return value
     if isinstance(value, Mapping):

@@ -41,7 +41,8 @@ SCRIPTS = (
     ("make.js", "attack.js"),
     ("make.js", "attack.js", "object.js"),
 )
-"""The combinations of scripts that pages contain. The server allows no other scripts."""
+"""The combinations of scripts that pages contain. The server allows no other scripts.
+"""
 
 
 def make_document(

@@ -162,7 +162,7 @@ def _run_row(name: str, run: listing.ListedRun, can_compare: bool) -> Html:
 
 
 def _comparison_checkbox(name: str) -> Html:
-    """Return the box by which a sweep is chosen to be shown beside others."""
+    """Return the check box that selects a sweep for comparison with others."""
     return make_element(
         "input",
         type="checkbox",
@@ -346,8 +346,8 @@ THUMBNAIL_PATH = re.compile(r"[0-9]+/[0-9]{1,12}\.jpg")
 
 
 class PhotographServer(Protocol):
-    """The interface of the object that serves the pages on which photographs are aligned
-    with the renderings of a run.
+    """The interface of the object that serves the pages on which photographs are
+    aligned with the renderings of a run.
     """
 
     def make_page(
