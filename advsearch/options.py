@@ -291,8 +291,8 @@ def check_takes(what: str, function: Callable[..., object], *names: str) -> None
         ) from None
 
 
-# ---- A configuration in words: named values with units, as controls say them and runs
-# keep them ---------------------
+# ---- A configuration as named values with units, as controls make them and runs store
+# them ---------------------
 
 
 class Value(TypedDict):

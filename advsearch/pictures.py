@@ -39,7 +39,7 @@ MAX_SCANS = 64
 @contextlib.contextmanager
 def without_pillows_limit() -> Iterator[None]:
     """Inside the block, let Pillow open pictures of any size; before one is decoded,
-    `check_pixels` refuses what is too large.
+    `check_pixels` rejects images that are too large.
     """
     pixel_limit = Image.MAX_IMAGE_PIXELS
     Image.MAX_IMAGE_PIXELS = None
@@ -138,7 +138,7 @@ def load_upright(path: Path, side: int) -> npt.NDArray[np.float32]:
     """
     with open_image(path, MAX_FILE_BYTES) as image:
         check_decodable(image, path)
-        # turned as the camera's note in the file says
+        # rotated by the orientation that the camera has stored in the file
         rotated = ImageOps.exif_transpose(image)
         reduced = Image.fromarray(to_8bit_levels(rotated, alpha=False))
         if max(reduced.size) > side:

@@ -138,7 +138,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
             return False
         packages = module.split(".")
         if packages[0] in self.built_ins or packages[0] in self._installed:
-            return False  # what stands before the colon is an entry
+            return False  # the name before the colon is that of an entry
         return all(package.isidentifier() for package in packages)
 
     @cached_property
@@ -178,7 +178,7 @@ def get_first_doc_line(entry: Any) -> str:
 
 
 def load_attribute(target: str) -> Any:
-    """Import what "module:attribute" names."""
+    """Import the attribute that "module:attribute" names."""
     module, _, attribute = target.partition(":")
     return getattr(import_module(module), attribute)
 

@@ -303,7 +303,7 @@ def _name_objects(
 
 
 def _format_report(result: SuiteResult, claim: ClaimResult, repeat: str) -> str:
-    """Return the message of a failed claim; `repeat` is what runs it again."""
+    """Return the message of a failed claim; the command `repeat` runs it again."""
     run = Path(result.run or "")
     lines = [
         f"{claim.name}: {claim.verdict}: {claim.reason}",

@@ -68,8 +68,8 @@ def read_processor_name(cpu_info: Path = _CPU_INFO) -> str:
     """Return the name of the processor; "unknown" if the system does not state it.
 
     Args:
-        cpu_info: file in which Linux describes the processor. If it has no name, Python
-            is asked.
+        cpu_info: file in which Linux describes the processor. If it has no name, that
+            of Python's `platform` is returned.
     """
     try:
         for line in cpu_info.read_text(encoding="utf-8", errors="replace").splitlines():

@@ -76,7 +76,7 @@ def dashboard(args: argparse.Namespace) -> int:
     """
     if not 0 <= args.port <= 65535:
         raise InputError(f"--port: expected a number from 0 to 65535, got {args.port}")
-    # damaged runs are allowed: the page with the list says what is wrong with each
+    # corrupt runs are allowed: the page with the list has an error for each
     runs = [find_run(name, checked=False) for name in args.runs]
     # PHOTOGRAPH_PAGES is "module:function"; an installation may lack the module
     has_photographs = is_present(PHOTOGRAPH_PAGES.partition(":")[0])

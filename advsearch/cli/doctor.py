@@ -77,7 +77,7 @@ class Component:
 
 @command(output.add_flags)
 def doctor(args: argparse.Namespace) -> int:
-    """Check every part of the installation, and print what was found.
+    """Check every component of the installation, and print the results.
 
     Returns:
         The exit status: 0 if everything that is necessary works, else `FELL_SHORT`.
@@ -104,13 +104,13 @@ def doctor(args: argparse.Namespace) -> int:
 
 
 def _print_parts(parts: Sequence[Component], *, is_good: bool) -> None:
-    """Print a table of the parts, what to do about each, and whether all is good.
+    """Print a table of the components with their fixes, and whether all are in order.
 
     Args:
         parts: the parts with their states.
         is_good: whether everything that is necessary works.
     """
-    # late: where rich is missing, --json still says so
+    # late: without rich, --json still works and reports it
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
@@ -211,7 +211,7 @@ def _describe_ending(status: int, error_text: str) -> str:
     Args:
         status: its exit status; if negative, minus the number of the signal that ended
             it.
-        error_text: what it wrote to standard error.
+        error_text: its output to standard error.
     """
     if status == 0:
         return ""
@@ -328,7 +328,7 @@ def find_installed_version(name: str) -> str | None:
 
 
 def _reinstall(name: str) -> str:
-    """Return what to type to install a package again."""
+    """Return the command that installs a package again."""
     return (
         f"pip install --force-reinstall --no-deps {name}, or make clean setup in a "
         "checkout"
@@ -411,7 +411,7 @@ def check_reference_weights() -> Component:
 
 
 def check_kernel_cache(folder: Path) -> Component:
-    """Check the folder in which Dr.Jit keeps compiled kernels between runs."""
+    """Check the folder in which Dr.Jit stores compiled kernels."""
     name = "kernel cache"
     try:
         folder.mkdir(parents=True, exist_ok=True)

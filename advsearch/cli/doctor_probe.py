@@ -99,7 +99,7 @@ def _describe_wall(mi: Any) -> dict[str, Any]:
 
 
 def probe_denoiser() -> str:
-    """Denoise a constant picture, which must stay what it is."""
+    """Denoise a constant picture, which must not change."""
     # what is probed
     import mitsuba_oidn
     import numpy as np

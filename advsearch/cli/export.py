@@ -197,7 +197,7 @@ def _write_table(args: argparse.Namespace, out: Path | None, file_suffix: str) -
             f"{folder}: is a study, whose rows are those of its parts; "
             f"export one of {parts}"
         )
-    # For a terminal the table goes through `print`, which escapes what would steer it;
+    # For a terminal the table goes through `print`, which escapes control characters;
     # else it is written as it is.
     is_for_terminal = out is None and sys.stdout.isatty()
     buffer = io.BytesIO()

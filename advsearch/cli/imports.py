@@ -47,7 +47,7 @@ Understood = tuple[dict[str, Any], list[str]]
     ),
 )
 def file(args: argparse.Namespace) -> int:
-    """Print what is understood of a mesh or scene file, and return the exit status.
+    """Print what advsearch reads from a mesh or scene file, and return the exit status.
 
     With `--out`, a picture of it is rendered, too.
 

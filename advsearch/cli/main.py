@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     from advsearch.settings import Config
 
 # --------------------------------------------------------------------------------
-# The commands: what the help lists, and what carries each out.
+# The commands in the help, and the classes that run them.
 #
 # An experiment's command is made from it (`advsearch.experiment.Experiment`). Others
 # are functions of this package made a `command`, imported when they are used, so that
@@ -65,7 +65,7 @@ Argument = Callable[[argparse.ArgumentParser], object]  # adds something to a pa
 
 
 def argument(*names: str, **options: Any) -> Argument:
-    """Return what adds an argument to a parser, as its `add_argument` does."""
+    """Return a function that adds an argument to a parser, as `add_argument` does."""
     return methodcaller("add_argument", *names, **options)
 
 
@@ -90,7 +90,7 @@ def command(
 ) -> Callable[[Callable[[argparse.Namespace], int]], PlainCommand]:
     """Return a decorator that makes a `PlainCommand` of a function.
 
-    The module and the name of the function stand in `GROUPS`.
+    The module and the name of the function are in `GROUPS`.
     """
     return lambda run: PlainCommand(run, arguments, more, examples)
 
@@ -350,7 +350,7 @@ def get_command(name: str) -> ExperimentCommand | PlainCommand:
 
 
 def get_command_help(name: str) -> str:
-    """Return what a command does, in a clause."""
+    """Return the description of a command, as a clause."""
     target = COMMANDS_OF_THIS_PACKAGE.get(name)
     if target is None:
         return get_experiment_help(name)
@@ -466,7 +466,7 @@ def _run_and_report_errors(words: list[str]) -> int:
         print(f"advsearch: error: {shorten_words(text)}", file=sys.stderr)
         return BAD_INPUT
     except BrokenPipeError:
-        # nobody reads the output any more, as behind `head`
+        # the output is closed, for instance by `head`
         return OK
 
 
@@ -558,7 +558,7 @@ def make_parser_without_commands() -> tuple[
 def _list_commands_with_help() -> list[str]:
     """Return the lines of the help that list the commands in their groups.
 
-    Names are in a column, with the text of each command beside its name.
+    The lines have a column of names and a column of descriptions.
     """
     groups = group_commands()
     longest_name = max(len(name) for group in groups.values() for name in group)

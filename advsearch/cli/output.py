@@ -87,7 +87,7 @@ def output_errors() -> Iterator[None]:
     """Turn errors of standard output inside the block into errors with a message.
 
     Raises:
-        BrokenPipeError: nobody reads it any more, which is no failure.
+        BrokenPipeError: the reader has closed the output, which is no failure.
         StorageError: it cannot be written for another reason.
     """
     try:
@@ -102,9 +102,7 @@ def output_errors() -> Iterator[None]:
 
 @contextmanager
 def escape_output() -> Iterator[None]:
-    """Inside the block, let all that is printed go through a `Screen`, which escapes
-    what would steer a terminal.
-    """
+    """Escape control characters in all output that is printed inside of the block."""
     stdout = sys.stdout
     stderr = sys.stderr
     sys.stdout = _screen(stdout, raises_errors=True)
@@ -268,7 +266,7 @@ def make_resume_command(run: str | Path) -> str:
 
     words = ["advsearch", "resume", format_run_name(run)]
     file = Path(run) / CONFIG
-    # where the file cannot be read, the printed command will say so when it is run
+    # If the file cannot be read, the printed command reports it when it is run.
     with suppress(AdvsearchError):
         config = read_file_config(read_command(file), file, {})
         if not isinstance(config, SceneConfig):
@@ -427,7 +425,7 @@ class InterruptCheckingProgress:
         """See `Progress.stage`.
 
         Raises:
-            KeyboardInterrupt: there was an interrupt that nobody has handled.
+            KeyboardInterrupt: there was an interrupt that was not handled.
         """
         INTERRUPTS.look()
         self._progress.stage(name, total, hint=hint, at_most=at_most)

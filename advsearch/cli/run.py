@@ -82,7 +82,7 @@ def run_file(
     args: argparse.Namespace,
     resumed: Path | None = None,
 ) -> int:
-    """Run what a YAML file describes, and return the exit status.
+    """Run the experiment that a YAML file describes, and return the exit status.
 
     Args:
         file: file with settings.

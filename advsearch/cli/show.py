@@ -70,7 +70,7 @@ def show(args: argparse.Namespace) -> int:
         The exit status.
 
     Raises:
-        InputError: the words name nothing that can be shown.
+        InputError: the words name none of these.
     """
     if args.picture and (args.json or len(args.what) > 1):
         raise InputError(
@@ -177,7 +177,7 @@ def _show_unfinished(run: ListedRun, as_json: bool) -> int:
     """Show a run without a result: how far it is, and how it can be resumed.
 
     Args:
-        run: what the listing of runs knows of it.
+        run: its entry in the list of runs.
         as_json: print JSON instead of text.
 
     Returns:
@@ -283,7 +283,7 @@ def _describe_options(
     options = list[dict[str, Any]]()
     for option, field in list_declared_options(entry).items():
         default = get_option_default(field)
-        # an object, such as another task, stands by its name
+        # an object, such as another task, is represented by its name
         default = to_json_value(getattr(default, "name", default))
         options.append(
             {"name": option, "type": get_option_type(field), "default": default}
@@ -407,7 +407,7 @@ def _find_drawing() -> tuple[Callable[[Path], None] | None, str]:
 
     Returns:
         The function of a picture's path, None if nothing can be drawn; and a sentence
-        about why not, empty if there is nothing to say.
+        with the reason, which is empty otherwise.
     """
     if not sys.stdout.isatty():
         return None, ""
@@ -577,7 +577,7 @@ def _select_labels(names: Sequence[str], word: str | None) -> dict[int, str]:
 
     Args:
         names: all class names.
-        word: what the names should be like; None for all.
+        word: word that the names should resemble; None for all.
     """
     # late, so that --help answers at once
     from advsearch.models.labels import find_similar_labels, is_nothing_name

@@ -50,7 +50,7 @@ class BatchResult:
     """The result of a batch, or of a single item during which workers died."""
 
     items: Sequence[Any]
-    value: Any  # what the call returned
+    value: Any  # return value of the call
     worker: str = ""  # empty in this process
     # name in `WorkerStats.machines`; None if it is like this machine
     machine: str | None = None
@@ -61,7 +61,7 @@ class BatchResult:
         """Return the value of the batch, which must have been computed.
 
         Args:
-            title: what the batch was, for the message.
+            title: name of the batch, for the message.
 
         Raises:
             ClusterError: if there is no value.

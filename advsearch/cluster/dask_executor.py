@@ -448,7 +448,7 @@ class DaskExecutor(WorkerExecutor):
                         return value
             except asyncio.CancelledError:
                 # Dask cancels the future of a lost worker: then the call is repeated.
-                # If asyncio cancels this call, nobody needs its result any more.
+                # If asyncio cancels this call, its result is not needed any more.
                 if future.status != "cancelled":
                     raise
             except KilledWorker:

@@ -90,7 +90,7 @@ class WorkerProcess:
             self._popen.kill()
 
     def close(self) -> None:
-        """End it and release its pipes, which nobody may be reading."""
+        """End it and release its pipes, which may have no reader."""
         with suppress(OSError), self._popen:
             self._popen.kill()
 

@@ -390,7 +390,7 @@ def load_task(task: WorkerTask) -> BatchFunction:
 
 
 def _make_task_key(task: WorkerTask) -> str:
-    """Return a digest of all that decides what a loaded task computes."""
+    """Return a digest of everything on which the results of a loaded task depend."""
     described = [
         task.function,
         task.settings,

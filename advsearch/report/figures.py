@@ -68,7 +68,7 @@ def render_figure(
     """Draw a figure and return it as the contents of files.
 
     Args:
-        draw: draws on the empty figure that it is given.
+        draw: function that draws on the empty figure.
         size: (width, height) of the figure in inches.
         kinds: suffixes of the files to make, png or svg.
         style: matplotlib settings that replace those of `STYLE`.
@@ -273,7 +273,7 @@ def draw_heat_map(
 
 
 def format_axis_title(name: str, unit: str) -> str:
-    """Return what an axis is called: ``pose.yaw [degrees]``."""
+    """Return the title of an axis: ``pose.yaw [degrees]``."""
     return f"{name} [{unit}]" if unit not in ("", "name") else name
 
 
@@ -282,8 +282,8 @@ def render_axes(draw: Callable[[Any], object], size: tuple[float, float]) -> Fig
 
 
 # --------------------------------------------------------------------------------
-# Pictures with something drawn into them, boxes and masks of what is true and what is
-# said; or several on a sheet.
+# Images with boxes and masks of the ground truth and of predictions, and sheets of
+# several images.
 
 Floats = npt.NDArray[np.float32]
 TRUE_COLOR = (0, 190, 255)
@@ -311,7 +311,7 @@ def draw_marks(picture: Any, shapes: Sequence[Shape]) -> Floats:
 
     Args:
         picture: (H, W, 3), display-referred sRGB in [0, 1]; a small one is magnified.
-        shapes: what is drawn, with coordinates in pixels of `picture`.
+        shapes: shapes to draw, with coordinates in pixels of `picture`.
 
     Returns:
         The drawing (h, w, 3), float32 in [0, 1].

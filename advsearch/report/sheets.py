@@ -135,8 +135,8 @@ def write_sheets(
 
     Args:
         path: path of the PDF.
-        pieces: what is printed, at least one.
-        title: title of the whole.
+        pieces: pieces to print, at least one.
+        title: title of the document.
         paper: a name in `PAPERS`.
         profile: the ICC profile of an RGB printer, to which colours are converted; None
             leaves them sRGB.
@@ -268,7 +268,7 @@ def _cut_piece(piece: Piece, width: float, height: float) -> Iterator[PlacedPart
     Cuts lie between pixels. The parts have no position on a page yet.
 
     Args:
-        piece: what is printed.
+        piece: piece to print.
         width: width of a page inside its margins, millimetres.
         height: height of a page inside its margins, millimetres.
 
@@ -471,7 +471,7 @@ def _draw_cut_marks(
 
 
 def _draw_cut_line(axes: Axes, part: PlacedPart, inside: Mask) -> None:
-    """Draw the outline of what is cut out of a part.
+    """Draw the outline along which a part is cut out.
 
     Args:
         axes: axes of the page, in millimetres.

@@ -238,7 +238,7 @@ def list_remarks(result: Result, view: ShownResult) -> list[str]:
 
 
 def list_subjects(result: Result, view: ShownResult) -> list[str]:
-    """Return what a result is about: its own names, or object, controls and model."""
+    """Return the subjects of a result: its own names, or object, controls and model."""
     if view.about:
         return [*view.about]
     subjects = []
@@ -250,7 +250,7 @@ def list_subjects(result: Result, view: ShownResult) -> list[str]:
 
 
 def collect_facts(result: Result, view: ShownResult) -> dict[str, str]:
-    """Return what a result was made with, as texts by name, such as the seed.
+    """Return properties of a run as texts by name, such as the seed.
 
     Facts of the view come first, and replace common facts of the same name. So a view
     leaves out a common fact by an empty text.
@@ -688,7 +688,7 @@ def make_notebook_html(
 
 def _make_section_html(part: ResultPart) -> Html:
     """Return the texts and the table of a part of a result as HTML."""
-    # the texts of a chart say what is on it, and the chart itself is not here
+    # the texts of a chart describe it, and the chart itself is not displayed here
     texts = part.text if part.draw is None else ()
     children = [make_element("p", text) for text in texts if text]
     if part.rows:
@@ -789,7 +789,7 @@ def make_chart_svg(
     above the chart, in the color of the page's text.
 
     Args:
-        draw: draws on the axes that it is given.
+        draw: function that draws on axes of matplotlib.
         description: the text for readers who cannot see the chart.
         width: width in CSS pixels.
         height: height in CSS pixels.
@@ -816,7 +816,7 @@ def make_chart_svg(
     return make_element(
         "svg",
         make_element("title", description),
-        # the width tells the ids of two charts on a page apart
+        # with the width, the ids of two charts on a page differ
         _make_inline_svg(files["svg"].decode("utf-8"), prefix=f"{width}-"),
         viewBox=f"0 0 {width} {height}",
         class_="chart wide" if width == WIDE_WIDTH else "chart narrow",

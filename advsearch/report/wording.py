@@ -111,7 +111,7 @@ AnyPrediction = Any
 
 
 def percent(fraction: float | None, max_decimals: int = MAX_DECIMALS) -> str:
-    """Return ``83 %`` for 0.83. 100 and 0 are said only of exactly 1 and 0."""
+    """Return ``83 %`` for 0.83. Only exactly 1 and 0 become 100 and 0."""
     return (
         "unknown"
         if fraction is None
@@ -169,7 +169,7 @@ def format_fraction_of(
 
 
 def explain_repeats(name: str, repeats: int, units: int) -> str:
-    """Return sentences for a sweep in which nothing is drawn by chance.
+    """Return sentences for a sweep in which nothing is sampled at random.
 
     Then the repeats of a unit (such as a drive) differ in the noise of rendering alone,
     and are no independent predictions.
@@ -265,20 +265,20 @@ def get_marks_legend(task: str) -> str:
 
 
 def format_goal(objective: str, thing: str) -> str:
-    """Return what a search with an objective looks for, as a clause: "makes the model
+    """Return the goal of a search with an objective, as a clause: "makes the model
     miss this mug".
     """
     return _WANTED.get(objective, "makes the model miss {}").format(thing)
 
 
 def format_prediction_cells(task: str, prediction: AnyPrediction) -> list[str]:
-    """Return the two cells of a prediction in a table: what is predicted, and a number.
+    """Return the two cells of a prediction in a table: the label, and a number.
 
     For instance ``["vase", "84 %"]`` and ``["no cup found", "best score of cup
     0.12"]``. The second cell is empty if there is no number.
 
     Args:
-        task: name of the task, which decides what the number is called.
+        task: name of the task, on which the name of the number depends.
         prediction: has the label, the probability and perhaps a payload.
     """
     label = prediction.label
@@ -373,7 +373,7 @@ VISIBLE_HEADS = ("seen", "box", "distance")
 
 
 def format_thing_rows(things: Mapping[str, Any]) -> list[list[str]]:
-    """Return a table of what is visible of each thing: name, visible share, box,
+    """Return a table of the visible objects: name, visible fraction, box,
     distance.
 
     Args:
@@ -394,7 +394,7 @@ def format_thing_rows(things: Mapping[str, Any]) -> list[list[str]]:
 
 
 def format_image_prediction_cells(task: str, prediction: AnyPrediction) -> list[str]:
-    """Return one of the predictions of a whole picture, for a table: ``["cup", "score
+    """Return one of the predictions for a picture, for a table: ``["cup", "score
     0.77"]``, ``["mug", "91 %"]``.
     """
     if prediction.probability is None:
@@ -409,7 +409,7 @@ def format_image_prediction_cells(task: str, prediction: AnyPrediction) -> list[
 
 
 def format_image_prediction(task: str, prediction: AnyPrediction) -> str:
-    """Return one of the predictions of a whole picture on one line: ``cup (score
+    """Return one of the predictions for a picture on one line: ``cup (score
     0.77)``, ``mug 91 %``.
     """
     label, number = format_image_prediction_cells(task, prediction)

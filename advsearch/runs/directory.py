@@ -117,9 +117,9 @@ class RunDirectory:
         removed from it.
 
         Args:
-            run: a name (kept in ``runs/``) or a path; None takes ``runs/<default>-NNN``
-                with the next free number.
-            config: what the run does; a run without it can't be repeated or resumed.
+            run: a name (for a folder in ``runs/``) or a path; None for
+                ``runs/<default>-NNN`` with the next free number.
+            config: its settings; a run without them cannot be repeated or resumed.
             overwrite: whether the new run may replace another one.
             default: name of a run without a name.
 
@@ -298,7 +298,7 @@ class RunDirectory:
         )
 
     def check_unchanged(self, note: str, facts: Mapping[str, Any]) -> None:
-        """Check that what decides the numbers of a run is as it was when the run began.
+        """Check that facts on which the numbers of a run depend have not changed.
 
         Facts are settings, versions of packages, or digests of files. The first call
         stores them. Later calls compare with the stored ones, and store those that are
@@ -309,7 +309,7 @@ class RunDirectory:
             facts: values by name, such as {"torch": "2.13.0"}.
 
         Raises:
-            InputError: a fact is not what it was when it was stored first; the run
+            InputError: a fact differs from the stored one; the run
                 can't go on.
         """
         stored = self.store.read_json_note(note)
@@ -358,8 +358,8 @@ class RunDirectory:
 
         Args:
             *rows: one row for each evaluated configuration.
-            cached: what a search needs to be resumed and the last row lacks, such as
-                the gradient; None if there is nothing.
+            cached: data that a search needs to be resumed and the last row lacks, such
+                as the gradient; None if there is nothing.
         """
         self.store.append(rows, cached)
         if self._tracker is not None:
@@ -476,7 +476,7 @@ class RunDirectory:
     ) -> None:
         """Close the directory; after an error, remove it if it is new and empty.
 
-        Without an error it is checked first that nobody moved it meanwhile.
+        Without an error it is checked first that it was not moved in the meantime.
         """
         # A new directory is removed only if the block raised before it stored anything.
         if error is None:
@@ -559,14 +559,14 @@ def check_links(run: Path) -> None:
 
 
 def locate_run(run: str | Path) -> Path:
-    """Return where `run` is kept: a bare name in ``runs/``, a path as it is."""
+    """Return the folder of a run: a name becomes ``runs/NAME``, a path is unchanged."""
     path = Path(run)
     is_name = isinstance(run, str) and os.sep not in run and run not in (".", "..")
     return HOME / path if is_name else path.expanduser()
 
 
 def format_run_name(path: str | Path) -> str:
-    """Return what a user types to name the run in a folder.
+    """Return the text by which a user refers to the run in a folder.
 
     It is the name of the folder if that is in ``runs/``, else its path.
     """
@@ -603,7 +603,7 @@ def read_python_only(path: Path) -> list[PythonOnly]:
 
     No file and no command can name them, so that the run cannot be repeated from its
     `run.yaml`. They are noted as pairs of role and name. A pair of another form is left
-    out, as the file may come from somebody else.
+    out, since another person may have written the file.
     """
     if not (path / store.NAME).is_file():
         return []

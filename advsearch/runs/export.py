@@ -96,7 +96,7 @@ def list_columns(rows: Iterable[Row]) -> list[str]:
     Metrics and values stand between the fixed columns, in the order in which they first
     occur.
     """
-    # the keys of these dictionaries are sets that keep their order
+    # the keys of these dictionaries serve as ordered sets
     metrics = dict[str, None]()
     values = dict[str, None]()
     for row in rows:

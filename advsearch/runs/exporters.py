@@ -57,7 +57,7 @@ class Exporter(ABC):
         Args:
             run: the run's name or directory, see `advsearch.runs.directory.find_run`.
             out: the file or directory to write.
-            options: the values of `options`; None where one was not given.
+            options: the values of `options`; None for flags that were not used.
             progress: object that displays the progress of long work.
 
         Raises:

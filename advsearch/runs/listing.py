@@ -143,7 +143,9 @@ def _make_damaged_run(path: Path) -> ListedRun:
 
 
 def _state(path: Path) -> object:
-    """Return what changes when a file is written; None if it is missing or empty."""
+    """Return a value that changes when a file is written; None if it is missing or
+    empty.
+    """
     with suppress(OSError):
         file = os.lstat(path)
         if file.st_size:  # who reads leaves an empty log
@@ -225,7 +227,7 @@ def _find_start_time(path: Path) -> float | None:
 
 @contextmanager
 def _collect_faults(faults: list[str], file: Path) -> Iterator[None]:
-    """Note what is wrong with a file, but not that it is missing."""
+    """Add errors about a file to the faults, but not that it is missing."""
     try:
         yield
     except AdvsearchError as error:

@@ -51,7 +51,7 @@ class Measurements:
 
         Args:
             key: key of the measurement in the store of the run.
-            measure: measures it; what it returns must have a JSON form.
+            measure: function that measures it and returns a value with a JSON form.
 
         Raises:
             OutOfTime: it would have to be measured, the time is up, and something was

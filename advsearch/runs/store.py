@@ -188,7 +188,7 @@ class Store:
 
         Args:
             rows: rows of evaluations.
-            cached: what a search needs to be resumed and the last row does not have,
+            cached: data that a search needs to be resumed and the last row lacks,
                 such as the gradient of its evaluation; None if there is nothing.
         """
         check_not_moved(self.path)
@@ -263,7 +263,7 @@ class Store:
         )
 
     def read_cached(self, kind: str, step: int) -> tuple[Row, CachedEvaluation] | None:
-        """Return a row of a search, with what the search needs of it to be resumed.
+        """Return a row of a search, with the data that the search needs to be resumed.
 
         Args:
             kind: kind of the search.
@@ -295,7 +295,7 @@ class Store:
             until: only rows with at most this id.
         """
         query = (
-            # NULL instead of the gradient, which nobody needs here
+            # NULL instead of the gradient, which is not needed here
             "number, u, non_finite, cost, NULL, picture, height FROM told JOIN "
             "evaluations ON row = id "
             "WHERE kind = ? AND id > ? AND id <= ? AND picture IS NOT NULL ORDER BY id"
@@ -307,7 +307,7 @@ class Store:
 
     @property
     def has_cached(self) -> bool:
-        """Whether there is something that searches were told: the run is not done."""
+        """Whether there are cached evaluations: then the run is not done."""
         return bool(next(self._select("EXISTS (SELECT * FROM told)"))[0])
 
     def delete_cached(self) -> None:
@@ -381,7 +381,7 @@ class Store:
         return any(self._select("key FROM meta WHERE key LIKE ? LIMIT 1", "answer %"))
 
     def write_note(self, key: str, value: str) -> None:
-        """Keep a text under `key`, in place of what was there."""
+        """Store a text under a key, and replace an earlier one."""
         check_not_moved(self.path)
         with storage_errors(self.path), self._db:
             self._db.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", (key, value))
@@ -490,8 +490,8 @@ MAX_STEP = (1 << 32) - 1
 def _decode(values: tuple[Any, ...], path: Path) -> Row:
     """Return a row from the values of its columns.
 
-    Each value is checked, since the file may come from somebody else, and SQLite allows
-    any type in any column.
+    Each value is checked, since another person may have written the file, and SQLite
+    allows any type in any column.
 
     Args:
         values: values in the order of the fields of `Row`.

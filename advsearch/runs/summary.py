@@ -58,7 +58,7 @@ def read_result(folder: Path) -> Result:
     Its ending is `RUNNING` if it is not finished and a process works on the run.
 
     Raises:
-        FileFormatError: there is none, or it is not what this version writes.
+        FileFormatError: there is none, or its contents are not those of this version.
     """
     result = read_stored_result(folder)
     return (
@@ -202,7 +202,7 @@ copy, even if the file has changed.
 
 
 def collect_versions(settings: Mapping[str, object]) -> dict[str, str]:
-    """Return what decides the numbers of a run apart from its settings.
+    """Return facts on which the numbers of a run depend, apart from its settings.
 
     These are the versions of Python and of packages by name, and the SHA-256 of each
     file and each bundled object, environment or model that the settings name.
@@ -426,7 +426,7 @@ def _digest_folder(folder: Path, pattern: str) -> str:
 
 
 def _find_paths(value: object) -> Iterator[str]:
-    """Yield what may be the path of a file in a setting.
+    """Yield the texts in a setting that may be paths of files.
 
     Names are separated by commas. Some name a file in a part of the text:
     ``reference@weights.safetensors``, ``scene.glb#NODE`` and

@@ -109,7 +109,7 @@ class Units:
         draw.
 
         Args:
-            image_index: number of the picture in the whole sweep, or an array of them.
+            image_index: index of the image in the sweep, or an array of indices.
         """
         # Each scene has `scene` images, all in one photograph. The photographs are used
         # in turn.
@@ -125,7 +125,7 @@ class Units:
         with and without an adversarial scene are of one draw.
 
         Args:
-            image_index: number of the picture in the whole sweep, or an array of them.
+            image_index: index of the image in the sweep, or an array of indices.
         """
         # The second half repeats the draws with the adversarial scene.
         if self.again:

@@ -135,7 +135,7 @@ class Tracker:
             return  # the tracker is slow; the rows themselves are in the run
 
     def _work(self, folder: Path, settings: Mapping[str, str]) -> None:
-        """Send messages until None comes; this is what the thread runs.
+        """Send messages until None comes. This is the main function of the thread.
 
         Args:
             folder: folder of the run.

@@ -93,7 +93,7 @@ class Setting:
         elif isinstance(self.default, float):
             default = f"{self.default:g}"
         elif self.default is None:
-            default = self.otherwise  # what it means that there is no value
+            default = self.otherwise  # the meaning of None
         else:
             default = str(self.default)
         suffix = f" (default: {default})" if default else ""
@@ -121,7 +121,7 @@ def setting(
     Args:
         default: the default value, or a function that creates it.
         group: group of settings in the help.
-        description: what the setting is, for the help.
+        description: description of the setting, for the help.
         expects: the values that it takes, in words; "" to derive them from the type.
         unit: unit of measurement; "" for none.
         otherwise: meaning of the default None, for the help.
@@ -484,7 +484,7 @@ class Config(BaseModel):
     @property
     def left_out(self) -> tuple[OmittedSetting, ...]:
         """The settings of the file that were not taken over, since they do more than
-        decide what happens in the run.
+        change what happens in the run.
         """
         return self._left_out
 

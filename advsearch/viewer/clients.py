@@ -124,7 +124,7 @@ class ConnectionPool:
         self._ready: LifoQueue[tuple[socket.socket, Any] | None] = LifoQueue()
         self._connections: dict[int, _Connection] = {}  # by the thread of their worker
         self._closed = threading.Event()
-        # set unless `serve` runs, so that `close` never waits for what has not begun
+        # set unless `serve` runs, so that `close` does not wait if it was never called
         self._ended = threading.Event()
         self._ended.set()
 

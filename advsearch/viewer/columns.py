@@ -293,7 +293,7 @@ def _parameter_columns(
             unit = ""
             values, levels = _encode_levels(column)
         else:
-            # what is too large for float32 becomes infinite, without a warning
+            # values too large for float32 become infinite, without a warning
             with np.errstate(over="ignore"):
                 values = column.to_numpy(np.float32)
         columns[f"parameter {index}"] = values

@@ -191,7 +191,7 @@ def _cover_link(run: listing.ListedRun, address: str) -> Html:
 
 
 def _run_subject(name: str, run: listing.ListedRun, address: str) -> Html:
-    """Return what a run is about, with a link to its page for photographs."""
+    """Return the subjects of a run, with a link to its page for photographs."""
     facts = (run.command, wording.shorten_names(run.object), " and ".join(run.controls))
     photographs = None
     if run.command in ("attack", "sweep"):
@@ -529,7 +529,7 @@ class Dashboard(HTTPServer):
 
     def make_list_page(self) -> str:
         """Return the page that lists the runs."""
-        with self._listing:  # one thread reads, the others find what it has cached
+        with self._listing:  # one thread reads, the others find its cached entries
             return make_list_page(self.list_runs())
 
     def serve_forever(self, poll_interval: float = CHECK_INTERVAL) -> None:

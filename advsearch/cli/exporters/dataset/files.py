@@ -117,7 +117,7 @@ def _find_category(label: str, labels: tuple[str, ...]) -> int | None:
 def write_dataset(
     run: str, out: Path, format: str, *, every: bool, progress: Progress
 ) -> tuple[int, list[str]]:
-    """Write the pictures of a run as a dataset, with what is true of them.
+    """Write the pictures of a run as a dataset, with their ground truth.
 
     The dataset is written in full or not at all. If there are no pictures, nothing is
     written.
@@ -263,7 +263,7 @@ def write_coco_index(
 
 
 def make_notes(categories: Categories, n_changed: int) -> list[str]:
-    """Return sentences about what a reader of the dataset has to know.
+    """Return sentences that users of the dataset should know.
 
     Args:
         categories: the categories of the dataset.
@@ -357,7 +357,7 @@ def make_thing(number: int, image: int, thing: Any, category: int) -> dict[str, 
     Args:
         number: the id of the annotation.
         image: the id of its picture.
-        thing: what is true of it.
+        thing: its ground truth.
         category: the index of its label.
     """
     fraction = thing.visible_fraction

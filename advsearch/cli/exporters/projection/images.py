@@ -64,7 +64,7 @@ def write_projection(run: str | Path, out: Path) -> list[str]:
         out: the folder, which must not exist.
 
     Returns:
-        Sentences about what to set.
+        Sentences about the settings of the projectors.
 
     Raises:
         InputError: the scene has no projector, or the folder is there already; other

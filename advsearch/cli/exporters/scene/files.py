@@ -82,7 +82,7 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
 
 
 def _check_backdrop(backdrop: torch.Tensor | None, folder: Path, *, hazy: bool) -> None:
-    """Check that a scene file of Mitsuba can have what is behind the scene.
+    """Check that a scene file of Mitsuba can represent the background.
 
     Args:
         backdrop: a plain background (3,) or a photograph (H, W, 3); None without.
@@ -112,7 +112,7 @@ def check_free(path: Path, out: Path) -> None:
     Args:
         path: the XML file of the scene. The other files have names that begin with its
             own.
-        out: what the user named: that file, or its folder.
+        out: that file or its folder, as the user named it.
 
     Raises:
         InputError: one of the files exists, there is a file in place of the folder, or
@@ -203,10 +203,10 @@ def write_gltf(run: str | Path, out: Path) -> list[str]:
         out: a file that ends in .glb.
 
     Returns:
-        Sentences about what is not as in the run.
+        Sentences about differences from the scene of the run.
 
     Raises:
-        InputError: the file is called otherwise; other errors as for
+        InputError: the file has another suffix; other errors as for
             `AdversarialRun.load`.
     """
     if out.suffix.lower() != GLB:
