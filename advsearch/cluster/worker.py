@@ -337,10 +337,14 @@ def _describe_failure(error: Exception) -> tuple[Failure, str]:
     """
     if isinstance(error, MissingFilesError):
         return Failure.MISSING_FILES, f"it lacks {error}"
+    # The machine lacks software such as LLVM, or its disk is full: another worker may
+    # be able to do the task.
     if isinstance(error, (EnvironmentSetupError, StorageError)):
         return Failure.UNFIT, str(error)
+    # Any other error of this kind is about the input of the user.
     if isinstance(error, AdvsearchError):
         return Failure.INPUT, str(error)
+    # A file or a package is missing, for instance.
     if isinstance(error, (OSError, ImportError)):
         return Failure.UNFIT, f"{type(error).__name__}: {error}"
     return Failure.BUG, traceback.format_exc()

@@ -436,7 +436,7 @@ def _encode(row: Row, stamp: float) -> tuple[Any, ...]:
     """Return a row as the values of its columns, for SQLite.
 
     Numbers of NumPy and torch become numbers of Python, mappings become JSON, and empty
-    metrics become NULL. Time and id stand last in the columns.
+    metrics become NULL. Time and id are the last columns.
 
     Args:
         row: row of an evaluation.
@@ -450,8 +450,11 @@ def _encode(row: Row, stamp: float) -> tuple[Any, ...]:
         elif name in _AS_JSON and value is not None:
             value = _encode_json(value)
         else:
+            # SQLite stores these as they are. Most values are of this kind, so
+            # `to_json_value`, which takes longer, is only called for others.
             is_finite_float = type(value) is float and math.isfinite(value)
-            if type(value) not in _SIMPLE and not is_finite_float:
+            is_simple = type(value) in _SIMPLE or is_finite_float
+            if not is_simple:
                 value = to_json_value(value)
         values.append(value)
     return (*values, stamp, row.id)

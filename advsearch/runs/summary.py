@@ -357,7 +357,9 @@ def compute_file_digests(settings: Mapping[str, object]) -> dict[str, str]:
     for name, value in settings.items():
         for path in _find_paths(value):
             with suppress(OSError, ValueError):
-                # One by one: if a file cannot be read, the digests before it stay.
+                # The files of the path, and those that were read for them. They are
+                # added one by one: if a file cannot be read, the others before it
+                # remain. The name of the setting tells whether it may name files.
                 for file_name, digest in _iterate_digests(name, path):
                     digests[file_name] = digest
     return digests
@@ -417,6 +419,7 @@ def _digest_folder(folder: Path, pattern: str) -> str:
             which.
     """
     paths = sorted(islice(folder.glob(pattern), MAX_FILES))
+    # Joined without separator: all digests have the same length.
     lines = [
         f"{path.relative_to(folder).as_posix()}\n{_digest_file(path)}"
         for path in paths
