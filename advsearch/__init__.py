@@ -1,12 +1,13 @@
-"""advsearch: find the scene that a vision model gets wrong most badly.
+"""advsearch: find the worst-case scene for a vision model.
 
     scene = advsearch.load_scene("mug", environment="studio")
     model = advsearch.load_model("reference")
     result = advsearch.attack(scene, model, controls=["texture"])
 
-Nothing heavy is imported until one of these is used. Editors and type checkers read the
-block of imports; of the experiments other than `attack`, `sweep` and `render` the class
-of settings documents the keywords.
+Large packages are only imported when one of these names is used. Editors and type
+checkers read the block of imports below. The keywords of `attack`, `sweep` and `render`
+are declared in their signatures; those of other experiments are documented by the
+classes of their settings.
 """
 
 from __future__ import annotations
@@ -71,12 +72,12 @@ _HOMES = {
     "measured_palette": "advsearch.api.chart",
     "photo_agreement": "advsearch.questions.photographs.carry_out",
 }
-"""The public names, and the module of each. Every experiment is public too."""
+"""The module of each public name. Every experiment is public, too."""
 _MODULES = ("controls", "losses", "maite", "testing")  # public modules
 __all__ = sorted({*_HOMES, *_MODULES, *list_built_ins("experiment")})
 
 
-if not TYPE_CHECKING:  # else a checker would take any name
+if not TYPE_CHECKING:  # otherwise a type checker would accept any name
 
     def __getattr__(name: str) -> Any:
         """Import a name of the public interface on first use (PEP 562).

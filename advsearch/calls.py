@@ -1,5 +1,7 @@
-"""Check calls from Python: suggest the keyword that another library's keyword
-corresponds to, and reject wrong types with a sentence.
+"""Check the arguments of calls from Python.
+
+An unknown keyword is reported with the keyword that is probably meant, such as one that
+other libraries use. A value of a wrong type is reported with the expected types.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from advsearch.options import describe_value
 OTHER_TERMS = {"eot": "over", "minimal_perturbation": "smallest"}
 """Terms of the literature for settings that have another name here."""
 DEVICES = ("device", "cuda", "gpu", "use_cuda")
-
+# Why keywords of other libraries do not exist here.
 UNSUPPORTED_KEYWORDS = {
     **dict.fromkeys(
         DEVICES,
@@ -47,7 +49,7 @@ ALIASES = {
     *"Controls Loss ProgressOption SettingValues Texture Read MakeOptimizer "
     "Examples Unpack Literal UniqueNames StackedTensors Names Named Tensor".split()
 }
-"""Names in annotations that are no classes."""
+"""Names in annotations that are no classes. Their values are not checked."""
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
@@ -68,10 +70,10 @@ def make_unexpected_error(
         if name in known:
             continue
         suggestions, reason = suggest_keyword(name, known)
-        # No keyword chooses a device. So names that are only spelled like "device" are
-        # not suggested.
-        is_device = name.lower() in DEVICES
-        if not suggestions and not is_device:
+        # No keyword chooses a device, so a similarly spelled one would be a wrong
+        # suggestion for `device`.
+        chooses_device = name.lower() in DEVICES
+        if not suggestions and not chooses_device:
             suggestions = find_similar_names(name, known)[:2]
         hint = ""
         if suggestions:

@@ -1,7 +1,8 @@
-"""The built-in parts that somebody could also add from a package: where each is, and a
-line of help.
+"""The catalog of built-in parts: experiments, controls, policies, tasks and so on.
 
-Nothing is imported before it is needed. A part whose module is missing is left out.
+Other packages may add parts of these kinds, too. The catalog has the module and a line
+of help of each part. A module is imported when its part is used for the first time. A
+part whose module is missing is left out.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ class BuiltIn(NamedTuple):
         kind: "experiment", "control", "policy", "task", "model source", "recognizer" of
             networks from Python, "exporter", "reader" of mesh files, or "converter" of
             files to glTF.
-        name: the word for it on the command line; of a reader or converter the suffix
-            of its files, of a recognizer the library of its networks.
+        name: its name on the command line. For a reader or converter it is the suffix
+            of its files, and for a recognizer the library of its networks.
         target: "module:attribute" that is imported when the part is used.
         help: what it does, in a line that begins in lower case and has no full stop.
     """
@@ -58,20 +59,20 @@ BUILT_INS = (
         "experiment",
         "render",
         f"{_EXPERIMENTS}.render:render",
-        "render a picture of a scene, and say what the model sees in it",
+        "render a picture of a scene, with the prediction of the model",
     ),
     BuiltIn(
         "experiment",
         "region",
         f"{_EXPERIMENTS}.region:region",
-        "grow a box around a configuration in which the model's verdict stays the same",
+        "find a box around a configuration in which the model stays right, or wrong",
     ),
     BuiltIn(
         "experiment",
         "explain",
         f"{_EXPERIMENTS}.explain:explain",
-        "say in words where a model is wrong, from the rows of sweeps, and confirm it "
-        "by fresh renders",
+        "find rules about where a model is wrong, from the rows of sweeps, and confirm "
+        "them by new renders",
     ),
     BuiltIn(
         "experiment",
@@ -84,7 +85,7 @@ BUILT_INS = (
         "experiment",
         "recipe",
         f"{_EXPERIMENTS}.recipe:recipe",
-        "run a whole experiment that a recipe describes, and write a page of figures",
+        "run the full experiment of a recipe, and write a page with figures",
     ),
     BuiltIn(
         "experiment",
@@ -97,46 +98,47 @@ BUILT_INS = (
         "experiment",
         "test",
         f"{_EXPERIMENTS}.test:test",
-        "test claims about a model, each found held, failed or undecided: a gate at "
-        "every change",
+        "test claims about a model, for instance at every change of it; each holds, "
+        "fails or is undecided",
     ),
     BuiltIn(
         "experiment",
         "replay",
         f"{_EXPERIMENTS}.replay:replay",
-        "render the adversarial scene of a run again under other conditions, beside "
-        "the clean scene",
+        "render the adversarial scene of a run again under other conditions, and the "
+        "clean scene for comparison",
     ),
     BuiltIn(
         "experiment",
         "check",
         f"{_EXPERIMENTS}.check:check",
-        "check every gradient against differences; show how a search gets them and "
-        "what it leaves out",
+        "compare every gradient with finite differences; show how a search computes "
+        "them and what it leaves out",
     ),
     BuiltIn(
         "experiment",
         "precision",
         f"{_EXPERIMENTS}.precision:precision",
-        "measure error against run time, draw it, and recommend settings",
+        "measure error and run time of renders and gradients, and recommend settings",
     ),
     BuiltIn(
         "experiment",
         "stability",
         f"{_EXPERIMENTS}.stability:stability",
-        "run stiff and extreme cases, and check that each of them holds",
+        "run difficult and extreme scenes, and check the result of each",
     ),
     BuiltIn(
         "experiment",
         "twins",
         f"{_EXPERIMENTS}.twins:twins",
-        "measure on photographs with known poses how far verdicts on renders hold",
+        "measure on photographs with known poses how well renders predict whether the "
+        "model is right",
     ),
     BuiltIn(
         "control",
         "pose",
         f"{_CONTROLS}.pose:PoseControl",
-        "where the object stands, how it is turned, and how large it is",
+        "the position, the rotation and the size of the object",
     ),
     BuiltIn(
         "control",
@@ -148,127 +150,125 @@ BUILT_INS = (
         "control",
         "path",
         f"{_CONTROLS}.path:PathControl",
-        "the camera, the object or both travel along a path; a frame is a time",
+        "the camera, the object or both move along a path; a frame is a time",
     ),
     BuiltIn(
         "control",
         "texture",
         f"{_CONTROLS}.texture:TextureControl",
-        "the base-colour map of the object or another mesh, inside a ball around the "
-        "original",
+        "the base color texture of the object or another mesh, inside a norm ball "
+        "around the original",
     ),
     BuiltIn(
         "control",
         "material",
         f"{_CONTROLS}.material:MaterialControl",
-        "the object's gloss, metal, coat and tint, and which named material covers it",
+        "the object's gloss, metal, coat and tint, or a named material that covers it",
     ),
     BuiltIn(
         "control",
         "light",
         f"{_CONTROLS}.light:LightControl",
-        "a lamp: where it stands, its colour, its power, and the size of an area light",
+        "a lamp: its position, color and power, and the size of an area light",
     ),
     BuiltIn(
         "control",
         "projector",
         f"{_CONTROLS}.projector:ProjectorControl",
-        "a picture that a projector throws onto the object",
+        "a picture that a projector projects onto the object",
     ),
     BuiltIn(
         "control",
         "spot",
         f"{_CONTROLS}.projector:SpotControl",
-        "the spot of a torch or a laser on the object",
+        "the spot of a flashlight or a laser on the object",
     ),
     BuiltIn(
         "control",
         "shadow",
         f"{_CONTROLS}.shadow:ShadowControl",
-        "a dark card that throws a shadow onto the object, out of the camera's sight",
+        "a dark card that casts a shadow onto the object, invisible to the camera",
     ),
     BuiltIn(
         "control",
         "environment",
         f"{_CONTROLS}.environment:EnvironmentControl",
-        "which environment lights the scene, how it is turned, how bright it is, and "
-        "its colour",
+        "the environment that lights the scene, and its rotation, brightness and color",
     ),
     BuiltIn(
         "control",
         "sky",
         f"{_CONTROLS}.sky:SkyControl",
-        "a clear sky instead of the environment: where the sun stands, and how hazy "
-        "the air is",
+        "a clear sky instead of the environment: the position of the sun, and the haze",
     ),
     BuiltIn(
         "control",
         "geometry",
         f"{_CONTROLS}.geometry:GeometryControl",
-        "a smooth change of the object's shape, at most so far",
+        "a smooth change of the object's shape, up to a maximum distance",
     ),
     BuiltIn(
         "control",
         "things",
         f"{_CONTROLS}.things:ThingsControl",
-        "where the things beside the object stand, how they are turned, and whether "
-        "they are there",
+        "the positions and rotations of the other objects in the scene, and whether "
+        "they are present",
     ),
     BuiltIn(
         "control",
         "body",
         f"{_CONTROLS}.body:BodyControl",
-        "what a person is like, how they stand or walk, and how a rigged file of your "
-        "own moves",
+        "the look, the pose and the walk of a person, or the joints and animations of "
+        "a rigged file",
     ),
     BuiltIn(
         "control",
         "patch",
         f"{_CONTROLS}.patch:PatchControl",
-        "a printed square stuck onto the object: its pixels, place, size and turn",
+        "a printed square on the object: its pixels, position, size and rotation",
     ),
     BuiltIn(
         "control",
         "occlusion",
         f"{_CONTROLS}.occlusion:OcclusionControl",
-        "a second object between the camera and the object, hiding a wanted share of it",
+        "a second object between the camera and the object, which hides a fraction of it",
     ),
     BuiltIn(
         "control",
         "contents",
         f"{_CONTROLS}.contents:ContentsControl",
-        "what a vessel is filled with, and how high: water, coffee and milk",
+        "the liquid in a vessel (water, coffee or milk), and how full it is",
     ),
     BuiltIn(
         "control",
         "background",
         f"{_CONTROLS}.background:BackgroundControl",
-        "a plain colour behind the object; the environment keeps lighting it",
+        "a plain color behind the object, which the environment still lights",
     ),
     BuiltIn(
         "control",
         "backdrop",
         f"{_CONTROLS}.backdrop:BackdropControl",
-        "which photograph of a folder the scene is rendered into, seen by its camera",
+        "the photograph of a folder into which the scene is rendered, with its camera",
     ),
     BuiltIn(
         "control",
         "haze",
         f"{_CONTROLS}.haze:HazeControl",
-        "a uniform haze around camera and object: how dense it is, and its colour",
+        "a uniform haze around camera and object: its density and color",
     ),
     BuiltIn(
         "control",
         "lens",
         f"{_CONTROLS}.lens:LensControl",
-        "translucent, blurred dots on the camera's lens: their places, sizes, colours, "
-        "opacities",
+        "translucent, blurred dots on the camera's lens: their positions, sizes, colors "
+        "and opacities",
     ),
     BuiltIn(
         "control",
         "sensor",
         f"{_CONTROLS}.sensor:SensorControl",
-        "what a camera adds: noise, mosaic, white balance, chromatic aberration, "
+        "effects of a camera: noise, mosaic, white balance, chromatic aberration, "
         "vignetting, JPEG",
     ),
     BuiltIn(
@@ -281,13 +281,13 @@ BUILT_INS = (
         "control",
         "mitsuba",
         f"{_CONTROLS}.mitsuba:MitsubaControl",
-        "anything else in the scene: numbers and colours by Mitsuba's own names",
+        "any other number or color in the scene, by its name in Mitsuba",
     ),
     BuiltIn(
         "policy",
         "adam",
         f"{_POLICIES}.pgd:Adam",
-        "Adam (Kingma and Ba 2015) uphill, projected onto the domain after every step",
+        "Adam (Kingma and Ba 2015) as ascent, projected onto the domain after each step",
     ),
     BuiltIn(
         "policy",
@@ -299,19 +299,19 @@ BUILT_INS = (
         "policy",
         "auto",
         f"{_POLICIES}.auto:Auto",
-        "what to use first; it has no options",
+        "chooses a policy by itself: try it first; it has no options",
     ),
     BuiltIn(
         "policy",
         "cmaes",
         f"{_POLICIES}.evolution:CMAES",
-        "CMA-ES (Hansen and Ostermeier 2001; Hansen 2016) as pycma has it",
+        "CMA-ES (Hansen and Ostermeier 2001; Hansen 2016) with the package pycma",
     ),
     BuiltIn(
         "policy",
         "grid",
         f"{_POLICIES}.sampling:Grid",
-        "every combination of evenly spaced values, then nothing more",
+        "every combination of evenly spaced values, once",
     ),
     BuiltIn(
         "policy",
@@ -335,29 +335,28 @@ BUILT_INS = (
         "policy",
         "portfolio",
         f"{_POLICIES}.auto:Portfolio",
-        "lets several policies search side by side and goes on with those that reached "
-        "more",
+        "runs several policies in parallel, and continues with the most successful ones",
     ),
     BuiltIn(
         "policy",
         "random",
         f"{_POLICIES}.sampling:Random",
-        "independent samples within the budget, by turns at the extremes of the norm "
+        "independent samples within the budget, alternately at the extremes of the norm "
         "balls and in their interior",
     ),
     BuiltIn(
         "policy",
         "restarts",
         f"{_POLICIES}.auto:Restarts",
-        "lets a policy search `times` times, each with an equal share of the renders; "
-        "they take turns, step by step",
+        "runs a policy `times` times, each with an equal part of the renders; the runs "
+        "alternate step by step",
     ),
     BuiltIn(
         "policy",
         "sobol",
         f"{_POLICIES}.sampling:Sobol",
-        "a scrambled Sobol sequence over the whole domain (Sobol 1967; scrambled as by "
-        "Owen 1998, Matousek 1998)",
+        "a scrambled Sobol sequence over the full domain (Sobol 1967; scrambling of Owen "
+        "1998, Matousek 1998)",
     ),
     BuiltIn(
         "task",
@@ -369,50 +368,49 @@ BUILT_INS = (
         "task",
         "detection",
         f"{_TASKS}.detection:Detection",
-        "a model finds the object: one of its boxes has a right name, a score of "
-        "`confidence`, overlaps the true box",
+        "a model detects the object: one of its boxes has a right label and a score of "
+        "`confidence`, and overlaps the true box",
     ),
     BuiltIn(
         "task",
         "segmentation",
         f"{_TASKS}.segmentation:Segmentation",
-        "a model gives at least `accuracy` of the object's pixels a right class; "
-        "pixels beside it don't count",
+        "a model gives at least a fraction `accuracy` of the object's pixels a right "
+        "class; other pixels do not count",
     ),
     BuiltIn(
         "task",
         "depth",
         f"{_TASKS}.depth:Depth",
-        "a model judges how far the object is: off by less than a factor of 1 + "
-        "`tolerance`, on average",
+        "a model estimates the distance of the object, on average to within a factor of "
+        "1 + `tolerance`",
     ),
     BuiltIn(
         "task",
         "similarity",
         f"{_TASKS}.similarity:Similarity",
-        "the object is what the nearest reference pictures show, or what the clean "
-        "picture shows",
+        "a model's embedding of the picture is nearest to those of reference pictures "
+        "of the object, or close to that of the clean picture",
     ),
     BuiltIn(
         "task",
         "answer",
         f"{_TASKS}.answers:FreeAnswer",
-        "a model's answer has one of the right words in it, as a whole word, in any "
-        "case",
+        "a model's answer contains one of the right words, in upper or lower case",
     ),
     BuiltIn(
         "task",
         "command",
         f"{_TASKS}.command:Command",
-        "a policy commands about the action that it commands in the clean scene: open "
-        "loop, one picture, one action",
+        "a robot policy outputs nearly the same action as in the clean scene; open loop, "
+        "one action for one picture",
     ),
     BuiltIn(
         "task",
         "rig",
         f"{_TASKS}.rig:Rig",
-        "several cameras take pictures of one configuration, and one prediction is "
-        "made of what a model says of each",
+        "several cameras take pictures of one configuration, and the model's predictions "
+        "of them are combined into one",
     ),
     BuiltIn(
         "model source",
@@ -460,7 +458,7 @@ BUILT_INS = (
         "exporter",
         "coco",
         f"{_EXPORTERS}.dataset:Coco",
-        "the pictures with boxes and masks, as COCO has them",
+        "the pictures with boxes and masks, in the format of COCO",
     ),
     BuiltIn(
         "exporter",
@@ -490,7 +488,7 @@ BUILT_INS = (
         "exporter",
         "projector",
         f"{_EXPORTERS}.projection:Projection",
-        "a projector's picture, and marks to line it up",
+        "the picture of a projector, and marks to align it",
     ),
     BuiltIn(
         "exporter",

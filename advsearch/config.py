@@ -1,9 +1,10 @@
-"""Declare the settings of a run, which YAML files, flags and Python calls all become.
+"""Declare the settings of runs, which may come from YAML files, flags and Python calls.
 
-Each setting states its flag, unit, range and default once; the command line's help and
-the docs are made from that (`settings`). This module has what many commands need, and
-`render`; the rest is with each experiment. Names of objects, controls and policies are
-checked by what loads them, so that settings stay light.
+Each setting declares its flag, unit, range and default once. The help of the command
+line and the docs are made from these declarations (`settings`). This module contains
+the settings that many commands share, and those of `render`. Each experiment declares
+its other settings. Names of objects, controls and policies are not checked here, but
+when they are loaded, so that this module imports little.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ from advsearch.settings import values as written
 from advsearch.trust import powers
 
 PATH_OPTIONS = ("references", "state")
-"""Options that may be a directory or a file. Its absolute path is stored, so that a run
-may be resumed anywhere.
+"""Options of a task or policy that are the path of a directory or a file. The absolute
+path is stored, so that a run may be resumed from any directory.
 """
 
 
@@ -89,13 +90,13 @@ def read_joined(value: Any, setting: str, default_name: str) -> Any:
         names.append(name)
         if mapping:
             options[name] = mapping
-    # Stored commands have the form detection+depth={depth: {seek: gone}}: the options
-    # of all names follow the last name, each under its own name. They are told from
-    # options of the last name alone by their keys.
+    # In stored command lines the options of all names follow the last name, each under
+    # its own name: detection+depth={depth: {seek: gone}}. They belong to all names if
+    # their keys are names; otherwise they are options of the last name only.
     last_name = names[-1]
     last_options = options.get(last_name, {})
-    are_of_all_names = last_options.keys() <= set(names)
-    if are_of_all_names:
+    is_keyed_by_names = last_options.keys() <= set(names)  # also if there are none
+    if is_keyed_by_names:
         options[last_name] = {}
         options.update(last_options)
     options = {name: value for name, value in options.items() if value}
@@ -105,13 +106,13 @@ def read_joined(value: Any, setting: str, default_name: str) -> Any:
 
 
 def has_address(model: str) -> bool:
-    """Whether the name of a model, or one of several, is an address."""
+    """Return whether the name of a model, or one of several names, is an address."""
     names = written.split_names(model)
     return any(re.match("https?:", name, re.IGNORECASE) for name in names)
 
 
 def get_name(named: str | Mapping[str, object]) -> str:
-    """Return the name in what `read_named` returns."""
+    """Return the name in a setting in the form that `read_named` returns."""
     return named if isinstance(named, str) else str(named["name"])
 
 
@@ -129,28 +130,30 @@ LIST_SETTINGS = (
     "held_out",
     "held_out_environment",
 )
-"""The settings that may be several names, where a command takes several."""
+"""Settings that may have several names, if the command allows it."""
 TEXT_SETTINGS = (
     *LIST_SETTINGS,
     *("task", "up", "camera", "backdrop", "occluder", "run", "objective"),
 )
-"""The settings that are texts, whatever they are given as."""
-# controls as they are asked for: their names, each with its settings
+"""Settings that are stored as strings. Paths, numbers and lists are converted."""
+
+# Controls by name, each with its options.
 ControlsByName = dict[str, dict[str, object]]
+
 SEARCH_SPP = {"oidn": 8, "none": 16}
-"""Samples a pixel of a search that asks for none, with the denoiser and without."""
-AUTO_SPP_DIVISOR = (
-    2  # with `--spp auto` a search takes the default's samples divided by this
-)
-# then a candidate is rendered so many times more, at most, while it is not clearly
-# worse than the best
+"""Default number of samples per pixel of a search, with the denoiser and without."""
+# With `--spp auto`, the default number of samples is divided by this.
+AUTO_SPP_DIVISOR = 2
+# With `--spp auto`, a candidate is rendered at most this many times more, as long as it
+# may still be the best.
 MAX_EXTRA_REPEATS = 4
 
 
 class SceneConfig(Config):
-    """What every command over a scene and a model needs to know. A file is looked for
-    relative to the current directory. None means "choose for me", and the description
-    says how.
+    """The settings of every command with a scene and a model.
+
+    Paths are relative to the current directory. A setting that is None is chosen
+    automatically, as its description says.
     """
 
     changeable_settings: ClassVar[tuple[str, ...]] = (
@@ -158,18 +161,18 @@ class SceneConfig(Config):
         "ask",
     )
     default_environment: ClassVar[str] = DEFAULT_ENVIRONMENT
-    # which of object, environment and model may be several, with commas
+    # those of object, environment and model that may have several names, with commas
     list_settings: ClassVar[tuple[str, ...]] = ()
     clashes: ClassVar[tuple[Clash, ...]] = (
         Clash(
             "threads",
             lambda one: one.deterministic and one.threads != 1,
-            "`deterministic` works on one thread; leave one of them out",
+            "`deterministic` uses one thread; leave one of them out",
         ),
         Clash(
             "overwrite",
             lambda one: one.run is None,
-            "replaces the run that `run` names, and none is named; name it, or leave "
+            "replaces the run that `run` names, but `run` is not set; set it, or leave "
             "`overwrite` out",
         ),
     )
@@ -177,7 +180,7 @@ class SceneConfig(Config):
     object: str = setting(
         ...,
         "scene",
-        "the object that the model should recognise",
+        "the object that the model should recognize",
         f"the name of an object or a {either(MESHES)} file",
     )
     environment: str | None = setting(
@@ -192,41 +195,43 @@ class SceneConfig(Config):
         None,
         "scene",
         "which axis of an imported object points up",
-        otherwise="as the format says, or else the axis along which it stands best",
+        otherwise="that of the file format, or else the axis along which the object "
+        "stands best",
     )
     facing: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = setting(
         None,
         "scene",
-        "which axis of an imported object's file its front faces, turned towards +x "
-        "here",
-        otherwise="as the format says (+z in glTF and VRM 1, -z in VRM 0), and +x in "
-        "others",
+        "the axis of an imported file along which the front of the object points; in "
+        "the scene it points along +x",
+        otherwise="that of the format (+z in glTF and VRM 1, -z in VRM 0), +x for other "
+        "formats",
     )
     size: float | None = setting(
         None,
         "scene",
-        "how large the object is: its longest side; distances are then in metres",
+        "the length of the longest side of the object; distances are then in metres",
         "a number of metres from 1e-4 to 1e4",
-        otherwise="as bundled, or as its file says: glTF is in metres",
+        otherwise="that of the bundled object or of the file: glTF is in metres",
         ge=1e-4,
         le=1e4,
     )
     unit: Literal["mm", "cm", "m", "in"] | None = setting(
         None,
         "scene",
-        "unit of the coordinates of the object's file, which says how large it is",
-        otherwise="as its file says: glTF is in metres",
+        "unit of the coordinates in the object's file, which determines its size",
+        otherwise="that of the file: glTF is in metres",
     )
     camera: str | None = setting(
         None,
         "scene",
-        "which camera takes the picture: one of a scene file, or the one around the "
-        "object, mounted somewhere or with a lens of its own",
+        "the camera that takes the picture: a camera of a scene file, a built-in one, "
+        "or one with the lens of a camera file",
         "a name that advsearch import lists, orbit, dashcam, robot, fisheye, "
         "equirectangular, or a camera file of OpenCV, Kalibr, ROS, COLMAP or "
         "nerfstudio",
         metavar="NAME",
-        otherwise="orbit, the pinhole around the object that camera.* describes",
+        otherwise="orbit, a pinhole camera around the object with the parameters "
+        "camera.*",
         min_length=1,
     )
     set_: dict[str, float | str | tuple[float, ...]] = setting(
@@ -241,19 +246,20 @@ class SceneConfig(Config):
     things: str | None = setting(
         None,
         "scene",
-        "what stands beside the object, in metres from it: x forwards, y to its left",
-        "OBJECT@X,Y with heading=DEGREES, size=METRES, name=NAME or label=LABEL after "
-        "it, several with ; between them",
+        "other objects in the scene, at X metres in front of the object and Y metres "
+        "to its left",
+        "OBJECT@X,Y, perhaps followed by heading=DEGREES, size=METRES, name=NAME or "
+        "label=LABEL with commas between them; several with ; between them",
         flag="--with",
-        otherwise="nothing",
+        otherwise="none",
     )
     backdrop: str | None = setting(
         None,
         "scene",
         "a photograph that the object is rendered into, taken by the camera of the "
         "scene",
-        "a picture file, a part of it, photo.jpg#X,Y,WIDTH,HEIGHT in pixels, or a folder "
-        "of photographs with their camera files",
+        "a picture file, a part of one as photo.jpg#X,Y,WIDTH,HEIGHT in pixels, or a "
+        "folder of photographs with their camera files",
         metavar="FILE",
         otherwise="the environment is behind the object",
         min_length=1,
@@ -261,19 +267,20 @@ class SceneConfig(Config):
     occluder: str | None = setting(
         None,
         "scene",
-        "a mask or the depth of what is before the object in the photograph of "
+        "a mask or a depth map of what is in front of the object in the photograph of "
         "`backdrop`",
-        "a picture of the photograph's size, white where something is before it; or "
-        "depth, .exr or .npy in metres, or depth.png#METRES of a level",
+        "a mask as a picture of the photograph's size, white where something is in "
+        "front of the object; or a depth map: .exr or .npy in metres, or "
+        "depth.png#METRES, the metres of one level",
         metavar="FILE",
-        otherwise="nothing is before the object",
+        otherwise="nothing is in front of the object",
         min_length=1,
     )
     judge: str = setting(
         "object",
         "model",
-        "which thing the predictions are judged by",
-        "object, the name of a thing beside it, or all",
+        "the object whose label the model should predict",
+        "object, the name of another object in the scene, or all",
         min_length=1,
     )
     exposure: float = setting(
@@ -289,7 +296,7 @@ class SceneConfig(Config):
         "scene",
         "size of the rendered picture",
         "SIDE or HEIGHTxWIDTH, each from 8 to 4096",
-        otherwise="what the model takes",
+        otherwise="the input size of the model",
         unit="pixels",
     )
 
@@ -313,34 +320,34 @@ class SceneConfig(Config):
     prompt: str | None = setting(
         None,
         "model",
-        "text for a model that takes text beside the picture: for CLIP what a picture "
-        "is compared with, one text for each label; for a model such as LLaVA the "
-        "question",
-        "a text, for CLIP with {} where the name goes, or several with | between them",
+        "text for a model that takes text in addition to the picture: for CLIP the "
+        "caption with which a picture is compared, one for each label; for a model such "
+        "as LLaVA the question",
+        "a text, for CLIP with {} in place of the label, or several with | between them",
         otherwise="a photo of a {}, or What is this?",
         metavar="TEXT",
     )
     value_range: tuple[float, float] | None = setting(
         None,
         "model",
-        "which values black and white have in the pictures that the model takes",
+        "the values of black and white in the input of the model",
         "LOW,HIGH with LOW below HIGH, such as 0,255",
-        otherwise="what the model says, or 0,1",
+        otherwise="those that the model states, or 0,1",
         metavar="LOW,HIGH",
     )
     ask: dict[str, float] = setting(
         dict,
         "model",
-        "a limit for a model behind an address, such as calls=500: calls (2000), "
-        "tokens and money of a run, seconds of an answer (120), requests at_once (4), "
-        "and the prices per_call, per_million_in and per_million_out; may be repeated",
+        "a limit for a model at an address, such as calls=500: calls (2000), tokens and "
+        "money of a run, seconds for an answer (120), requests at_once (4), and the "
+        "prices per_call, per_million_in and per_million_out; may be repeated",
         "LIMIT=NUMBER",
         metavar="LIMIT=NUMBER",
     )
     task: str | dict[str, JsonValue] = setting(
         "classification",
         "model",
-        "what the model does, and how its predictions are judged; for several models "
+        "what the model does, and how its predictions are evaluated; for several models "
         "one task each, with + between them",
         "the name of a task, or NAME={OPTION: VALUE}",
     )
@@ -349,7 +356,7 @@ class SceneConfig(Config):
         "model",
         "the labels that count as right, separated by commas",
         'names of classes or their numbers, such as "coffee mug,cup" or #504',
-        otherwise="the object's own",
+        otherwise="the object's label",
     )
 
     controls: ControlsByName = setting(
@@ -367,15 +374,15 @@ class SceneConfig(Config):
         "search",
         "side length of the searched texture",
         unit="texels",
-        otherwise="chosen from the object's own",
+        otherwise="chosen by the resolution of the object's texture",
         ge=2,
         le=4096,
     )
     spp: Annotated[int, Field(ge=1, le=65536)] | Literal["auto"] | None = setting(
         None,
         "search",
-        "samples per pixel of a render of the search; auto takes half of the default, "
-        "and renders the best candidates again while they are close",
+        "samples per pixel of a render of the search; auto uses half of the default, "
+        "and renders the best candidates again as long as they are close",
         "a whole number from 1 to 65536, or auto",
         otherwise="8 with the denoiser, 16 without",
         unit="samples",
@@ -386,9 +393,9 @@ class SceneConfig(Config):
     pixel_sampler: Literal["independent", "multijitter"] = setting(
         "multijitter",
         "search",
-        "how samples are spread over a pixel, in search and verification; multijitter "
-        "has less noise and rounds the number of samples up to a product of two near "
-        "numbers",
+        "how samples are distributed over a pixel, in search and verification; "
+        "multijitter has less noise, and rounds the number of samples up to a product "
+        "of two similar numbers",
     )
 
     seed: int = setting(
@@ -403,13 +410,15 @@ class SceneConfig(Config):
         None, "run", "number of processor threads", otherwise="all", ge=1, le=1024
     )
     deterministic: bool = setting(
-        False, "run", "use one thread, so that a run repeats bit for bit; slower"
+        False,
+        "run",
+        "use one thread, so that repeated runs are equal bit for bit; slower",
     )
     run: str | None = setting(
         None,
         "run",
         "where the run is stored",
-        "a name (kept in runs/) or the path of a folder",
+        "a name (for a folder in runs/) or the path of a folder",
         otherwise="runs/OBJECT-CONTROL-NNN",
         min_length=1,
         power=powers.describe_location,
@@ -417,7 +426,7 @@ class SceneConfig(Config):
     overwrite: bool = setting(
         False,
         "run",
-        "replace a run that is already there",
+        "replace a run that exists already",
         power=powers.describe_overwrite,
     )
 
@@ -441,8 +450,8 @@ class SceneConfig(Config):
                 raise make_single_value_error(setting_name, names)
         if self.size is not None and len(self.objects) > 1:
             raise InputError(
-                "size: it is the size of one object, and there are several; leave it "
-                "out, or give `unit`"
+                "size: is the size of one object, and there are several; leave it out, "
+                "or use `unit`"
             )
         return self
 
@@ -457,26 +466,28 @@ class SceneConfig(Config):
 
     @property
     def used_threads(self) -> int | None:
-        """Processor threads that are taken; None for all."""
+        """Number of processor threads to use; None for all."""
         return 1 if self.deterministic else self.threads
 
     @property
     def environment_name(self) -> str:
-        """The environment by name: the default one where none was asked for."""
+        """The name of the environment: the setting, or the default."""
         return self.environment or DEFAULT_ENVIRONMENT
 
     @property
     def control_kinds(self) -> tuple[str, ...]:
-        """What says of which kind the controls are: their names, or the `kind` among
-        their settings.
-        """
-        named = {**self.controls, **getattr(self, "over", {})}
-        return tuple(str(options.get("kind", name)) for name, options in named.items())
+        """The kind of each control: its option `kind`, or else its name."""
+        controls = {**self.controls, **getattr(self, "over", {})}
+        return tuple(
+            str(options.get("kind", name)) for name, options in controls.items()
+        )
 
     @property
     def search_spp(self) -> int:
-        """Samples per pixel of a render of the search: what is set, or the default for
-        the denoiser, of which "auto" takes a part.
+        """Samples per pixel of a render of the search.
+
+        It is the setting `spp` if that is a number; the default for the denoiser if it
+        is None; and the default divided by `AUTO_SPP_DIVISOR` if it is "auto".
         """
         if isinstance(self.spp, int):
             return self.spp
@@ -495,8 +506,10 @@ class SceneConfig(Config):
 
     @property
     def max_extra_repeats(self) -> int:
-        """Renders more of a search's best configurations, at most, while it is close
-        between them.
+        """Maximum number of extra renders of a configuration that may be the best one.
+
+        They are made as long as the best ones are close together; with `spp` "auto"
+        only.
         """
         return MAX_EXTRA_REPEATS if self.spp == "auto" else 0
 
@@ -506,8 +519,10 @@ class SceneConfig(Config):
 
     @property
     def models(self) -> tuple[str, ...]:
-        """The models by name. For a joint task, "detection+depth", its models are a single
-        one, whose name has commas.
+        """The names of the models.
+
+        The models of a joint task, such as "detection+depth", count as a single model,
+        whose name contains commas.
         """
         is_joint_task = TASK_SEPARATOR in self.task_name
         return (self.model,) if is_joint_task else written.split_names(self.model)
@@ -515,12 +530,13 @@ class SceneConfig(Config):
     @field_validator(*TEXT_SETTINGS, mode="before", check_fields=False)
     @classmethod
     def _as_text(cls, value: Any, info: Any) -> Any:
-        """Return names, in a list or not, as a text with commas between them."""
+        """Return a name as a text, and a list of names as a text with commas."""
         is_list_of_labels = info.field_name == "labels" and isinstance(
             value, (list, tuple)
         )
+        # A comma inside of a label would later split it into two.
         if is_list_of_labels and any("," in str(name) for name in value):
-            raise ValueError("a name that would be two; a file can have it")
+            raise ValueError("a label with a comma; put such labels into a file")
         return written.to_text(value, several=info.field_name in LIST_SETTINGS)
 
     @field_validator("facing", mode="before", check_fields=False)
@@ -551,8 +567,10 @@ class SceneConfig(Config):
     @field_validator("controls", "over", mode="before", check_fields=False)
     @classmethod
     def _controls_with_options(cls, value: Any) -> Any:
-        """Return controls as a mapping from their names to options; those without options
-        get an empty mapping, and Mitsuba's names are gathered in one control.
+        """Return controls as a mapping from name to options.
+
+        A control without options gets an empty mapping. Names of Mitsuba's scene
+        parameters become options of the control "mitsuba".
         """
         if not isinstance(value, Mapping):
             return value
@@ -564,7 +582,7 @@ class SceneConfig(Config):
     @field_validator("resolution", mode="before")
     @classmethod
     def _resolution_from_text(cls, value: Any) -> Any:
-        """Read ``SIDE`` or ``HEIGHTxWIDTH``; a single side is that of a square."""
+        """Read ``HEIGHTxWIDTH``, or ``SIDE`` for a square."""
         sides = value.lower().split("x") if isinstance(value, str) else value
         if isinstance(sides, int):
             sides = [sides]
@@ -598,7 +616,7 @@ class SceneConfig(Config):
     @field_validator("set_", mode="before")
     @classmethod
     def _numbers_from_text(cls, value: Any) -> Any:
-        """Read texts that are numbers as such; YAML takes 1e-3 for a text."""
+        """Convert texts that are numbers; YAML reads 1e-3 as a text."""
         if not isinstance(value, Mapping):
             return value
         return {
@@ -620,14 +638,12 @@ def make_single_value_error(name: str, names: Sequence[str]) -> InputError:
     )
 
 
-PICTURE_SPP = 64  # samples a pixel of a picture that is made to be looked at
-IMAGE_SUFFIXES = (".png", ".exr")  # that can be written
+PICTURE_SPP = 64  # default number of samples per pixel of `render`
+IMAGE_SUFFIXES = (".png", ".exr")  # suffixes of images that can be written
 
 
 class RenderConfig(SceneConfig):
-    """Everything that decides what `render` does: pictures of a scene, and what the
-    model says of them.
-    """
+    """The settings of `render`, which renders pictures of a scene and predicts them."""
 
     command: ClassVar[str] = "render"
     excluded_settings: ClassVar[tuple[str, ...]] = ("run", "overwrite")
@@ -637,15 +653,16 @@ class RenderConfig(SceneConfig):
         "controls",
         default=dict,
         group="picture",
-        description="what differs from the scene, separated by commas; a range stays "
-        "where a search would start",
+        description="what differs from the scene, separated by commas; a range has the "
+        "value at which a search would start",
         expects="names of controls, or NAME={PARAMETER: VALUE}",
         min_length=None,
     )
     around: int | None = setting(
         None,
         "picture",
-        "one sheet of so many views, from azimuths all around the object",
+        "render one sheet with this number of views, from azimuths all around the "
+        "object",
         otherwise="one view",
         unit="views",
         ge=2,
@@ -657,8 +674,8 @@ class RenderConfig(SceneConfig):
     aov: str | None = setting(
         None,
         "picture",
-        "write ground truth of each pixel, names separated by commas, as layers of an "
-        "EXR beside the picture",
+        "write ground truth per pixel as layers of an EXR file next to the picture; "
+        "names separated by commas",
         "names among mask, depth, normal, uv, id",
         otherwise="none",
         metavar="NAMES",
@@ -666,8 +683,8 @@ class RenderConfig(SceneConfig):
     out: str = setting(
         ...,
         "picture",
-        "the file to write: a .png holds what the model sees, an .exr linear radiance "
-        "times the gain",
+        "the file to write: a .png contains the input of the model, an .exr linear "
+        "radiance times the gain",
         "the path of a .png or .exr file",
     )
 
@@ -677,7 +694,7 @@ class RenderConfig(SceneConfig):
         """Return the path of an image as a text.
 
         Raises:
-            ValueError: it does not have the suffix of an image, or has a zero byte in it.
+            ValueError: the path has no suffix of an image, or contains a zero byte.
         """
         text = str(value) if isinstance(value, Path) else value
         is_path = isinstance(text, str) and "\0" not in text
@@ -686,13 +703,14 @@ class RenderConfig(SceneConfig):
         return text
 
 
-# no control has a distance of that size; far above it, its square is none in float32
+# No control needs a larger distance. The square of a far larger one overflows float32.
 MAX_EPSILON = 1e6
 
 
 class DerivativeConfig(SceneConfig):
-    """What every command that differentiates a scene needs to know: budgets of the
-    controls, and what is maximised.
+    """The settings of every command that differentiates a scene.
+
+    They add the budgets of the controls (epsilon), and the objective.
     """
 
     clashes: ClassVar[tuple[Clash, ...]] = (
@@ -700,7 +718,7 @@ class DerivativeConfig(SceneConfig):
         Clash(
             "epsilon",
             lambda config: config.epsilons and "epsilon" not in config.list_settings,
-            "several make a curve, which only `advsearch attack` draws; give one",
+            "several values make a curve, which only `advsearch attack` draws; give one",
         ),
     )
 
@@ -708,16 +726,17 @@ class DerivativeConfig(SceneConfig):
     epsilon: float | dict[str, float] | tuple[float, ...] | None = setting(
         None,
         "search",
-        "how far a control may move from its start, in its own unit (for several "
-        "controls CONTROL=NUMBER,...; in `attack` also NUMBER,NUMBER,... for a curve)",
+        "the maximum distance of a control from its start, in the unit of the control "
+        "(for several controls CONTROL=NUMBER,...; in `attack` also NUMBER,NUMBER,... "
+        "for a curve)",
         f"a number greater than 0 and at most {MAX_EPSILON:g}",
-        otherwise="the control's own",
+        otherwise="that of the control",
     )
     norm: Literal["linf", "l2"] | None = setting(
         None,
         "search",
-        "norm in which epsilon is measured",
-        otherwise="the control's own",
+        "norm of the distance that epsilon limits",
+        otherwise="that of the control",
     )
     estimators: dict[str, str] = setting(
         dict,
@@ -733,31 +752,31 @@ class DerivativeConfig(SceneConfig):
     objective: str | None = setting(
         None,
         "search",
-        "the objective that the search maximises",
+        "the objective that the search maximizes",
         "the name of an objective",
-        otherwise="the task's own: margin",
+        otherwise="that of the task: margin",
     )
     specialise: bool = setting(
         True,
         "search",
-        "leave out what the scene and the search don't need",
+        "leave out computations that the scene and the search do not need",
         flag="--no-specialise",
         switched="compute everything, also what this search does not need; `advsearch "
-        "check` shows what is left out otherwise",
+        "check` shows what is left out by default",
     )
 
     @field_validator("epsilon", mode="before")
     @classmethod
     def _epsilon_from_text(cls, value: Any) -> Any:
-        """Read the setting `epsilon`, and check that its numbers are in range.
+        """Split a text of `epsilon` into its values, and check that they are in range.
 
         It is ``0.05``, or ``0.01,0.02`` for values to try one after the other, or
         ``texture=0.05,geometry=0.01`` for a value of each control. No value and no
         control may occur twice.
 
         Returns:
-            A single value, a tuple, or a mapping by control. Numbers that are text
-            remain text: pydantic converts them afterwards.
+            A single value, a tuple, or a mapping by control. Values that are text
+            remain text: pydantic converts them after this check.
         """
         if isinstance(value, str):
             value = _split_epsilons(value)
@@ -782,7 +801,7 @@ class DerivativeConfig(SceneConfig):
 
     @property
     def epsilons(self) -> tuple[float, ...]:
-        """The several epsilons of a curve; empty where there is one."""
+        """The epsilons of a curve; empty if `epsilon` is a single value or a mapping."""
         return self.epsilon if isinstance(self.epsilon, tuple) else ()
 
 
@@ -815,7 +834,7 @@ def _parse_positive(value: Any) -> float:
         number = float(value)
     except (TypeError, ValueError, OverflowError):
         raise ValueError("not a number") from None
-    # The square of a smaller number would be 0 in float32.
+    # 1e-30 is far below any useful distance.
     if not 1e-30 < number <= MAX_EPSILON:
         raise ValueError("out of range")
     return number
@@ -825,6 +844,8 @@ FIRST_COMMANDS = ("attack", "render", "sweep")  # the first commands in the docs
 
 
 class _Configs(Mapping[str, type[Config]]):
+    """The class of the settings of each command, imported when it is needed."""
+
     def __iter__(self) -> Iterator[str]:
         return iter(
             sorted(
@@ -842,6 +863,4 @@ class _Configs(Mapping[str, type[Config]]):
 
 
 CONFIGS: Mapping[str, type[Config]] = _Configs()
-"""The settings of each command, in the order of the docs; they are imported on first
-use.
-"""
+"""The class of the settings of each command, in the order of the docs."""

@@ -1,5 +1,5 @@
-"""What code of others is handed is its own copy, so that nothing that it writes into is
-looked at again.
+"""Copy the arguments of a user's code, so that it may change them in place without an
+effect on the search.
 """
 
 from __future__ import annotations

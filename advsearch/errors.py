@@ -1,10 +1,11 @@
-"""The one tree of errors that a user can cause.
+"""The exceptions that a user can cause.
 
-Every message says what was expected, what was got and what to do, and names the file or
-the setting as Python has it: ``epsilon: ...`` at its beginning, and in backticks
-elsewhere, as in "use `denoise=none`" or "`grid` pose.yaw". The command line writes
-flags instead (`cli.flags.with_flags`) in one line on standard error, with exit status
-2; anything but an `AdvsearchError` is a bug and keeps its traceback.
+Every message states what was expected, what was received and what to do. It names a
+setting as in Python: ``epsilon: ...`` at its beginning, and in backticks elsewhere, as
+in "use `denoise=none`" or "`grid` pose.yaw". The command line replaces these names by
+flags (`cli.flags.format_as_flags`), prints the message in one line on standard error,
+and exits with status 2. Any exception that is no `AdvsearchError` is a bug, and gets a
+traceback.
 """
 
 from __future__ import annotations
@@ -14,29 +15,30 @@ import re
 from collections.abc import Iterable, Sequence
 
 FELL_SHORT = 3
-"""Exit status of a command whose check fell short."""
+"""Exit status of a command whose check or test did not pass."""
 
-# least ratio of `difflib` at which a name, or a word of it, is spelled nearly alike
+# Minimum ratio of `difflib` for a similar name, and for a similar word of a name.
 MIN_SIMILARITY = 0.6
 MIN_WORD_SIMILARITY = 0.75
 
 
 class AdvsearchError(Exception):
-    """Base of every error that is the input's fault or the machine's, not a bug of
-    advsearch.
+    """Base class of errors that are caused by input or by the machine, and that are no
+    bug of advsearch.
     """
 
 
 class InputError(AdvsearchError):
-    """A value given on the command line, in a file or in a call is outside what is
-    allowed.
-    """
+    """Raised if a value on the command line, in a file or in a call is not allowed."""
 
 
 class UnknownNameError(InputError):
-    """A name of a kind ("object", say) that is not among the known ones; the message
-    lists near matches, and may end in a hint: a sentence about how to give a path
-    instead, say.
+    """Raised if a name is unknown, such as that of an object.
+
+    The message lists similar names and all known names.
+
+    Attributes:
+        near: the similar names, best first.
     """
 
     def __init__(
@@ -63,41 +65,41 @@ class UnknownNameError(InputError):
 
 
 class FileFormatError(InputError):
-    """A file that is missing, empty, truncated, or not what it should be. The message
-    names the path.
+    """Raised if a file is missing, empty, truncated or of a wrong format.
+
+    The message contains the path.
     """
 
 
 class ModelError(AdvsearchError):
-    """A model that cannot be loaded, or whose output is not logits of shape (N,
-    classes).
-    """
+    """Raised if a model cannot be loaded, or has outputs of a wrong type or shape."""
 
 
 class CodeNotAllowedError(InputError, ModelError):
-    """Python code, weights or an address that only a file names, and that a person has
-    to allow.
+    """Raised if a file names Python code, weights or an address that the user has not
+    allowed.
     """
 
 
 class RunExistsError(InputError):
-    """The run directory exists already and `overwrite` was not asked for."""
+    """Raised if the run directory exists already and `overwrite` is not set."""
 
 
 class StorageError(AdvsearchError):
-    """The run directory cannot be written (full disk, read-only file system, no
-    permission).
+    """Raised if the run directory cannot be written: the disk is full, the file system
+    is read-only, or permission is missing.
     """
 
 
 class EnvironmentSetupError(AdvsearchError):
-    """A part of the machine is missing or unusable (no usable LLVM, say). The message
-    holds the command to type.
+    """Raised if software is missing or unusable, such as LLVM.
+
+    The message contains the command that installs it.
     """
 
 
 class ClusterError(AdvsearchError):
-    """Workers that cannot be reached, or that cannot do what they are given."""
+    """Raised if workers cannot be reached, or cannot compute the batches of a task."""
 
 
 def find_similar_names(name: str, known: Iterable[str]) -> list[str]:

@@ -1,13 +1,13 @@
-"""An experiment: a function that answers a question about a model, with its settings
-and its result.
+"""Define experiments: functions with declared settings and a result.
 
     @experiment("count --runs mug-texture-001", positional_args=("runs",))
     def count(context: RunContext[CountConfig]) -> CountResult: ...
 
-The command, the Python function, the run directory and the page are made from it.
-Built-in experiments are listed in `advsearch.catalog`; a package adds its own by an
-entry point of the group `advsearch.experiments`. The module of an experiment imports
-what is heavy inside functions, since the command line reads it for its help.
+The command, the Python function, the run directory and the HTML page are made from this
+definition. `advsearch.catalog` lists the built-in experiments. A package adds its own
+by an entry point of the group `advsearch.experiments`. The module of an experiment is
+imported for the help of the command line, so it should import large packages inside of
+functions.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ SHARED_RESULT_FIELDS = {
     "policy": "policy_name",
     "seed": "seed",
 }
-"""Fields of a result that are filled from the settings, with the attribute of the
-settings.
+"""Fields of a result that are copied from the settings, with the name of the attribute
+of the settings.
 """
 
 PYTHON_TYPES = {
@@ -64,18 +64,20 @@ PYTHON_TYPES = {
     "compared": "str | Path | Sequence[str | Path]",
     "sweeps": "str | Path | Sequence[str | Path]",
 }
-"""Types that Python callers may pass for a positional setting, in place of its text."""
+"""Types that Python callers may pass for positional settings, which are stored as text.
+"""
 
 
 class RunContext(ExitStack, Generic[Settings]):
-    """What the function of an experiment works with: settings, progress, and the run
-    directory.
+    """The settings, the progress and the run directory of a running experiment.
+
+    The function of an experiment gets it as its argument.
 
     Attributes:
-        config: the settings.
-        progress: is told how far the experiment is.
-        resumed: the folder of the run that is continued; None for a new one.
-        ending: how the run ends, "done" or "interrupted".
+        config: settings of the experiment.
+        progress: object that displays the progress.
+        resumed: folder of the run that is continued; None for a new run.
+        ending: status with which the run will end, "done" or "interrupted".
     """
 
     def __init__(
@@ -102,8 +104,10 @@ class RunContext(ExitStack, Generic[Settings]):
 
     @cached_property
     def run(self) -> RunDirectory:
-        """The run directory. The first access creates it, so check everything that may
-        be wrong before.
+        """The run directory.
+
+        The first access creates it. Check all settings before, so that a wrong one
+        leaves no run behind.
         """
         return self.enter_context(RunDirectory.open(self.config, self.resumed))
 
@@ -119,8 +123,9 @@ class RunContext(ExitStack, Generic[Settings]):
 
     @contextmanager
     def until_interrupted(self) -> Iterator[None]:
-        """Let Ctrl-C end the block, but not the experiment: that goes on after it, with
-        `ending` set to `INTERRUPTED`.
+        """Let Ctrl-C end the block, but not the experiment.
+
+        The experiment continues after the block, with `ending` set to `INTERRUPTED`.
         """
         try:
             with interruptible():
@@ -137,29 +142,31 @@ class RunContext(ExitStack, Generic[Settings]):
         )
 
     def open_measurements(self, seconds: float | None = None) -> Measurements:
-        """Return the run's stored measurements, with a way to measure the rest.
+        """Return the stored measurements of the run, with methods to measure the rest.
 
-        None is started after so many seconds.
+        Args:
+            seconds: time after which no measurement is started any more; None for no
+                limit.
         """
         return Measurements(self, seconds)
 
     @property
     def machine(self) -> dict[str, Any]:
-        """What measured times depend on: the processor's name, and the cores that this
-        process may use.
+        """The hardware on which measured times depend: the name of the processor, and
+        the number of cores that this process may use.
         """
         return {"cpu": threads.read_processor_name(), "cores": threads.count_cores()}
 
     def result(self, result_type: type[ResultType], **fields: Any) -> ResultType:
-        """Return a result with the given fields and those that every result has.
+        """Return a result with the passed fields and those that every result has.
 
         Every result has values of the settings (`SHARED_RESULT_FIELDS`), the path of
-        the run, how it ended, its command line, and its seconds.
+        the run, its status, its command line, and its seconds.
 
         Args:
             result_type: class of the result.
-            fields: other fields by name. `seconds` may have the times of stages, to
-                which the total is added.
+            fields: other fields by name. `seconds` may have the times of stages; the
+                total is added if it is not among them.
         """
         settings = self.config
         shared = {
@@ -167,9 +174,11 @@ class RunContext(ExitStack, Generic[Settings]):
             for name, attribute in SHARED_RESULT_FIELDS.items()
             if hasattr(settings, attribute)
         }
+        # Results have lists of names; in the settings, objects are a tuple and controls
+        # a mapping by name.
         for name in ("objects", "controls"):
             if name in shared:
-                shared[name] = list(shared[name])  # a tuple, and a mapping by name
+                shared[name] = list(shared[name])
         seconds = {
             "total": time.perf_counter() - self._start_time,
             **fields.pop("seconds", {}),
@@ -222,22 +231,26 @@ def run_experiment(
     """
     from advsearch.api.names import check_names  # imports scipy
 
-    if not config.python_only_parts:  # objects of a session may have any name
+    # If the caller passed Python objects, their names in the settings may be any text.
+    if not config.python_only_parts:
         check_names(dict(config))
-    # an experiment with `out` writes a file or folder of its own
-    writes_run = resumed is None and getattr(config, "out", None) is None
-    # The folder is made before heavy imports, so that a run that is stopped early can
-    # be listed.
-    with create_before_work(config) if writes_run else nullcontext(resumed) as folder:
+    # An experiment with `out` writes a file or folder of its own, and no run.
+    creates_run = resumed is None and getattr(config, "out", None) is None
+    # The folder of a new run is created before slow imports, so that a run that is
+    # stopped early can be listed. Then the experiment continues in it as in a resumed
+    # run.
+    with create_before_work(config) if creates_run else nullcontext(resumed) as folder:
         experiment: Experiment[Result] = registry.get_experiment(config.command)
         return experiment.run(config, progress=progress, resumed=folder)
 
 
 def find_stopped_run(config: Config) -> Path | None:
-    """Return the folder of the run that the settings name; None where there is none
-    yet.
+    """Return the folder of the run to resume: the one that the setting `run` names.
+
+    Returns None if the setting is not set, or names no run yet: then a new run is
+    started. Whether the run has ended already is checked when it is resumed.
     """
-    run, _ = config.run_location
+    run, _overwrite = config.run_location
     if run is None or not is_run(locate_run(run)):
         return None
     return locate_run(run)
@@ -279,12 +292,12 @@ def run_part(
 
 
 class PositionalArgument(NamedTuple):
-    """A setting that the command line also takes without its flag."""
+    """A setting that may be written on the command line without its flag."""
 
-    metavar: str  # what the help calls it
-    expected: str  # completes "expected ..." where it is missing
-    help_suffix: str = ""  # what the help adds
-    is_repeatable: bool = False  # whether there may be several
+    metavar: str  # its placeholder in the help
+    expected: str  # completes the error "expected ..." if it is missing
+    help_suffix: str = ""  # text that is appended to its help
+    is_repeatable: bool = False  # whether several values may be written
 
 
 def always_succeed(result: Any) -> int:
@@ -293,43 +306,44 @@ def always_succeed(result: Any) -> int:
 
 @dataclass(frozen=True)
 class Experiment(Generic[AnyResult]):
-    """An experiment: its function, the classes of its settings and its result, and how
-    it is presented.
+    """An experiment: its function, its settings and result, and how it is presented.
 
     Attributes:
         function: ``(context: RunContext[NameConfig]) -> NameResult``.
-        settings: the class of its settings.
-        result: the class of its result.
-        examples: lines of a shell for its help, without `advsearch`.
+        settings: class of its settings.
+        result: class of its result.
+        examples: command lines for its help, without `advsearch`.
         positional_args: settings that the Python function takes by position.
-        about: the setting that names a run or a file which the experiment is about.
-        positional: how the command line takes `about` without its flag; None for not at
-            all.
-        defaults_from_run: ``(run.yaml, typed arguments) -> settings`` that the run in
-            `about` provides.
-        python_function: "module:function" that Python calls, where it is not the one
-            made of the settings.
+        about: name of the setting that names the subject of the experiment: a run, a
+            file or a name; empty if it has no subject.
+        positional: how the subject is written on the command line without a flag; None
+            if it needs its flag.
+        defaults_from_run: ``(run.yaml, typed arguments) -> settings``, which reads
+            default settings from the run in `about`.
+        python_function: "module:function" for Python callers; empty for the function
+            that is made from the settings.
         python_arguments: "module:function" whose keyword-only parameters Python callers
-            may pass beside settings; those that they pass go to `function`. A
-            positional setting that is among them may be a loaded object.
+            may pass in addition to settings. They are passed on to `function`. If a
+            positional setting is among them, it may be a loaded object.
         resumes_in_python: whether Python callers may continue the run that `run` names,
             with `resume=True`.
-        help_suffix: what its help adds to the line in the catalog.
+        help_suffix: text that its help appends to the line in the catalog.
         exit_status: ``result -> int``, the exit status of the command.
-        choices: "module:function" that returns the names that `about` may have, each
+        choices: "module:function" that returns the allowed names of the subject, each
             with a line of help.
-        choice_description: "module:function" from one of these names to a text and its
-            facts as JSON values, for `advsearch show`.
-        view: ``result -> ShownResult``, what terminal, page and notebook show; None
-            shows all fields.
+        choice_description: "module:function" that returns the description of such a
+            name as text and as JSON values, for `advsearch show`.
+        view: ``result -> ShownResult``, the contents of terminal, page and notebook;
+            None for all fields.
         claims: ``result -> claims`` that a run supports, for `advsearch report`.
         triggering: ``result -> lines``, conditions under which the model is wrong more
             often, for `advsearch report`.
-        noted_settings: ``(run, result) -> {kind: {name: settings}}`` of what a run
-            tried beside its own settings, as it noted them, for `advsearch report`; a
-            kind is missing where its note cannot be read.
-        page: ``(run, result) -> HTML or None``, for a page of its own kind.
-        other_results: further classes of results, each by a field that it alone has.
+        noted_settings: ``(run, result) -> {kind: {name: settings}}`` of other settings
+            that a run has tried, and stored as a note, for `advsearch report`. A kind
+            is missing if its note cannot be read.
+        page: ``(run, result) -> HTML or None``, for an experiment with a special page.
+        other_results: additional classes of results, each by the name of a field that
+            no other class has.
     """
 
     function: Callable[..., AnyResult]
@@ -405,7 +419,9 @@ class Experiment(Generic[AnyResult]):
         ) -> AnyResult:
             positional = dict(zip(self.positional_args, args, strict=False))
             values = {**positional, **settings}
-            # objects that settings cannot have go to the experiment's function directly
+            # Objects that settings cannot hold are passed directly to the experiment's
+            # function. A positional setting may be such an object; its name is still
+            # stored in the settings, so it is passed to both.
             arguments = {
                 name: values[name] for name in object_parameters if name in values
             }
@@ -420,6 +436,7 @@ class Experiment(Generic[AnyResult]):
                 config, progress=as_progress(progress), resumed=resumed, **arguments
             )
 
+        # `with_settings_signature` reads the signature, and adds the other settings.
         signature = self._make_signature(object_parameters)
         function.__signature__ = signature  # type: ignore[attr-defined]
         function.__name__ = self.settings.command
@@ -464,7 +481,8 @@ class Experiment(Generic[AnyResult]):
     def _find_python_arguments(self) -> dict[str, inspect.Parameter]:
         """Return the parameters for objects that only Python callers can pass, by name.
 
-        A setting cannot hold such objects, since it is stored in a file.
+        A setting cannot hold such objects, since it is stored in a file. They are the
+        keyword-only parameters of the function that `python_arguments` names.
         """
         if not self.python_arguments:
             return {}

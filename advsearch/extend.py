@@ -1,12 +1,11 @@
-"""Names that an added experiment, control, task, policy, model source, reader or
-exporter may import from advsearch.
+"""The interface for extensions of advsearch: experiments, controls, tasks, policies,
+model sources, readers and exporters.
 
     from advsearch.extend import Control, Parameter, Values
 
 Everything else in the package may change without notice. The optional built-in parts
-use this module too, and nothing but it. A name is imported on first use, so that a
-control does not wait for the modules of an experiment. docs/extending.md has an example
-of each name.
+import nothing else either. A name is imported on first use, so that a control does not
+import the modules of an experiment. docs/extending.md has an example of each name.
 """
 
 from __future__ import annotations
@@ -104,7 +103,7 @@ _NAMES = {
     "advsearch.settings": ("Config", "setting", "setting_as_in"),
     "advsearch.tasks": ("Task",),
 }
-"""The names of the interface, by the module that each is imported from."""
+"""The names of the interface, by the module from which they are imported."""
 
 _MODULES = {
     "assets": "advsearch.scene.assets",
@@ -134,7 +133,7 @@ _MODULES = {
     "workbench": "advsearch.api.workbench",
     "writing": "advsearch.trust.writing",
 }
-"""Modules of functions that belong to the interface as a whole."""
+"""Modules that belong to the interface with all their public names."""
 
 _MODULE_OF_NAME = {name: module for module, names in _NAMES.items() for name in names}
 

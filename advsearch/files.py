@@ -1,6 +1,4 @@
-"""Names of files: their endings, and how a sentence lists them; and the types of what
-JSON holds.
-"""
+"""Suffixes and names of files, and types for the contents of JSON files."""
 
 from __future__ import annotations
 
@@ -9,15 +7,15 @@ from collections.abc import Sequence
 
 from advsearch.catalog import list_built_ins
 
-# whatever JSON can hold
+# A value that JSON can hold.
 JsonValue = bool | int | float | str | list["JsonValue"] | dict[str, "JsonValue"] | None
-# A JSON object, before a type has taken it or once it has been written out
+# A JSON object: before it is validated, or after it was converted for writing.
 JsonObject = dict[str, JsonValue]
 MESHES = tuple(
     f".{name}" for name in (*list_built_ins("reader"), *list_built_ins("converter"))
 )
-"""Endings of the files that an object can be read from, but for those of other
-packages' readers.
+"""Suffixes of the files from which an object can be read, without those of readers in
+other packages.
 """
 
 
@@ -28,7 +26,7 @@ def either(names: Sequence[str], word: str = "or") -> str:
 
 
 PATH_ENDINGS = (".csv", ".txt", ".tum", ".kitti")
-"""How the name of a file ends along which something travels, in small letters."""
+"""Suffixes of files with a motion path, in lower case."""
 
 
 def split_paths(name: str) -> list[str]:

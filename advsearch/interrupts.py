@@ -1,7 +1,10 @@
-"""Ctrl-C, counted: what a handler raises inside a destructor, a callback or native code
-may come to nothing, and modules that are being imported make other errors of it. So all
-that renders, asks a model, waits for workers or tells how far it is looks
-(`INTERRUPTS.look`) whether there was one that nobody has handled.
+"""Handle Ctrl-C so that it is never lost.
+
+The KeyboardInterrupt of a signal handler is lost inside a destructor, a callback or
+native code, and a module that is being imported may turn it into another error. So the
+handler counts the interrupts. Code that renders, calls a model, waits for workers or
+reports progress calls `INTERRUPTS.look`, which raises an interrupt again that was not
+handled.
 """
 
 from __future__ import annotations
@@ -16,14 +19,18 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 
-# seconds within which a second signal is the same Ctrl-C: programs pass on what the
-# terminal has sent to all
+# A second signal within this many seconds belongs to the same Ctrl-C: the terminal
+# sends it to all processes, and some programs also pass it on.
 DUPLICATE_SECONDS = 0.5
 
 
 class Interrupts:
-    """A handler of Ctrl-C as Python's own, which counts signals; once it has `ended`,
-    nothing is left to interrupt.
+    """A handler of Ctrl-C that raises KeyboardInterrupt, and counts the interrupts.
+
+    Attributes:
+        count: number of interrupts so far.
+        handled: number of those that were handled, that is, that ended something.
+        ended: whether all work is done, so that nothing is left to interrupt.
     """
 
     def __init__(self) -> None:
@@ -51,7 +58,7 @@ class Interrupts:
 
     @property
     def waiting(self) -> bool:
-        """Whether one has come that nobody has handled."""
+        """Whether an interrupt has come that was not handled yet."""
         return self.count > self.handled
 
     def mark_handled(self) -> None:
@@ -59,17 +66,18 @@ class Interrupts:
         self.handled = self.count
 
     def look(self) -> None:
-        """Raise an interrupt that has come already and was not handled; in the main
-        thread, where it belongs.
+        """Raise an earlier interrupt again if it was not handled.
+
+        As for Python's own handler, only the main thread is interrupted.
 
         Raises:
-            KeyboardInterrupt: there is one.
+            KeyboardInterrupt: there is such an interrupt, and this is the main thread.
         """
         if self.waiting and threading.current_thread() is threading.main_thread():
             raise KeyboardInterrupt
 
 
-INTERRUPTS = Interrupts()  # those of this process
+INTERRUPTS = Interrupts()  # the interrupts of this process
 
 
 @contextmanager
@@ -88,11 +96,11 @@ def interruptible() -> Iterator[None]:
     # block, since it counts interrupts.
     replaces_handler = is_main_thread and handler is signal.default_int_handler
     if replaces_handler:
-        INTERRUPTS.mark_handled()
+        INTERRUPTS.mark_handled()  # earlier ones do not concern this block
         signal.signal(signal.SIGINT, INTERRUPTS)
     try:
         yield
-        INTERRUPTS.look()
+        INTERRUPTS.look()  # raises an interrupt that was lost inside the block
     except KeyboardInterrupt:
         INTERRUPTS.mark_handled()
         raise
@@ -106,7 +114,7 @@ def interruptible() -> Iterator[None]:
             signal.signal(signal.SIGINT, handler)
 
 
-def end_at_the_second() -> None:
+def end_process_at_second_interrupt() -> None:
     """Let a second Ctrl-C end this process at once, also inside native code.
 
     Python handles signals only between its own instructions, so that a thread waits for
@@ -154,9 +162,10 @@ def _wait_for_second(reading_end: socket.socket, writing_end: socket.socket) -> 
             os._exit(128 + signal.SIGINT)
 
 
-def unless_interrupted(unraisable: sys.UnraisableHookArgs) -> None:
-    """Tell an exception that a destructor or a callback could not raise, but for an
-    interrupt: interrupt that is counted.
+def report_unraisable_error(unraisable: sys.UnraisableHookArgs) -> None:
+    """Print an exception that a destructor or a callback could not raise.
+
+    An interrupt is not printed: it was counted, and `INTERRUPTS.look` raises it again.
     """
     if not issubclass(unraisable.exc_type, KeyboardInterrupt):
         sys.__unraisablehook__(unraisable)

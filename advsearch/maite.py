@@ -1,5 +1,5 @@
-"""Models and datasets of MAITE (https://mit-ll-ai-technology.github.io/maite), by its
-protocols: `advsearch.maite`.
+"""Use models of MAITE (https://mit-ll-ai-technology.github.io/maite), and make datasets
+for it.
 
     from advsearch import maite
 
@@ -37,7 +37,7 @@ __all__ = ["Detections", "Scenes", "load_model"]
 
 
 class _MaiteNetwork(nn.Module):
-    """A model of MAITE, called as torchvision's models are."""
+    """A model of MAITE with the interface of torchvision's models."""
 
     def __init__(self, model: Any, task: str) -> None:
         super().__init__()
@@ -140,26 +140,27 @@ class Detections:
 
 
 class Scenes:
-    """Images of a scene, sampled from its controls, as a dataset of MAITE.
+    """A dataset of MAITE with images of a scene, whose controls are sampled at random.
 
     Item k is an image (3, H, W) float32, sRGB in [0, 1] rounded to 8 bits; its target;
     and its metadata: `id`, and the configuration by parameter. The target is one-hot
-    (classes,), or the `Detections` of what is visible and has a name among the labels.
-    An item is rendered on access, and is the same every time.
+    (classes,) for classification. For detection it is the `Detections` of the visible
+    objects whose names are among the labels. An item is rendered on access, and is the
+    same every time.
 
     Args:
-        scene: scene from `load_scene`, or what that takes.
-        controls: what varies, evenly within its ranges.
-        count: how many pictures.
+        scene: scene from `load_scene`, or the name or the file of its object.
+        controls: controls whose parameters are sampled uniformly in their ranges.
+        count: number of images.
         labels: names of the classes, in the order of the model's outputs.
-        label: what is right, one name of these; None takes the object's own.
+        label: name of the right class; None for the label of the object.
         task: "classification" or "detection".
         resolution: side, or (height, width), in pixels.
-        spp: samples a pixel.
+        spp: samples per pixel.
         seed: seed of configurations and noise.
 
     Raises:
-        InputError: no class is called as the object, or an argument is out of range.
+        InputError: no class has the name of the object, or an argument is out of range.
     """
 
     def __init__(
@@ -205,11 +206,13 @@ class Scenes:
         self.task = task
         self.spp = spp
         self.seed = seed
-        description = self.renderer.scene.definition[0]
+        description, _filter = self.renderer.scene.definition
+        # the classes that count as right for the object
         self.right = find_label_set(
             label or description.object.label or description.object_name, self.labels
         )
         self.space = cast("Any", self.renderer.space)
+        # The domain has the ranges of all parameters; a configuration is a point in it.
         domain = make_domain(self.space.controls)
         self.configurations = domain.sample(torch.Generator().manual_seed(seed), count)
         index2label = dict(enumerate(self.labels))
@@ -252,17 +255,17 @@ class Scenes:
         has the boxes, classes and scores (all 1) of the visible objects; objects of
         none of the classes are left out.
         """
-        right_class = self.right.indices[0]
+        right_class = self.right.indices[0]  # the first, if several are right
         if self.task == "classification":
             one_hot = nn.functional.one_hot(torch.tensor(right_class), len(self.labels))
             return one_hot.float()
-        meshes = self.renderer.scene.definition[0].meshes
+        description, _filter = self.renderer.scene.definition
         boxes = []
         classes = []
         for thing in find_visible_meshes(self.renderer, u):
             class_id: int | None = right_class
-            if thing.name != "object":
-                name = meshes[thing.name].label or thing.name
+            if thing.name != "object":  # another object in the scene
+                name = description.meshes[thing.name].label or thing.name
                 class_id = _find_class(name, self.labels)
             if class_id is not None:
                 boxes.append(thing.box)

@@ -1,5 +1,5 @@
-"""Handle options of what has a name on the command line: the fields of a policy's or a
-task's dataclass, and Mitsuba's names.
+"""Read options on the command line: those of a policy or a task, which are fields of
+its dataclass, and Mitsuba's scene parameters.
 """
 
 from __future__ import annotations
@@ -16,21 +16,22 @@ from typing import Any, TypedDict
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonValue
 
-# Metadata of a field that is no option: it depends on what a run works with.
+# Metadata of a field that is no option: the run sets it.
 FROM_RUN = {"set by": "the run"}
-MAX_OPTION = 1_000_000  # maximum of a number in options: no budget has more renders
+# Maximum value of a number in options. No run has a budget of more renders.
+MAX_OPTION = 1_000_000
 MITSUBA_CONTROL = "mitsuba"  # the control whose parameters have Mitsuba's names
-TASK_SEPARATOR = (
-    "+"  # separates the names of joint tasks, one for each of several models
-)
+# Separates the names of joint tasks, one for each of several models.
+TASK_SEPARATOR = "+"
 
 
 def group_mitsuba_keys(controls: Mapping[str, object]) -> dict[str, object]:
-    """Collect all keys of Mitsuba's scene parameters in a single control.
+    """Bring controls into the form name to options, where a key has a range.
 
+    All keys of Mitsuba's scene parameters become options of a single control:
     ``{"mitsuba:mug.bsdf.reflectance": RANGE}`` becomes ``{"mitsuba":
-    {"mug.bsdf.reflectance": RANGE}}``. A range of a single parameter of another control
-    gets the name of the parameter: ``{"pose.yaw": RANGE}`` becomes ``{"pose.yaw":
+    {"mug.bsdf.reflectance": RANGE}}``. The range of a single parameter of another
+    control becomes a mapping, too: ``{"pose.yaw": RANGE}`` becomes ``{"pose.yaw":
     {"yaw": RANGE}}``.
 
     Args:
@@ -43,9 +44,11 @@ def group_mitsuba_keys(controls: Mapping[str, object]) -> dict[str, object]:
     ranges = dict[str, object]()
     for name, options in controls.items():
         kind, colon, key = str(name).partition(":")
-        if kind != MITSUBA_CONTROL or not colon:
+        is_mitsuba_key = kind == MITSUBA_CONTROL and bool(colon)
+        has_range = options is not None and options not in ({}, "")
+        if not is_mitsuba_key:
             plain[name] = _with_parameter(str(name), options)
-        elif not key or options is None or options in ({}, ""):
+        elif not key or not has_range:
             raise InputError(
                 f"`controls` {name}: expected a range, as in "
                 f"{MITSUBA_CONTROL}:{key or 'KEY'}=[0.2, 0.8]"
@@ -110,12 +113,15 @@ def format_things(things: object) -> str | None:
 
 
 def _make_thing_absolute(thing: str) -> str:
-    """Return a thing as text, ``OBJECT@OPTIONS``, with the absolute path of its object
-    if that is a file, perhaps with a node: ``scene.glb#NODE``.
+    """Make the path of an object absolute in a text ``OBJECT@OPTIONS``.
+
+    The object may be a node of a file, ``scene.glb#NODE``. The name of a bundled object
+    is not changed, and neither is a text without an @, which is rejected later.
     """
     object_name, at, options = thing.strip().rpartition("@")
     object_name = object_name.strip()
     file, mark, node = object_name.partition("#")
+    # Names of bundled objects have no suffix; such a name is not taken for a file.
     if "." in file and Path(file).is_file():
         object_name = f"{Path(file).resolve()}{mark}{node}"
     return f"{object_name}{at}{options}"
@@ -285,44 +291,44 @@ def check_takes(what: str, function: Callable[..., object], *names: str) -> None
         ) from None
 
 
-# ---- A configuration in words: named values with units, as controls say them and runs
-# keep them ---------------------
+# ---- A configuration as named values with units, as controls make them and runs store
+# them ---------------------
 
 
 class Value(TypedDict):
-    """One value of a configuration."""
+    """The value of a parameter in a configuration, with its unit."""
 
     value: float | str
     unit: str
 
 
-# Label of an output with NaN or infinity: it is no prediction.
+# Label for an output with NaN or infinity, which is no prediction.
 NOT_A_NUMBER = "not a number"
 OUT_OF_VIEW = "out of view"
-"""Label of a prediction about an image without the evaluated thing. It is no success of
-a search, and accuracies do not count it.
+"""Label of a prediction for an image in which the evaluated object is not visible. It
+counts neither as a success of a search nor in accuracies.
 """
 
 
 class Outcome(Enum):
-    """What becomes of the object in a detector's boxes, or in a segmentation's pixels.
+    """How a detector or a segmentation model finds, or does not find, the object.
 
-    The types of errors of TIDE (Bolya et al. 2020, section 2.2), as one object meets
-    them. The value is what JSON holds. Every count and every sentence about a detector
-    draws from this, and none from the text of a prediction.
+    These are the types of errors of TIDE (Bolya et al. 2020, section 2.2) for a single
+    object. JSON files contain the value. All counts and sentences about a detector are
+    computed from these, not from the text of a prediction.
     """
 
-    FOUND = "found"  # a right box
-    # a box of the right class on the object, which overlaps it too little; of pixels,
-    # too few
+    FOUND = "found"  # a right box, or enough right pixels
+    # A box of a right class overlaps the object too little, or too few pixels are
+    # right.
     LOOSE = "loose"
     WRONG_CLASS = "wrong class"  # a good box of another class
-    # a box of the class away from the object, or where nothing of it is to be seen
+    # A box of a right class is somewhere else, or the object is not visible.
     PHANTOM = "phantom"
     MISSED = "missed"  # no box that counts
 
 
-OUTCOME = "outcome"  # under which a payload has the value of one
+OUTCOME = "outcome"  # key of a payload under which it has the value of an `Outcome`
 
 
 def get_outcome(payload: object) -> Outcome | None:

@@ -1,5 +1,6 @@
-"""Picture files that others have made: only formats that are pictures, and none that
-takes too much to decode.
+"""Read image files that other people may have made.
+
+Only formats of images are read, and no file that takes too much time or memory.
 """
 
 from __future__ import annotations
@@ -19,25 +20,26 @@ from advsearch.trust import stored_files
 from advsearch.trust.stored_files import make_size_error, scale_limit
 
 FORMATS = ("PNG", "JPEG", "BMP", "GIF", "PPM", "DDS", "SGI", "TIFF", "WEBP", "TGA")
-"""Formats of pictures, as Pillow names them. Pillow knows more; for some (EPS) it runs
-other programs.
+"""Formats of images that are read, by their names in Pillow, in the order in which they
+are tried.
 
-Tried in this order: for the sixth Pillow imports all that it knows, which takes 0.1 s.
+Pillow knows more formats, and runs other programs for some (EPS). Common formats come
+first: for the sixth and later ones Pillow imports all its plugins, which takes 0.1 s.
 """
-MAX_FILE_BYTES = (
-    1 << 28
-)  # bytes of a file that `load_upright` reads, before `scale_limit`
-# of a picture (8192 x 8192), before `scale_limit`; decoded they take 4 bytes each
+
+# Users may raise the limits below by an environment variable (`scale_limit`).
+MAX_FILE_BYTES = 1 << 28  # maximum size of a file that `load_upright` reads
+# Maximum number of pixels (8192 x 8192). A decoded pixel takes 4 bytes.
 MAX_PIXELS = 1 << 26
-# scans of a progressive JPEG, each of which takes as long to decode as a picture; usual
-# are ten
+# Maximum number of scans of a progressive JPEG. Each takes as long to decode as an
+# image. Ten are usual.
 MAX_SCANS = 64
 
 
 @contextlib.contextmanager
 def without_pillows_limit() -> Iterator[None]:
     """Inside the block, let Pillow open pictures of any size; before one is decoded,
-    `check_pixels` refuses what is too large.
+    `check_pixels` rejects images that are too large.
     """
     pixel_limit = Image.MAX_IMAGE_PIXELS
     Image.MAX_IMAGE_PIXELS = None
@@ -56,13 +58,15 @@ def check_pixels(
         path: path of its file, for errors.
         width: width in pixels.
         height: height in pixels.
-        limit: how many pixels it may have, before `scale_limit`.
+        limit: maximum number of pixels. Users may raise it by an environment variable
+            (`scale_limit`).
 
     Raises:
         FileFormatError: it has more.
     """
-    if width * height > scale_limit(limit):
-        expected = f"a picture of at most {scale_limit(limit):,} pixels"
+    scaled_limit = scale_limit(limit)
+    if width * height > scaled_limit:
+        expected = f"a picture of at most {scaled_limit:,} pixels"
         raise make_size_error(path, expected, f"{width} x {height}")
 
 
@@ -82,9 +86,10 @@ def check_decodable(image: Image.Image, path: Path | str) -> None:
         )
     if image.format in ("JPEG", "MPO"):
         n_scans = _count_scans(image)
-        if n_scans > scale_limit(MAX_SCANS):
+        max_scans = scale_limit(MAX_SCANS)  # users may raise the limit
+        if n_scans > max_scans:
             raise make_size_error(
-                path, f"a JPEG of at most {scale_limit(MAX_SCANS)} scans", f"{n_scans}"
+                path, f"a JPEG of at most {max_scans} scans", f"{n_scans}"
             )
 
 
@@ -133,7 +138,7 @@ def load_upright(path: Path, side: int) -> npt.NDArray[np.float32]:
     """
     with open_image(path, MAX_FILE_BYTES) as image:
         check_decodable(image, path)
-        # turned as the camera's note in the file says
+        # rotated by the orientation that the camera has stored in the file
         rotated = ImageOps.exif_transpose(image)
         reduced = Image.fromarray(to_8bit_levels(rotated, alpha=False))
         if max(reduced.size) > side:

@@ -1,5 +1,5 @@
-"""How far a question is: what the API tells whoever watches, in a terminal or a
-notebook (`progress=True`).
+"""Display the progress of an experiment in a terminal, in a notebook or as lines of
+text (`progress=True`).
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ from advsearch.errors import InputError
 
 
 class Progress(Protocol):
-    """A watcher of a run. Its methods return at once and never raise because of what
-    they are shown.
+    """The interface of objects that display progress.
+
+    An experiment calls the methods. They should return at once, and raise nothing.
     """
 
     def stage(
@@ -42,23 +43,27 @@ class Progress(Protocol):
         return
 
     def advance(self, n: int = 1, **info: float | str) -> None:
-        """Report `n` more steps of the stage done. `info` is shown beside the bar:
-        ``best=0.31``.
+        """Report that `n` more steps of the stage are done.
+
+        `info` has values to display with the number of steps, such as ``best=0.31``.
         """
         return
 
     def message(self, text: str) -> None:
-        """Show one sentence that a person should read: a warning, say."""
+        """Display one sentence for the user, such as a warning."""
         return
 
 
 class NullProgress(Progress):
-    """The watcher that looks away: what a Python call uses when it is given none."""
+    """A `Progress` that displays nothing."""
 
 
 class Stages:
-    """Reports the stages of a run to its watcher, and measures the seconds of each by
-    name.
+    """Reports the stages of a run to a `Progress`, and measures how long they take.
+
+    Attributes:
+        progress: object that displays the stages.
+        seconds: seconds by name of the stage.
     """
 
     def __init__(self, progress: Progress) -> None:
@@ -108,29 +113,28 @@ class Stages:
 
 
 ProgressOption = Progress | bool | None
-"""Who watches, as a caller says it: True is a bar, False nobody, None a bar on a
-terminal.
+"""The argument `progress` of functions: True for a display, False for none, None for
+one on a terminal only, or an object that displays the progress.
 """
 
 
-def as_progress(watched: ProgressOption) -> Progress:
-    """Return who is told how far it is: the watcher that was given, and nobody where
-    none was.
+def as_progress(option: ProgressOption) -> Progress:
+    """Return the object that displays progress, or a `NullProgress` if the option is
+    none.
     """
-    return NullProgress() if watched is None or isinstance(watched, bool) else watched
+    return NullProgress() if option is None or isinstance(option, bool) else option
 
 
 Function = TypeVar("Function", bound=Callable[..., Any])
-# seconds after which a stage is announced where there is no terminal; a shorter one is
-# not worth a line
+# Seconds after which a line announces a stage without a terminal. Shorter stages get no
+# line.
 ANNOUNCE_SECONDS = 2.0
-MAX_BARS = 5  # stages that a terminal shows at once
-MIN_UPDATE_SECONDS = 0.2  # least seconds between two changes of a notebook's line
+MAX_BARS = 5  # maximum number of bars that are visible at once in a terminal
+MIN_UPDATE_SECONDS = 0.2  # minimum seconds between two updates of a notebook's line
+# Minimum time between two lines without a terminal: in seconds, and as a fraction of
+# the time that the stage has lasted.
 LINE_INTERVAL = 5.0
 LINE_FRACTION = 0.1
-"""Seconds between two lines where there is no terminal, and the share of a stage's time
-so far that they are at least.
-"""
 
 
 def open_progress(
@@ -154,37 +158,44 @@ def open_progress(
                 f"progress: expected True, False, None or a Progress, got {requested!r:.80}"
             )
         return nullcontext(requested)  # type: ignore[arg-type]
+    if requested is False:
+        return nullcontext(NullProgress())
+    # From here on, None differs from True: it only displays bars in a terminal.
     shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
     is_notebook = getattr(shell, "kernel", None) is not None
     if requested and is_notebook:
         return NotebookProgress(written)
     stream = sys.stderr  # None in a process without a terminal or a pipe
-    if requested is not False and stream is not None and stream.isatty():
+    if stream is not None and stream.isatty():
         # A `Screen` around the terminal would escape the control characters of bars, so
         # they are written to the stream inside of it.
-        return BarProgress(getattr(stream, "stream", stream), written)
+        terminal = getattr(stream, "stream", stream)
+        return BarProgress(terminal, written)
     if requested and stream is not None:
         return LineProgress(stream, written)
     return nullcontext(NullProgress())
 
 
 def with_progress_option(function: Function) -> Function:
-    """Make a function that takes a watcher as its keyword `progress` take what
-    `open_progress` does: True, False, None or a watcher.
+    """Make a function accept True, False and None as its keyword `progress`, too.
+
+    The function itself expects an object that displays progress (`open_progress`).
     """
 
     @wraps(function)
     def wrapper(*args: Any, progress: ProgressOption = None, **keywords: Any) -> Any:
-        with open_progress(progress) as watcher:
-            return function(*args, progress=watcher, **keywords)
+        with open_progress(progress) as opened_progress:
+            return function(*args, progress=opened_progress, **keywords)
 
     return wrapper  # type: ignore[return-value]
 
 
 class LineProgress:
-    """Plain lines on a stream: what a stage is once it has lasted `ANNOUNCE_SECONDS` seconds,
-    then how far it is every `LINE_INTERVAL` seconds or more, inside a `with` block also
-    of one that is silent; messages at once.
+    """Displays progress as lines of text on a stream.
+
+    A stage is announced when it has lasted `ANNOUNCE_SECONDS`. After that, a line with
+    its progress is printed every `LINE_INTERVAL` seconds or more. Inside of a `with`
+    block this also happens if the stage reports no steps. Messages are printed at once.
     """
 
     def __init__(
@@ -308,8 +319,9 @@ class LineProgress:
 
 
 class NotebookProgress(LineProgress):
-    """One line below the cell of a notebook, which goes at the end of a `with` block,
-    and messages, which stay.
+    """Displays progress as a line below the cell of a notebook.
+
+    The line disappears at the end of the `with` block. Messages remain.
     """
 
     def __init__(self, written: Callable[[str], str] = str) -> None:
@@ -335,8 +347,9 @@ class NotebookProgress(LineProgress):
 
 
 class BarProgress:
-    """The bars of rich on a terminal, one for each stage, which are gone behind the
-    `with` block.
+    """Displays progress as bars of the package rich in a terminal, one for each stage.
+
+    The bars disappear at the end of the `with` block.
     """
 
     def __init__(self, terminal: IO[str], written: Callable[[str], str] = str) -> None:
@@ -397,7 +410,7 @@ class BarProgress:
         )
 
     def advance(self, n: int = 1, **info: float | str) -> None:
-        """See `Progress.advance`; nothing is shown before the first stage."""
+        """See `Progress.advance`. Before the first stage nothing is displayed."""
         for bar in self.bars.tasks[-1:]:
             text = escape_text(format_info(info)) if info else bar.fields["info"]
             self.bars.update(bar.id, advance=n, info=text)
@@ -435,8 +448,10 @@ def format_info(info: dict[str, float | str]) -> str:
 
 
 def escape_text(text: str, encoding: str = "utf-8") -> str:
-    """Return `text` with everything but line ends and tabs that a terminal would not
-    show, or that would steer it, written as an escape: names in it are others'.
+    """Return text with escapes for characters that could control a terminal.
+
+    Names in messages may come from other people. Characters that are not printable are
+    escaped, except for line ends and tabs.
     """
     if not text.isascii() or not text.isprintable():
         text = "".join(map(_escape_char, text))
@@ -444,7 +459,7 @@ def escape_text(text: str, encoding: str = "utf-8") -> str:
 
 
 def _escape_char(char: str) -> str:
-    """Return a character as it is if a terminal shows it, else as Python escapes it."""
+    """Return a character if it is printable, otherwise Python's escape for it."""
     if char in "\n\t" or char.isprintable() or unicodedata.category(char) == "Zs":
         return char
     code = ord(char)

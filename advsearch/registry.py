@@ -1,8 +1,7 @@
-"""Registries: built-in and installed parts of one kind by their name on the command
-line.
+"""Registries of experiments, controls, policies and so on, by name.
 
-A package adds to a registry through an entry point of the registry's group, as
-`docs/extending.md` shows.
+A registry contains the built-in parts of one kind, and those of installed packages. A
+package adds a part by an entry point of the registry's group, see `docs/extending.md`.
 """
 
 from __future__ import annotations
@@ -26,11 +25,11 @@ Entry = TypeVar("Entry")
 
 @dataclass(eq=False, repr=False)
 class Registry(Mapping[str, Entry], Generic[Entry]):
-    """Entries by name: the built-in ones first, in their order, then those of installed
-    packages; built-in names win.
+    """A mapping from names to entries: the built-in ones, then those of installed
+    packages.
 
-    An entry is imported on access, so that a package that cannot be imported affects no
-    other.
+    If a package has an entry with a built-in name, the built-in entry is used. An entry
+    is imported on access, so that a package that cannot be imported affects no other.
     """
 
     group: str  # group of entry points: "advsearch.policies"
@@ -40,8 +39,9 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
     # the entry point".
     expected: str
     fits: Callable[[str, Any], bool]  # whether an object under a name is an entry
-    # Whether "package.module:Class" names an entry too without registration: a class
-    # with a capital letter, from the Python path or the current directory.
+    # Whether a class of the user is an entry, too, by the name "package.module:Class".
+    # It is imported from the Python path or the current directory, and its name begins
+    # with a capital letter.
     imports: bool = False
 
     def __getitem__(self, name: str) -> Entry:
@@ -129,8 +129,8 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
     def names_class(self, name: str) -> bool:
         """Return whether a name stands for a class to import.
 
-        "package.module:Class" does. "light:Key" does not if "light" is an entry: then
-        it names an instance of that entry.
+        "package.module:Class" does, if this registry allows it (`imports`). "light:Key"
+        does not if "light" is an entry: then it names an instance of that entry.
         """
         module, _, attribute = name.partition(":")
         is_class_name = attribute[:1].isupper() and attribute.isidentifier()
@@ -138,7 +138,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
             return False
         packages = module.split(".")
         if packages[0] in self.built_ins or packages[0] in self._installed:
-            return False  # what stands before the colon is an entry
+            return False  # the name before the colon is that of an entry
         return all(package.isidentifier() for package in packages)
 
     @cached_property
@@ -178,7 +178,7 @@ def get_first_doc_line(entry: Any) -> str:
 
 
 def load_attribute(target: str) -> Any:
-    """Import what "module:attribute" names."""
+    """Import the attribute that "module:attribute" names."""
     module, _, attribute = target.partition(":")
     return getattr(import_module(module), attribute)
 

@@ -1,7 +1,8 @@
-"""Independent random streams, all derived from one root seed (docs/design.md, "Seeds").
+"""Derive independent random streams from one root seed (docs/design.md, "Seeds").
 
-A stream is named, so that the primal, gradient, search, baseline and verification seeds
-of a run never meet, whatever their number. `numpy.random.SeedSequence` does the mixing.
+Each stream has a name, so that the seeds of a run for search, gradients, baselines and
+verification are independent, whatever their number. `numpy.random.SeedSequence` mixes
+the root seed, the name and an index.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Claims about a model as assertions, for pytest (docs/testing.md).
+"""Assertions about a model, for pytest (docs/testing.md).
 
     from advsearch.testing import assert_right
 
@@ -6,8 +6,8 @@
         views = {"camera": {"azimuth": [0, 360]}}
         assert_right("mug", "model.pt2", at_least=0.9, controls=views)
 
-A failure shows the picture's path and what repeats it. Every call keeps a run, in `run`
-or under runs/.
+The message of a failure contains the path of the picture, and the command that repeats
+the test. Every call stores a run, in `run` or in a new folder under runs/.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ def assert_no_worse(
         than: the other model.
         points: percentage points, over 0 and under 100.
         pictures: maximum number of images.
-        confidence: probability that an assertion that passes or fails is correct.
+        confidence: probability with which the result of the test is correct.
         seed: root of all random numbers.
         run: name or folder of the run; None for a new name.
         **settings: settings of a scene and its images, as `sweep` takes them, and
@@ -133,7 +133,13 @@ def assert_no_worse(
     __tracebackhide__ = True
     claim = {"claim": "no_worse", "points": points, "pictures": pictures}
     return _assert_claim(
-        claim, object, {"model": model, "than": than}, settings, confidence, seed, run
+        claim,
+        object,
+        models={"model": model, "than": than},
+        settings=settings,
+        confidence=confidence,
+        seed=seed,
+        run=run,
     )
 
 
@@ -155,10 +161,13 @@ def assert_suite(suite: str | Path, **settings: Any) -> SuiteResult:
 
     experiment = workbench.get_experiment("test")
     workbench.allow_named(settings)
+    # no other thread of this process may render at the same time
     with workbench.hold_process_lock():
         result: SuiteResult = experiment.run(
             experiment.settings(**{"suite": str(suite), **settings})
         )
+    # `accepted`: the claim held, or has the result that the suite expects. `repeat` is
+    # the command that tests the claim again.
     reports = [
         _format_report(result, claim, claim.repeat)
         for claim in result.claims
@@ -207,10 +216,12 @@ def _assert_claim(
         workbench.allow_named(settings)
         for model in models.values():
             workbench.allow_named({"model": model})
+        # the settings with names in place of objects, and the objects by these names
         suite_settings, objects = _name_objects(object, settings)
         claim_settings = dict(claim)
         for key, model in models.items():
             model_name = workbench.get_model_name(model)
+            # "model" is a setting of the suite; "than" belongs to the claim
             if key == "model":
                 suite_settings[key] = model_name
             else:
@@ -292,7 +303,7 @@ def _name_objects(
 
 
 def _format_report(result: SuiteResult, claim: ClaimResult, repeat: str) -> str:
-    """Return the message of a failed claim; `repeat` is what runs it again."""
+    """Return the message of a failed claim; the command `repeat` runs it again."""
     run = Path(result.run or "")
     lines = [
         f"{claim.name}: {claim.verdict}: {claim.reason}",

@@ -1,12 +1,14 @@
-"""How many threads torch and Dr.Jit use, and how torch's wait, so that the two pools do
-not fight.
+"""Set the numbers of threads of torch and Dr.Jit, so that they do not compete for
+cores.
 
-Idle OpenMP threads poll at their barriers, and hold the core that the awaited one
-needs, so they sleep at once. Right after a render Dr.Jit's workers still poll too, so
-while there is rendering torch gets half of the cores, and all of them only where it
-works alone (training). OpenMP reads its environment once, when torch is imported: this
-module has to come before torch. What the user has set is left alone. Imports the
-standard library only.
+By default, idle OpenMP threads of torch wait in a busy loop, and occupy the cores that
+others need. Here they sleep instead. After a render Dr.Jit's workers are busy for a
+while, too. So torch gets half of the cores, and all of them only if nothing is rendered
+(training).
+
+OpenMP reads its environment variables once, when torch is imported, so this module must
+be imported before torch, and imports the standard library only. Variables that the user
+has set are not changed.
 """
 
 from __future__ import annotations
@@ -21,18 +23,21 @@ from pathlib import Path
 from advsearch.errors import InputError
 
 OPENMP_DEFAULTS = {"OMP_WAIT_POLICY": "PASSIVE", "KMP_BLOCKTIME": "0"}
-"""Idle threads sleep at once: the first for GNU OpenMP (torch on Linux), the second for
-LLVM's and Intel's (macOS).
+"""Environment variables with which idle threads sleep: the first one for GNU OpenMP
+(torch on Linux), the second one for the OpenMP of LLVM and Intel (macOS).
 """
 _CPU_MAX = Path("/sys/fs/cgroup/cpu.max")
 _CPU_INFO = Path("/proc/cpuinfo")
+# The number of threads that the user has set; empty if there is none. `configure`
+# changes the variable later.
 _USERS_COUNT = os.environ.get("OMP_NUM_THREADS", "")
 
-# a user who has set this has decided about waiting
+# A user who has set this variable has chosen how threads wait.
 if "GOMP_SPINCOUNT" not in os.environ:
     for _name, _value in OPENMP_DEFAULTS.items():
         os.environ.setdefault(_name, _value)
 
+# The number of threads that `configure` has set; None before its first call.
 _chosen: int | None = None
 
 
@@ -63,8 +68,8 @@ def read_processor_name(cpu_info: Path = _CPU_INFO) -> str:
     """Return the name of the processor; "unknown" if the system does not state it.
 
     Args:
-        cpu_info: file in which Linux describes the processor. If it has no name, Python
-            is asked.
+        cpu_info: file in which Linux describes the processor. If it has no name, that
+            of Python's `platform` is returned.
     """
     try:
         for line in cpu_info.read_text(encoding="utf-8", errors="replace").splitlines():
@@ -76,8 +81,8 @@ def read_processor_name(cpu_info: Path = _CPU_INFO) -> str:
     return platform.processor() or platform.machine() or "unknown"
 
 
-# of threads for each core: more only wait for each other, and somebody else's file may
-# ask for any number
+# A file of another person may request any number of threads. With more than a few per
+# core they only wait for each other.
 MAX_THREADS_PER_CORE = 4
 
 
@@ -122,6 +127,7 @@ def restore_threads() -> Iterator[None]:
     """
     global _chosen
     chosen_before = _chosen
+    # each is None if the library is not imported yet
     torch = sys.modules.get("torch")
     torch_threads = None if torch is None else torch.get_num_threads()
     drjit = sys.modules.get("drjit")
@@ -135,14 +141,15 @@ def restore_threads() -> Iterator[None]:
         if drjit is not None:
             if drjit.thread_count() != drjit_threads:
                 drjit.set_thread_count(drjit_threads)
-        elif "drjit" in sys.modules:
+        elif "drjit" in sys.modules:  # imported inside of the block
             apply_to_drjit()
 
 
 @contextmanager
 def all_for_torch() -> Iterator[None]:
-    """Inside the block, in which nothing is rendered, give torch all threads: training
-    takes half the time.
+    """Give torch all threads inside of the block, in which nothing is rendered.
+
+    Training then takes half of the time.
     """
     configure(_chosen, rendering=False)
     try:
@@ -152,8 +159,9 @@ def all_for_torch() -> Iterator[None]:
 
 
 def apply_to_drjit() -> None:
-    """Set the threads of Dr.Jit, which is imported, to what `configure` chose, or else
-    to the default.
+    """Set the number of threads of Dr.Jit, which must be imported.
+
+    It is the number that `configure` has set, or else the default.
     """
     drjit = sys.modules["drjit"]
     n_threads = _chosen if _chosen is not None else _get_default()
@@ -162,8 +170,8 @@ def apply_to_drjit() -> None:
 
 
 def _get_default() -> int:
-    """Return the threads that the user has set by OMP_NUM_THREADS, or else every core
-    that this process may use.
+    """Return the number of threads that the user has set by OMP_NUM_THREADS, or else
+    the number of cores that this process may use.
     """
     if _USERS_COUNT.isdecimal() and int(_USERS_COUNT) > 0:
         return int(_USERS_COUNT)

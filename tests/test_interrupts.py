@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from advsearch.cli.output import InterruptCheckingProgress
-from advsearch.interrupts import DUPLICATE_SECONDS, INTERRUPTS, Interrupts, interruptible, unless_interrupted
+from advsearch.interrupts import DUPLICATE_SECONDS, INTERRUPTS, Interrupts, interruptible, report_unraisable_error
 from advsearch.progress import NullProgress
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from conftest import ROOT
@@ -52,7 +52,7 @@ def in_a_library() -> None:
 @pytest.fixture(autouse=True)
 def alone(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Handler, hook and counts are as before afterwards."""
-    monkeypatch.setattr(sys, "unraisablehook", unless_interrupted)
+    monkeypatch.setattr(sys, "unraisablehook", report_unraisable_error)
     for name in ("count", "handled", "ended", "_last"):
         monkeypatch.setattr(INTERRUPTS, name, vars(Interrupts())[name])
     yield

@@ -1,5 +1,6 @@
-"""What Python has beside the questions: keywords, names, runs that are loaded, and
-exports.
+"""The Python interface apart from the experiments: keywords, names, loading of runs,
+and exports.
 """
 
-from advsearch import threads as threads  # before torch: it sets how OpenMP waits
+# Imported before torch, since it sets how threads of OpenMP wait.
+from advsearch import threads as threads

@@ -1,9 +1,9 @@
-"""Print a page of printable colors, and measure a photograph of it for what printer and
-paper make of them.
+"""Print a color chart, and measure a photograph of it to find how printer and paper
+change the colors.
 
-Between the patches is bare paper: a patch is measured relative to the light at its four
-corners, so that neither the lamp's color nor its unevenness counts. Four black squares,
-outside all patches, locate the chart.
+Between the patches is bare paper. Each patch is measured relative to the paper at its
+four corners, so that the color and the unevenness of the light cancel out. Four black
+squares outside of all patches show where the chart is in the photograph.
 """
 
 from __future__ import annotations
@@ -30,14 +30,13 @@ from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 
 Floats = npt.NDArray[np.float64]
 CHART_COLORS = np.array(list(itertools.product((0.1, 0.3, 0.5, 0.7, 0.9), repeat=3)))
-"""(125, 3) sRGB: the printable colours of `--printable`."""
-COLUMNS = 9
+"""(125, 3), sRGB: the printable colors of `--printable`."""
+COLUMNS = 9  # number of patches in a row
+# In millimetres: the distance between the centers of neighboring patches, and the
+# widths of a patch and of a black square.
 PITCH = 15.0
 PATCH_SIZE = 12.0
 CORNER_SIZE = 9.0
-"""Patches in a row; their pitch, their size and that of a black square in
-millimetres.
-"""
 ROWS = -(-len(CHART_COLORS) // COLUMNS)
 # Width and height of all patches with the paper around them, in millimetres.
 CHART_SIZE = (COLUMNS * PITCH, ROWS * PITCH)
@@ -48,11 +47,11 @@ CORNER_CENTERS = np.array(
         for x in (-CORNER_SIZE, CHART_SIZE[0] + CORNER_SIZE)
     ]
 )
-"""(4, 2) centers of the black squares, from the upper left corner of the patches, in
-reading order.
+"""(4, 2) x and y of the centers of the black squares, in millimetres from the upper
+left corner of the patches: upper left, upper right, lower left, lower right.
 """
-MAX_IMAGE_SIZE = 8192
-# (125, 2) centers of the patches.
+MAX_IMAGE_SIZE = 8192  # maximum width and height of a photograph, in pixels
+# (125, 2) x and y of the centers of the patches, in millimetres as above.
 PATCH_CENTERS = (
     np.stack(np.divmod(np.arange(len(CHART_COLORS)), COLUMNS)[::-1], axis=1) + 0.5
 ) * PITCH
@@ -69,7 +68,8 @@ def draw_chart_page(title: str, paper: tuple[float, float], convert: Any) -> Fig
     Args:
         title: title of the run.
         paper: (width, height) of the page in millimetres.
-        convert: color transform of PIL to the printer's profile; None for none.
+        convert: color transform of PIL to the printer's profile; None to leave the
+            colors as they are.
     """
     figure, axes = make_blank_page(paper)
     # upper left corner of the patches, on the page
@@ -124,24 +124,26 @@ def measured_palette(photograph: str | Path) -> Tensor:
     light = srgb_to_linear(load_upright(Path(photograph), MAX_IMAGE_SIZE)).astype(
         np.float64
     )
-    homography = _compute_homography(CORNER_CENTERS, _find_corners(light, photograph))
+    corner_pixels = _find_corners(light, photograph)
+    homography = _compute_homography(CORNER_CENTERS, corner_pixels)
 
-    def measure(points: Floats) -> Floats:
+    def measure_light(points: Floats) -> Floats:
         """Return the median light (3,) at points (N, 2) of the chart, in millimetres."""
         median: Floats = np.median(_sample(light, homography, points), axis=0)
         return median
 
-    # points in the middle of a patch, away from its edges, in millimetres
-    patch_offsets = _make_pairs(np.linspace(-0.25, 0.25, 7) * PATCH_SIZE)
-    # bare paper: points in the gaps at the four corners between a patch and its
-    # neighbours
-    paper_offsets = _make_pairs(np.linspace(-0.3, 0.3, 3) * (PITCH - PATCH_SIZE))
-    crossings = _make_pairs((-PITCH / 2.0, PITCH / 2.0))
+    # 7 x 7 points around the center of a patch, away from its edges, in millimetres
+    patch_offsets = _make_grid(np.linspace(-0.25, 0.25, 7) * PATCH_SIZE)
+    # The bare paper nearest to a patch is where the gaps between patches cross: at its
+    # four corners. The light is measured at 3 x 3 points of each crossing.
+    gap_crossings = _make_grid((-PITCH / 2.0, PITCH / 2.0))
+    paper_offsets = _make_grid(np.linspace(-0.3, 0.3, 3) * (PITCH - PATCH_SIZE))
     colors = []
     for center in PATCH_CENTERS:
-        patch_light = measure(center + patch_offsets)
+        patch_light = measure_light(center + patch_offsets)
         paper_light = [
-            measure(center + crossing + paper_offsets) for crossing in crossings
+            measure_light(center + crossing + paper_offsets)
+            for crossing in gap_crossings
         ]
         # The light is divided by that of the paper around the patch, so that uneven
         # light cancels out. 1e-4 prevents a division by zero.
@@ -149,9 +151,11 @@ def measured_palette(photograph: str | Path) -> Tensor:
     return torch.from_numpy(linear_to_srgb(np.array(colors, np.float32)))
 
 
-def _make_pairs(values: Iterable[float]) -> Floats:
-    """Return all pairs (N, 2) of values."""
-    return np.array(list(itertools.product(values, repeat=2)))
+def _make_grid(coordinates: Iterable[float]) -> Floats:
+    """Return the points (n * n, 2) of a square grid with n coordinates along each
+    axis.
+    """
+    return np.array(list(itertools.product(coordinates, repeat=2)))
 
 
 def _find_corners(light: Floats, photograph: str | Path) -> Floats:
@@ -179,8 +183,8 @@ def _find_corners(light: Floats, photograph: str | Path) -> Floats:
     if len(squares) < 4:
         raise not_found
     x, y, area = np.array(squares).T
-    # nearest to each corner of the picture: upper left first (smallest x + y), then
-    # upper right, lower left, lower right
+    # the square nearest to each corner of the image: upper left (smallest x + y), upper
+    # right, lower left, lower right
     outermost = [
         int(np.argmin(x_sign * x + y_sign * y))
         for y_sign, x_sign in itertools.product((1, -1), repeat=2)

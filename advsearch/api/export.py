@@ -1,7 +1,7 @@
-"""Export the adversarial scene of a run to other programs and to print.
+"""Export the adversarial scene of a run to other programs and to a printer.
 
-Other programs get the adversarial scene. Patches are printed, and textures unwrapped
-into pieces, in true millimetres.
+Other programs get the scene. On paper, patches and the pieces of unwrapped textures
+have the size in millimetres that they have on the real object.
 """
 
 from __future__ import annotations
@@ -43,12 +43,13 @@ from advsearch.scene.raster import compute_doubled_areas, rasterize_charts
 
 @dataclass(frozen=True, eq=False)
 class AdversarialRun:
-    """A run with its problem and its adversarial configuration.
+    """A run of `attack` with its adversarial scene.
 
     Attributes:
         folder: folder of the run.
-        problem: as the run had it.
-        u: (d,), the configuration in the full space; what varies by chance is as in the
+        problem: the optimization problem of the run, with its scene and model.
+        u: (d,), the adversarial configuration, with coordinates for the conditions
+            that vary at random. Without a stored trial these have the values of the
             clean scene.
     """
 
@@ -73,9 +74,12 @@ class AdversarialRun:
                 f"{folder}: ended with {summary.ending!r}, so that there is no "
                 "adversarial configuration to export"
             )
+        # A policy or an objective may exist only in the Python session of the run, and
+        # is not needed here.
         config = with_evaluation_only(AttackConfig.from_yaml(folder / CONFIG))
-        problem, _ = problem_from_config(config)
-        # where conditions vary, they are those of the trial whose picture the run stores
+        problem, _warnings = problem_from_config(config)
+        # Conditions that vary at random, such as the camera, are those of the trial
+        # (verification render) whose image the run stores.
         trial = summary.adversarial.trial
         conditions_seed = None
         if trial is not None:
@@ -118,20 +122,23 @@ class AdversarialRun:
         }
         with torch.no_grad():
             rendered = renderer.render_radiance(
-                traced, seed, spp, "backdrop.color" in inputs
+                traced, seed, spp, hide_environment="backdrop.color" in inputs
             )
+            # `u` is for controls that change the finished image: it has their values
             return renderer.finish_image(rendered, inputs, self.u)
 
     @property
     def image_controls(self) -> list[str]:
-        """The names of the controls that change the rendered image."""
-        # an image of noise: any control that changes images changes it
+        """The names of the controls that change the finished image, such as lens blur.
+
+        They are found by a test: a control is among them if it changes an image of
+        noise.
+        """
         noise = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0))
-        slices = self.problem.space.split_by_control(self.u)
         return [
             control.name
-            for control, part in slices
-            if not torch.equal(control.apply_to_image(part, noise), noise)
+            for control, control_u in self.problem.space.split_by_control(self.u)
+            if not torch.equal(control.apply_to_image(control_u, noise), noise)
         ]
 
     @property
@@ -142,10 +149,10 @@ class AdversarialRun:
             return renderer.scene.assembly(renderer.space.inputs(self.u))
 
 
-BLEED = 3.0  # color beyond the line to cut, in millimetres
+BLEED = 3.0  # width of the color beyond the line to cut, in millimetres
 MAX_PIXEL_SIZE = 0.2
-"""Maximum size of a printed pixel in millimetres: larger texels are subdivided, with
-the renderer's interpolation.
+"""Maximum size of a printed pixel in millimetres. Larger texels are subdivided, and
+interpolated as by the renderer.
 """
 # Maximum subdivisions of a texel per axis; odd, so that the center has its own color.
 MAX_SUBDIVISIONS = 9
@@ -203,13 +210,16 @@ def make_printable_pieces(run: str | Path, size: float) -> list[Piece]:
     scene = _load_object_scene(config)
     pieces = list[Piece]()
     for control in make_controls(config.controls):
-        texture_file = folder / ARTIFACTS / f"{to_file_name(control.name)}.png"
+        file_stem = to_file_name(control.name)
+        texture_file = folder / ARTIFACTS / f"{file_stem}.png"
         if control.kind == "patch":
-            pixels = read_png(folder / ARTIFACTS / f"{control.name}-pixels.png")
+            pixels = read_png(folder / ARTIFACTS / f"{file_stem}-pixels.png")
             patch_size = size * _get_relative_patch_size(control, config, summary)
-            pixel_size = patch_size / len(pixels)
+            pixel_size = patch_size / len(pixels)  # a patch is a square
             name = f"{control.name}, {patch_size:.1f} mm a side"
-            pieces.append(_make_piece(name, pixels, (pixel_size, pixel_size), None))
+            pieces.append(
+                _make_piece(name, pixels, (pixel_size, pixel_size), inside=None)
+            )
         elif isinstance(control, TextureControl) and texture_file.is_file():
             pieces.extend(
                 _make_texture_pieces(control, scene.description, texture_file, size)
@@ -236,14 +246,16 @@ def _make_texture_pieces(
         texture_file: PNG file of the texture.
         size: longest side of the real object in millimetres.
     """
+    # the mesh with the texture: the object, or another mesh of the scene
     mesh = control.get_mesh(description).mesh
     materials = control.list_materials(description)
-    faces = None
+    faces = None  # all of them
     if materials is not None:
         faces = np.concatenate([mesh.materials[name] for name in materials])
-    vertices = description.object.mesh.vertices
-    # millimetres per unit of the mesh: the longest side has `size`
-    scale = size / float(np.ptp(vertices, axis=0).max())
+    # All meshes of a scene have the same unit of length. `size` is the longest side of
+    # the object, so the object determines how many millimetres a unit has.
+    object_vertices = description.object.mesh.vertices
+    scale = size / float(np.ptp(object_vertices, axis=0).max())
     texture = read_png(texture_file)
     return _find_charts(control.name, texture, mesh, faces, scale)
 
@@ -293,6 +305,7 @@ def _find_charts(
         faces: indices of the faces to print; None for all.
         scale: millimetres per unit of the mesh.
     """
+    # signed areas of the faces in the texture
     uv_areas = compute_doubled_areas(mesh.uvs[mesh.faces].astype(np.float64))
     raster = rasterize_charts(mesh, (texture.shape[0], texture.shape[1]))
     positions = raster.compute_positions().astype(np.float64)
@@ -308,7 +321,7 @@ def _find_charts(
         image = _extend_inside(texture[box], inside)
         # A chart whose texture coordinates are mirrored has a negative signed area.
         is_mirrored = uv_areas[np.unique(raster.face[box][inside])].sum() < 0.0
-        if is_mirrored:
+        if is_mirrored:  # mirror it back; the size of its texels stays the same
             image = image[:, ::-1]
             inside = inside[:, ::-1]
         title = name if len(charts) == 1 else f"{name}, piece {number}"
@@ -353,12 +366,12 @@ def _measure_texel_size(
         area to print.
     """
     distances_by_axis = []
-    for axis in (1, 0):  # along rows, then along columns
+    for axis in (1, 0):  # along rows (width), then along columns (height)
+        # one distance for each texel that has a next texel along the axis
         distances = np.linalg.norm(np.diff(positions, axis=axis), axis=-1)
-        # whether a texel and the next one along the axis both belong to the part
-        next_inside = np.delete(inside, 0, axis)
-        both_inside = next_inside & np.delete(inside, -1, axis)
-        distances_by_axis.append(distances[both_inside])
+        is_inside = np.delete(inside, -1, axis)  # all but the last texel
+        is_next_inside = np.delete(inside, 0, axis)  # all but the first texel
+        distances_by_axis.append(distances[is_inside & is_next_inside])
     if not all(len(distances) for distances in distances_by_axis):
         return None
     width, height = (float(np.mean(distances)) for distances in distances_by_axis)
@@ -382,7 +395,8 @@ def _make_piece(
         name: name of the piece.
         image: (h, w, 3), sRGB in [0, 1].
         pixel_size: (width, height) of a pixel in millimetres.
-        inside: (h, w) bool, the part that is cut out; None for the full image.
+        inside: (h, w) bool, the part that is cut out with scissors; None for the full
+            image.
     """
     subdivisions = _count_subdivisions(max(pixel_size))
     if subdivisions > 1:
@@ -397,8 +411,15 @@ def _make_piece(
     levels = np.pad(to_8bit(fine.numpy()), (*padding, (0, 0)), mode="edge")
     mask = None
     if inside is not None and not inside.all():
-        mask = np.pad(inside.repeat(subdivisions, 0).repeat(subdivisions, 1), padding)
-    return Piece(name, levels, fine_size, (bleed_columns, bleed_rows), mask)
+        fine_inside = inside.repeat(subdivisions, axis=0).repeat(subdivisions, axis=1)
+        mask = np.pad(fine_inside, padding)  # the bleed is outside of the cut
+    return Piece(
+        name=name,
+        picture=levels,
+        pixel=fine_size,
+        bleed=(bleed_columns, bleed_rows),
+        inside=mask,
+    )
 
 
 def _count_subdivisions(pixel_size: float) -> int:
@@ -413,5 +434,6 @@ def _count_subdivisions(pixel_size: float) -> int:
     """
     if pixel_size <= MAX_PIXEL_SIZE:
         return 1
-    odd = 2 * math.ceil((pixel_size / MAX_PIXEL_SIZE - 1.0) / 2.0) + 1
-    return min(MAX_SUBDIVISIONS, odd)
+    # the smallest odd number, 2 n + 1, that is at least pixel_size / MAX_PIXEL_SIZE
+    n = math.ceil((pixel_size / MAX_PIXEL_SIZE - 1.0) / 2.0)
+    return min(MAX_SUBDIVISIONS, 2 * n + 1)

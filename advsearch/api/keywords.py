@@ -1,9 +1,10 @@
-"""Turn the settings of each experiment into keywords for Python callers.
+"""Turn the settings of each experiment into keyword arguments for Python callers.
 
-A setting is declared once: its default, its range, its description. In Python it may
-take more than the text of a file (`make_hint`). Signatures and docstrings are made from
-both (`with_settings_signature`). Type checkers see the keywords of `attack` and `sweep`
-in code: `SceneKeywords` and its subclasses.
+A setting is declared once, with its default, range and description. A Python caller may
+pass more types than a file can hold (`make_hint`). `with_settings_signature` makes the
+signatures and docstrings of the functions from the declared settings. For type
+checkers, the keywords of `attack` and `sweep` are also declared in `SceneKeywords` and
+its subclasses.
 """
 
 from __future__ import annotations
@@ -41,12 +42,13 @@ from advsearch.settings import Config, PythonOnly, Setting, settings, to_python
 from advsearch.trust.code import allow_named
 from advsearch.trust.stored_files import is_shallow
 
-Names = str | Sequence[str]  # names in a list, or in a text with commas between them
+Names = str | Sequence[str]  # a list of names, or a string of names with commas
 
 
 class SceneKeywords(TypedDict, total=False):
-    """Settings that `attack` and `sweep` both take as keywords; their docstrings say
-    what each is.
+    """Settings that both `attack` and `sweep` take as keywords.
+
+    They are described in the docstrings of these functions.
     """
 
     environment: Path | Names | None
@@ -87,8 +89,11 @@ class SceneKeywords(TypedDict, total=False):
 
 
 class _Signature(inspect.Signature):
-    """A signature with all settings, for editors; `help` writes the `short` one, with
-    `**settings` in their place: it lists them below.
+    """The signature of a function with all settings, for editors.
+
+    Attributes:
+        short: the signature as the function declares it, with ``**settings``. `help`
+            prints this one, since the docstring lists the settings.
     """
 
     __slots__ = ("short",)
@@ -103,24 +108,23 @@ class _Signature(inspect.Signature):
 
 
 KEYWORD_ONLY = inspect.Parameter.KEYWORD_ONLY
-RUN = {
+# The parameter `run` of the experiments' functions, to check its type.
+RUN_PARAMETER = {
     "run": inspect.Parameter(
         "run", KEYWORD_ONLY, default=None, annotation="str | Path | None"
     )
 }
-RUN_STORED = "The run is kept, in `run` or under runs/."
+# Sentences that the docstrings of many experiments share.
+RUN_STORED = "The run is saved in `run`, or in a new folder under runs/."
 SHARED_ARGUMENTS = {
-    "object": "from `load_scene`, or the name of an object, or a file of one.",
-    "model": "from `load_model`, or what that takes.",
-    "progress": "True shows a bar, False none, None one on a terminal; or told how far "
-    "it is.",
+    "object": "scene from `load_scene`, or the name or the file of an object.",
+    "model": "model from `load_model`, or anything that `load_model` takes.",
+    "progress": "True displays a progress bar, False none, and None one on a terminal; "
+    "a `Progress` object gets the reports.",
 }
 SHARED_ERRORS = (
-    "InputError: anything that the caller can put right; nothing is written then."
+    "InputError: a setting is wrong, or a file is missing; then nothing is written."
 )
-"""What the docstrings of many questions say alike: of the run, of arguments, and of
-errors.
-"""
 Function = TypeVar("Function", bound=Callable[..., Any])
 ConfigType = TypeVar("ConfigType", bound=Config)
 
@@ -129,8 +133,8 @@ def with_settings_signature(config: type[Config]) -> Callable[[Function], Functi
     """Return a decorator that documents the settings of a function with `**settings`.
 
     Every setting becomes a keyword in the signature, with its default, and a line among
-    the arguments in the docstring. A setting that is a parameter of the function
-    already is not changed.
+    the arguments in the docstring. Two kinds of settings get neither: those that the
+    function declares as parameters, and required ones, which must be declared.
 
     Args:
         config: class with the settings.
@@ -143,10 +147,10 @@ def with_settings_signature(config: type[Config]) -> Callable[[Function], Functi
             for parameter in declared_signature.parameters.values()
             if parameter.kind is not parameter.VAR_KEYWORD
         ]
-        names = [parameter.name for parameter in parameters]
+        declared_names = [parameter.name for parameter in parameters]
         setting_lines = []
         for setting in settings(config):
-            name = setting.field.removesuffix("_")
+            name = setting.field.removesuffix("_")  # the field of `set` is `set_`
             if name in declared_signature.parameters or setting.required:
                 continue
             parameters.append(_make_parameter(config, setting, name))
@@ -158,7 +162,7 @@ def with_settings_signature(config: type[Config]) -> Callable[[Function], Functi
         signature.short = declared_signature  # `help` displays this shorter one
         wrapper = _wrap_call(function, signature)
         wrapper.__doc__ = _make_docstring(
-            function.__doc__ or "", names, config.command, setting_lines
+            function.__doc__ or "", declared_names, config.command, setting_lines
         )
         wrapper.__signature__ = signature  # type: ignore[attr-defined]
         return wrapper
@@ -185,9 +189,10 @@ def _wrap_call(function: Function, signature: _Signature) -> Function:
 
     Args:
         function: function to call.
-        signature: signature with all settings.
+        signature: signature with all settings; `signature.short` is that of the
+            function itself.
     """
-    declared = signature.short.parameters
+    declared_parameters = signature.short.parameters
 
     @wraps(function)
     def wrapper(*args: Any, **keywords: Any) -> Any:
@@ -201,11 +206,13 @@ def _wrap_call(function: Function, signature: _Signature) -> Function:
         }
         with ExitStack() as stack:
             stack.enter_context(hold_process_lock())
-            if "progress" in declared:
+            if "progress" in declared_parameters:
                 progress = open_progress(plain_keywords.get("progress"))
                 plain_keywords["progress"] = stack.enter_context(progress)
+            # Functions that accept an object for one of these declare it as a
+            # parameter. For all others it is a setting, which has to be a name.
             for key in ("task", "objective", "policy"):
-                takes_object = key in declared
+                takes_object = key in declared_parameters
                 if key in plain_keywords and not takes_object:
                     _check_is_name(function.__name__, key, plain_keywords[key])
             return function(*args, **plain_keywords)
@@ -238,10 +245,11 @@ def _check_call(
     error = make_unexpected_error(name, keywords, list(signature.parameters))
     if error:
         raise error
-    # The configuration checks the values of settings. `run` is checked here already.
-    declared = signature.short.parameters
-    positional = dict(zip(declared, args, strict=False))
-    check_types({**declared, **RUN}, {**positional, **keywords})
+    # Only parameters that the function itself declares are checked here, and `run`. The
+    # configuration checks the values of settings.
+    declared_parameters = signature.short.parameters
+    positional = dict(zip(declared_parameters, args, strict=False))
+    check_types({**declared_parameters, **RUN_PARAMETER}, {**positional, **keywords})
     try:
         bound = signature.bind(*args, **keywords)
     except TypeError as error:
@@ -289,7 +297,7 @@ PYTHON_LIST_SETTINGS = (
     "case",
     "group",
 )
-"""Settings that may be a list of names."""
+"""Settings that Python callers may also pass as a list of names."""
 
 
 def make_hint(field: str, kind: Any) -> str:
@@ -305,18 +313,22 @@ def make_hint(field: str, kind: Any) -> str:
     """
     text = inspect.formatannotation(kind)
     text = text.replace("typing.", "").replace("NoneType", "None")
-    # without constraints: Annotated[float, Gt(gt=0)] is float
+    # Leave out constraints: "Annotated[int, FieldInfo(..., metadata=[Ge(ge=1)])]"
+    # becomes "int".
     text = re.sub(r"Annotated\[(\w+), .*?\]\)\]", r"\1", text)
-    # The label of a recipe may be a mapping from objects.
-    is_label_of_recipe = field == "label" and "dict" in text
-    if field in PYTHON_HINTS and not is_label_of_recipe:
+    # The label of a recipe may also be a mapping from objects to labels, which the hint
+    # in `PYTHON_HINTS` does not allow.
+    may_be_mapping = field == "label" and "dict" in text
+    if field in PYTHON_HINTS and not may_be_mapping:
         return PYTHON_HINTS[field]
     optional = re.fullmatch(r"Optional\[(.*)\]", text)
     if optional:
         types = [optional[1], "None"]
     else:
-        # Split at each | that is not inside of brackets.
-        types = re.split(r" \| (?![^\[]*\])", text)
+        # Split "A | B[C | D]" at each | outside of brackets: no "]" follows it before
+        # the next "[".
+        outer_bar = r" \| (?![^\[]*\])"
+        types = re.split(outer_bar, text)
     string_hint = "Path | Names" if field in PYTHON_LIST_SETTINGS else "str | Path"
     hints = []
     for type_name in types:
@@ -342,27 +354,37 @@ def _make_docstring(
         setting_lines: a line for each setting.
     """
     summary, _, argument_text = inspect.cleandoc(text).partition("\n\nArgs:\n")
-    if "other arguments are the settings of" not in " ".join(summary.split()):
+    # Some docstrings have this sentence already, with details of their own.
+    mentions_settings = "other arguments are the settings of" in " ".join(
+        summary.split()
+    )
+    if not mentions_settings:
         summary += (
             "\n\nAll other arguments are the settings of `advsearch "
             f"{command}`. {RUN_STORED}"
         )
-    # An entry is "NAME: text", and the text may continue on further lines.
+    # An entry is "NAME: text", and the text may continue on indented lines. So a new
+    # entry begins where a line begins with a name and a colon.
     entries = re.split(r"(?m)^(?=\w+: )", textwrap.dedent(argument_text))
-    described = {entry.partition(":")[0]: entry.rstrip() for entry in entries if entry}
-    lines = [
-        described.get(name, f"{name}: {SHARED_ARGUMENTS.get(name)}") for name in names
+    entry_of_name = {
+        entry.partition(":")[0]: entry.rstrip() for entry in entries if entry
+    }
+    # A name without an entry of its own has one in `SHARED_ARGUMENTS`.
+    argument_entries = [
+        entry_of_name.get(name, f"{name}: {SHARED_ARGUMENTS.get(name)}")
+        for name in names
     ]
-    arguments = textwrap.indent("\n".join([*lines, *setting_lines]), "    ")
+    arguments = textwrap.indent("\n".join([*argument_entries, *setting_lines]), "    ")
     return f"{summary}\n\nArgs:\n{arguments}\n\nRaises:\n    {SHARED_ERRORS}"
 
 
 def make_config(config: type[ConfigType], **keywords: Any) -> ConfigType:
     """Create a configuration from settings as Python callers pass them.
 
-    A scene, a model and controls may be objects. In the configuration the settings have
-    their names, since it is stored in a file; the objects are attached to it
-    (`Config.python_object`). It also lists the objects that exist in this session only.
+    A scene, a model and controls may be Python objects. Since a configuration is stored
+    in a file, its settings have the names of these objects. The objects themselves are
+    attached to it (`Config.python_object`), with a list of those that only this Python
+    session has, and that no file can name.
 
     Args:
         config: class of the configuration.
@@ -377,19 +399,21 @@ def make_config(config: type[ConfigType], **keywords: Any) -> ConfigType:
 
     scene = settings.get("object")
     model = settings.get("model")
+    is_model_object = isinstance(model, (Model, nn.Module))
     # Workers are other processes, to which these objects cannot be sent.
-    if isinstance(scene, loading.Scene) or isinstance(model, (Model, nn.Module)):
+    if isinstance(scene, loading.Scene) or is_model_object:
         check_no_worker_settings(settings)
-    if isinstance(model, (Model, nn.Module)):
+    if is_model_object:
         settings["model"] = get_model_name(model)
         objects[MODEL, settings["model"]] = model
         if is_session_only(model):
             python_only.append(PythonOnly("model", settings["model"]))
     if isinstance(scene, loading.Scene):
-        # The scene was loaded already, so that its settings come too late.
+        # The scene was loaded already, so that settings of loading come too late.
         check_no_scene_settings(
             {name: value for name, value in settings.items() if name != "object"}
         )
+        # the settings with which it was loaded, with the name of its object
         scene_settings = loading.scene_to_settings(scene)
         settings |= {
             name: value for name, value in scene_settings.items() if value is not None
@@ -398,7 +422,7 @@ def make_config(config: type[ConfigType], **keywords: Any) -> ConfigType:
         if scene.is_session_only:
             python_only.append(PythonOnly("scene"))
     for name in ("controls", "over"):
-        instances = _name_controls(settings, name)
+        instances = _replace_control_objects(settings, name)
         objects |= {(CONTROL, control.name): control for control in instances}
         python_only += [
             PythonOnly("control", kind)
@@ -411,8 +435,10 @@ def make_config(config: type[ConfigType], **keywords: Any) -> ConfigType:
     )
 
 
-def _name_controls(settings: dict[str, Any], name: str) -> Sequence[Any]:
+def _replace_control_objects(settings: dict[str, Any], name: str) -> Sequence[Any]:
     """Replace controls that are objects in a setting by their names and options.
+
+    The other controls in the setting are brought into the same form.
 
     Args:
         settings: settings by name; the setting is changed in place.
@@ -424,8 +450,10 @@ def _name_controls(settings: dict[str, Any], name: str) -> Sequence[Any]:
     """
     controls: Any = settings.get(name)
     instances = loading.list_control_instances(controls)
+    # Options in a mapping may hold Python functions, so a mapping is always converted.
     if not instances and not isinstance(controls, Mapping):
         return ()
+    # Workers are other processes, which cannot load objects of this session.
     if loading.list_session_only_controls(controls):
         check_no_worker_settings(settings)
     settings[name] = loading.controls_to_settings(controls)

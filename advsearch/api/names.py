@@ -1,8 +1,7 @@
-"""Look up names in settings before PyTorch and Mitsuba are imported, which takes
-seconds.
+"""Check names in settings before PyTorch and Mitsuba are imported, which takes seconds.
 
-So a typing error is reported at once. Names that pass are looked up again by what loads
-them.
+So a misspelled name is reported at once. Names that pass are looked up again when
+something is loaded by them.
 """
 
 from __future__ import annotations
@@ -24,16 +23,19 @@ from advsearch.scene.library import (
 )
 from advsearch.settings import split_names
 
-# What can only be the name of something bundled: no path, no file, no code.
+# A plain word. It can only be a known name, unless there is a file of this name: paths
+# and code ("package.module:Class") contain other characters.
 WORD = re.compile(r"[^\W\d][\w-]{0,59}")
 LABEL_SETS = ("imagenet", "cifar10", "cifar100", "coco", "coco90", "coco91", "voc")
-"""Equal to `advsearch.models.labels.SETS`, as a test checks."""
+"""The bundled sets of labels. A test checks that they equal
+`advsearch.models.labels.SETS`, which is slow to import.
+"""
 PARAMETERS = frozenset(
     "aberration aperture exposure heading height lumens phase pitch power pushes shot "
     "texels water weight x y z".split()
 )
-"""Names of controls' parameters that resemble the name of a control; a test checks that
-they are complete.
+"""Names of parameters of controls that are similar to the name of a control. A test
+checks that the list is complete.
 """
 
 
@@ -147,10 +149,11 @@ def _check_judge(judge: str, things: Iterable[str], objects: Iterable[str]) -> N
     """Check that the object to judge is one of the objects in the scene.
 
     Args:
-        judge: its name. If several objects have one name, the second is called NAME-2,
-            and so on.
+        judge: name of the object. If several objects have the same name, the second is
+            called NAME-2, and so on. The number is not checked here.
         things: additional objects as the setting has them, ``car@12,3.5,name=taxi``.
-        objects: kind of each of them, such as "car", which is its name by default.
+        objects: the object of each additional object, such as "car". It is also its
+            name unless the options have another.
 
     Raises:
         UnknownNameError: no object has this name.
@@ -159,7 +162,8 @@ def _check_judge(judge: str, things: Iterable[str], objects: Iterable[str]) -> N
     for thing, object_name in zip(things, objects, strict=True):
         match = re.search(r"name=([^,]+)", thing)
         names.append(match[1].strip() if match else object_name)
-    if re.sub(r"-\d+$", "", judge) not in (*names, "object", "all"):
+    judge_without_number = re.sub(r"-\d+$", "", judge)
+    if judge_without_number not in (*names, "object", "all"):
         raise UnknownNameError(
             "thing to judge:",
             judge,
@@ -169,26 +173,31 @@ def _check_judge(judge: str, things: Iterable[str], objects: Iterable[str]) -> N
 
 
 def _check_controls(values: Mapping[str, Any]) -> None:
-    """Check names of controls that are similar to built-in controls.
+    """Check the names of controls, both those searched and those that vary at random.
 
-    A name that is not similar may be code of the user.
+    A name without resemblance to a built-in control may be the user's code, and passes.
+
+    Raises:
+        UnknownNameError: a name is nearly that of a built-in control.
     """
     controls = {**(values.get("controls") or {}), **(values.get("over") or {})}
     names = []
     for name, options in controls.items():
+        # A control may have any name if its options state the kind.
         kind = str((options or {}).get("kind") or name)
         is_class = re.search(r":[A-Z]", kind)  # "package.module:Class"
         if not is_class:
             # "light" of "light:Key", and "pose" of "pose.yaw"
             names.append(re.split(r"[:.]", kind)[0])
     built_in_controls = list_built_ins("control")
-    # A parameter is no control: the registry reports it, with the control that has it.
-    like_controls = [
+    # The name of a parameter passes here: later the registry reports it in a message
+    # that also names the control with this parameter.
+    names_like_controls = [
         name
         for name in names
         if name not in PARAMETERS and find_similar_names(name, built_in_controls)
     ]
-    _check_entries("control", like_controls, "controls")
+    _check_entries("control", names_like_controls, "controls")
 
 
 def _check_suite(suite: str) -> None:
@@ -239,8 +248,8 @@ def _check_words(
 ) -> None:
     """Check that plain words are known names.
 
-    The path of an existing file passes, and so does a name that is no plain word, such
-    as "package.module:Class".
+    Other names pass: those of existing files, and those that are no plain words, such
+    as "package.module:Class" (`_is_word`).
 
     Args:
         kind: kind of the named object, for messages.
@@ -258,7 +267,8 @@ def _check_words(
 
 
 def _is_word(name: str) -> bool:
-    """Return whether a name can only be that of something known: it is a plain word,
-    and no file.
+    """Return whether a name is a plain word and not the path of an existing file.
+
+    Then it can only be a known name.
     """
     return WORD.fullmatch(name) is not None and not Path(name).exists()

@@ -1,7 +1,7 @@
-"""`render`: pictures of a scene, with what the model says of them; `load_run`, the
-result of a run from its folder.
+"""Functions of the Python interface: `render`, `load_run` and `load_model`.
 
-And `load_model`, to which a task may be named.
+`render` renders images of a scene, with the predictions of a model. `load_run` loads
+the result of a run from its folder. `load_model` loads a model, for a task by its name.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ def _load_attack(summary: AttackSummary, path: Path) -> AttackResult:
 
 
 class ModelKeywords(TypedDict, total=False):
-    """What may be said of a model, see `advsearch.models.load_model`."""
+    """Options of a model, as in `advsearch.models.load_model`."""
 
     labels: str | os.PathLike[str] | Sequence[str] | None
     prompt: str | Sequence[str] | None
@@ -177,7 +177,8 @@ def render_picture_file(
         StorageError: the file cannot be written.
     """
     progress = progress or NullProgress()
-    out = check_image_path(config.out, config.around or 1)
+    # an .exr file cannot show several views
+    out = check_image_path(config.out, n_views=config.around or 1)
     aovs = parse_aovs(config.aov)
     if aovs and config.around is not None:
         raise InputError("aov: is of one view; leave `around` out")
@@ -187,7 +188,7 @@ def render_picture_file(
     controls = make_configured_controls(config, config.controls)
     scene = load_configured_scene(config)
     task = make_task(config.task)
-    (model,), notes = load_models([config.model], task, config)
+    (model,), model_warnings = load_models([config.model], task, config)
     rendering = render(
         scene,
         model,
@@ -201,14 +202,14 @@ def render_picture_file(
         progress=progress,
         **config.image_settings,
     )
-    warnings = [*rendering.warnings, *notes]
+    warnings = [*rendering.warnings, *model_warnings]
     for text in warnings:
         progress.message(text)
     if aovs:
         rendering.save_aov(out, aovs)
-    return rendering.result(
-        out, rendering.save(out), warnings, rendering.save_predictions(out)
-    )
+    image_size = rendering.save(out)
+    prediction_path = rendering.save_predictions(out)
+    return rendering.result(out, image_size, warnings, prediction_path)
 
 
 def _check_replaces_no_input(config: RenderConfig, out: Path) -> None:

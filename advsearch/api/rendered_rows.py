@@ -1,5 +1,7 @@
-"""Render the images of a run's rows again, at the size that the model sees, with their
-ground truth.
+"""Render the images of a run again, with their ground truth.
+
+An image has the size of the model's input. A row of a run is the stored prediction of a
+model for an image.
 """
 
 from __future__ import annotations
@@ -35,7 +37,7 @@ from advsearch.scene.renderer import Renderer
 from advsearch.settings import read_yaml
 from advsearch.tasks import Facts, Task
 
-# Kinds of rows of an attack with the clean scene.
+# Kinds of the rows of an attack that are about the clean scene.
 CLEAN_KINDS = ("first control", "control")
 
 
@@ -45,14 +47,15 @@ class RenderedRow:
 
     Attributes:
         name: name of its file without a suffix.
-        picture: (H, W, 3), sRGB in [0, 1], rounded to 8 bits as the model sees it.
+        picture: (H, W, 3), sRGB in [0, 1], rounded to 8 bits as the model's input is.
         task: task of the first model.
         facts: the ground truth of the object.
         renderer: renderer of the scene.
         u: (d,), the configuration.
-        rows: rows of the run's models.
-        values: the configuration by parameter.
-        is_reproduced: whether the first model is right, or wrong, as in its row.
+        rows: stored predictions of the run's models for the image.
+        values: the values of the configuration, by parameter.
+        is_reproduced: whether the first model is right if it was right in the run, and
+            wrong if it was wrong.
     """
 
     name: str
@@ -71,7 +74,8 @@ class RenderedRow:
 
     def get_label(self, thing: VisibleMesh) -> str:
         """Return the label of a thing's mesh, or else its name."""
-        return self.renderer.scene.definition[0].meshes[thing.name].label or thing.name
+        description, _filter = self.renderer.scene.definition
+        return description.meshes[thing.name].label or thing.name
 
 
 def render_rows(run: str, *, every: bool, progress: Progress) -> Iterator[RenderedRow]:
@@ -150,6 +154,7 @@ def _render_sweep(
     scenes = load_scenes_of_sweep(config.model_copy(update={"metrics": {}}))
     job = scenes.job
     rows_of_image = _read_sweep_rows(folder, len(job.models))
+    # An image without a judgement (`correct` is None) is rendered, too.
     images = sorted(
         image
         for image, rows in rows_of_image.items()
@@ -181,22 +186,23 @@ def _render_sweep_image(
             again and compared with the first model's.
     """
     job = scenes.job
-    view, queries = scenes.make_queries(image)
+    loaded_scene, queries = scenes.make_queries(image)
     query = queries[0]  # all models get the same image
-    scene = job.scenes[view.number]
-    picture = view.render_image(query)
+    scene = job.scenes[loaded_scene.number]
+    picture = loaded_scene.render_image(query)
     # the steps of an image are in the order of the models
     correct_of_first_model = [
         row.correct for row in rows if row.step % len(job.models) == 0
     ]
     stored = correct_of_first_model[0] if correct_of_first_model else None
-    is_right = view.problems[0].judge(picture, query.u).right
+    problem_of_first_model = loaded_scene.problems[0]
+    is_right = problem_of_first_model.judge(picture, query.u).right
     return RenderedRow(
         name=f"{image:06d}",
         picture=picture,
         task=job.tasks[0],
         facts=make_object_facts(scene.scene, scene.object, job.config),
-        renderer=view.renderer_of_size[job.image_sizes[0]],
+        renderer=loaded_scene.renderer_of_size[job.image_sizes[0]],
         u=query.u,
         rows=rows,
         values=rows[0].values,
@@ -231,11 +237,12 @@ def _render_attack(
     summary = load_attack_summary(folder)
     parts = load_parts_of_run(folder)
     problem, _ = make_problem_with_warnings(parts)
-    # the configuration u of the trials, by the kind of their rows
+    # The configuration u of the trials, by the kind of their rows. The search starts at
+    # the clean scene.
     configuration_of_kind = dict.fromkeys(CLEAN_KINDS, problem.domain.start)
     if summary.adversarial is not None:
-        # If `answer_from` is set, a baseline found the adversarial scene, and not the
-        # search.
+        # `adversarial_from` is set if a baseline, and not the search, found the
+        # adversarial scene.
         kind = "baseline verification" if summary.adversarial_from else "verification"
         configuration_of_kind[kind] = read_stored_configuration(folder, problem)
     rows = list[Row]()
@@ -245,7 +252,7 @@ def _render_attack(
     progress.stage("rendering pictures", len(rows))
     for row in rows:
         u = configuration_of_kind[row.kind]
-        seed = max(0, row.seed or 0)  # a row may lack it
+        seed = max(0, row.seed or 0)  # a row may lack its seed
         picture = problem.picture(u, seed, row.spp or problem.spp)
         # `u` followed by the conditions that the seed samples
         full_u = problem.add_conditions(u, seed)
@@ -278,12 +285,13 @@ def make_object_facts(scene: Scene, name: str, config: SceneConfig) -> Facts:
     Args:
         scene: the scene.
         name: name of the object.
-        config: settings of the run. Their label belongs to the object that the run
-            judges. So it is ignored if the run judges an additional object.
+        config: settings of the run. If the run judges an additional object, `label` is
+            the label of that one, and the object has its usual label.
     """
     judges_object = config.judge not in scene.description.things
     label = config.label if judges_object else None
-    return make_facts(scene.description, name, label, dict)
+    # `dict` describes no values: each parameter has its value in the scene.
+    return make_facts(scene.description, name, label, describe=dict)
 
 
 RENDERERS = {SweepConfig.command: _render_sweep, AttackConfig.command: _render_attack}

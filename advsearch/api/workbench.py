@@ -139,10 +139,10 @@ from advsearch.trust.yaml_text import parse_yaml as parse_yaml
 
 
 def load_photographs() -> Any:
-    """Return what adds photographs of the real thing to runs, and counts how often they
-    and the renderings agree.
+    """Return an object that adds photographs of the real object to runs.
 
-    It has `list_files(folder, task)`, `add_files(run, files)` and `agreement(run)`
-    (`advsearch.photo_agreement`).
+    It has the methods `list_files(folder, task)`, `add_files(run, files)`, and
+    `agreement(run)`, which counts in how many photographs the model is right or wrong
+    as in the renderings (`advsearch.photo_agreement`).
     """
     return load_attribute("advsearch.questions.photographs.carry_out:Photographs")()

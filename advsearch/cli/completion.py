@@ -1,5 +1,5 @@
-"""`advsearch completion`: a script with which the Tab key finishes commands, flags,
-names and files in a shell.
+"""`advsearch completion`: a script for a shell, with which the Tab key completes
+commands, flags, names and files.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from advsearch.cli.main import (
 from advsearch.cli.show import REGISTRIES, list_names
 from advsearch.errors import InputError
 
-NAMED = {
+KIND_OF_FLAG = {
     "--object": "objects",
     "--environment": "environments",
     "--control": "controls",
@@ -29,9 +29,10 @@ NAMED = {
     "--objective": "objectives",
     "--model": "models",
 }
-"""Flags whose value is a name, and the kind of that name."""
+"""The kind of name that a flag takes as its value."""
 
-OR_A_FILE = ("--object", "--environment", "--model")
+# Flags whose value is such a name or a file.
+NAME_OR_FILE_FLAGS = ("--object", "--environment", "--model")
 
 
 @command(
@@ -50,12 +51,11 @@ OR_A_FILE = ("--object", "--environment", "--model")
 def completion(args: argparse.Namespace) -> int:
     """Print a script for a shell that completes commands, flags, names and files.
 
-    Each argument of each command gets what shtab completes: for a flag with a known
-    kind of name (`NAMED`) the names, for one that also takes a file (`OR_A_FILE`) names
-    and files, for all others files.
+    A flag of `KIND_OF_FLAG` is completed by names, one of `NAME_OR_FILE_FLAGS` by names
+    and files, and any other by files.
 
     Args:
-        args: `shell` is the shell, and `json` prints the script as JSON.
+        args: `shell` is the shell; with `json` the script is printed as JSON.
 
     Returns:
         The exit status.
@@ -66,22 +66,25 @@ def completion(args: argparse.Namespace) -> int:
         raise InputError(
             "completion needs the package shtab; install it with: pip install shtab"
         ) from error
-    # the loop below adds all commands with their flags
     parser, commands = make_parser_without_commands()
-    # names of each kind of thing, such as models, that a flag may take
+    # An installation may lack a kind of names; then `REGISTRIES` does, too.
     names_of_kind = {
-        kind: sorted(list_names(kind)) for kind in NAMED.values() if kind in REGISTRIES
+        kind: sorted(list_names(kind))
+        for kind in KIND_OF_FLAG.values()
+        if kind in REGISTRIES
     }
+    # shtab reads from each argument of the parser how to complete it
     for name in list_commands():
-        for action in add_command(commands, name)._actions:
+        command_parser = add_command(commands, name)
+        for action in command_parser._actions:
             takes_no_value = action.nargs == 0
             has_choices = action.choices is not None  # which shtab completes itself
             if takes_no_value or has_choices:
                 continue
             # The last one is the long form, "--json". A positional argument has none.
             flag = action.option_strings[-1] if action.option_strings else ""
-            names = names_of_kind.get(NAMED.get(flag, ""))
-            if names and flag not in OR_A_FILE:
+            names = names_of_kind.get(KIND_OF_FLAG.get(flag, ""))
+            if names and flag not in NAME_OR_FILE_FLAGS:
                 action.choices = names
                 continue
             completer: dict[str, Any] = shtab.FILE
@@ -97,13 +100,15 @@ def completion(args: argparse.Namespace) -> int:
 
 
 def _complete_name_or_file(flag: str, names: Sequence[str]) -> dict[str, Any]:
-    """Return what shtab writes for a flag whose value is a name or a file.
+    """Return the code with which shells complete a flag that takes a name or a file.
 
-    Each shell has code of its own; tcsh completes files only.
+    It has the form that shtab expects: the code by the name of the shell. For bash it
+    is the name of a shell function, which the "preamble" defines. For zsh it is an
+    action. For tcsh it is "f", which completes files only.
 
     Args:
         flag: the flag, such as "--object".
-        names: names that it may take besides files.
+        names: names that the flag takes in addition to files.
     """
     function = f"_advsearch{flag.replace('-', '_')}"
     words = " ".join(names)

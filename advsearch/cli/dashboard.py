@@ -1,5 +1,5 @@
-"""`advsearch dashboard`: look at runs in a browser; `advsearch view`: make the page of
-a run anew.
+"""The commands `advsearch dashboard`, which serves the pages of runs to a browser, and
+`advsearch view`, which makes the page of a run again.
 """
 
 from __future__ import annotations
@@ -23,10 +23,9 @@ PORT = 8265
 PHOTOGRAPH_PAGES = "advsearch.questions.photographs.pages:PhotographPages"
 
 PRIVACY_NOTE = (
-    "Whoever has this address sees the runs and can send photographs. Each is judged "
-    "on this machine, by the model "
-    "that the run's settings name, and kept in the run's folder, as a picture and as "
-    "rows; nothing else is written."
+    "Anyone with this address can see the runs and send photographs. Each photograph is "
+    "evaluated on this machine, by the model in the settings of the run, and stored in "
+    "the folder of the run, as a picture and as rows. Nothing else is written."
 )
 
 
@@ -40,25 +39,25 @@ PRIVACY_NOTE = (
     argument(
         "--host",
         default="127.0.0.1",
-        help="address to listen at (default: %(default)s); at others, whoever has the "
-        "printed "
-        "token sees the runs and can add photographs, which the run's model judges here",
+        help="address to listen at (default: %(default)s); at other addresses, anyone "
+        "with the printed token can see the runs and add photographs, which the model "
+        "of the run evaluates on this machine",
     ),
     argument(
         "--port",
         type=int,
         default=PORT,
-        help="port; 0 takes a free one (default: %(default)s)",
+        help="port; 0 for any free one (default: %(default)s)",
     ),
     argument(
         "--https",
         action="store_true",
-        help="speak HTTPS on this machine too; at other addresses that is always so",
+        help="use HTTPS on this machine, too; at other addresses it is always used",
     ),
     argument("--json", action="store_true", help="print the address as JSON"),
     output.add_code_flag,
-    more=". It keeps the photographs that are taken on a run's page, writes nothing "
-    "else, and ends with Ctrl-C",
+    more=". It stores the photographs that are taken on the page of a run, writes "
+    "nothing else, and ends with Ctrl-C",
     examples=(
         "dashboard",
         "dashboard mug-sweep-001 mug-sweep-002",
@@ -77,7 +76,7 @@ def dashboard(args: argparse.Namespace) -> int:
     """
     if not 0 <= args.port <= 65535:
         raise InputError(f"--port: expected a number from 0 to 65535, got {args.port}")
-    # damaged runs are allowed: the page with the list says what is wrong with each
+    # corrupt runs are allowed: the page with the list has an error for each
     runs = [find_run(name, checked=False) for name in args.runs]
     # PHOTOGRAPH_PAGES is "module:function"; an installation may lack the module
     has_photographs = is_present(PHOTOGRAPH_PAGES.partition(":")[0])
@@ -125,7 +124,7 @@ def dashboard(args: argparse.Namespace) -> int:
     argument(
         "--bundle",
         metavar="DIR",
-        help="write a folder: a page, the rows and the small pictures",
+        help="write a folder with a page, the rows and the small pictures",
     ),
     output.add_flags,
     examples=("view mug-sweep-001", "view mug-sweep-001 mug-sweep-002 --bundle site"),

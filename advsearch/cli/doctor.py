@@ -1,9 +1,9 @@
-"""What `advsearch doctor` checks: every part that a run needs, its version, whether it
-works, and what to do if not.
+"""`advsearch doctor`: check every component that a run needs.
 
-Whatever loads native code is tried in a process of its own
-(`advsearch.cli.doctor_probe`): a libLLVM that is too old takes its process down, and
-the rest should still be told.
+It reports the version of each component, whether it works, and how to repair it.
+Components with native code are tried in a process of their own
+(`advsearch.cli.doctor_probe`): an old libLLVM crashes the process, and the rest of the
+report should still be printed.
 """
 
 from __future__ import annotations
@@ -36,22 +36,21 @@ OK = "ok"
 WARNING = "warning"
 MISSING = "missing"
 BROKEN = "broken"
-"""The states of a part. A warning does not keep anything from running."""
+"""The statuses of a component. With a warning, everything still runs."""
 COLOURS = {OK: "green", WARNING: "yellow", MISSING: "red", BROKEN: "red"}
 
 GIB = 2**30
+# With less, there is a warning. The disk holds the images of runs and the kernel cache.
+# A search needs up to 2.5 GiB of memory, and other programs run as well.
 DISK_WANTED = 1 * GIB
 MEMORY_WANTED = 3 * GIB
-"""Below these a warning: a run's pictures and the kernel cache; the peak of a search
-(2.5 GiB) and what else runs.
-"""
 
-SECONDS_ALLOWED = 300
+SECONDS_ALLOWED = 300  # maximum run time of the probe
 OPTIONAL = {"pyarrow": "advsearch export does not write Parquet"}
-"""Packages without which the rest works, and what is lost."""
+"""Optional packages, with what does not work without them."""
 
 PROBE_PROCESS = ""
-"""The name under which `run_probe` returns how the process itself ended."""
+"""The name under which `run_probe` returns how the probe's process itself ended."""
 PROBE = (sys.executable, "-m", "advsearch.cli.doctor_probe")
 
 _SMALL_PACKAGES = ("OpenEXR", "imageio", "matplotlib", "cma", "xatlas", "pyarrow")
@@ -59,9 +58,14 @@ _SMALL_PACKAGES = ("OpenEXR", "imageio", "matplotlib", "cma", "xatlas", "pyarrow
 
 @dataclass(frozen=True)
 class Component:
-    """One part of the installation: its version ("" where there is none to tell), a
-    status (ok, warning, missing or broken), what was tried or found, and what to type
-    or do ("" when nothing has to be done).
+    """The state of one component of the installation.
+
+    Attributes:
+        name: name of the component.
+        version: its version; empty if it is unknown or does not apply.
+        status: "ok", "warning", "missing" or "broken".
+        detail: what was tried, or what is wrong.
+        fix: how to repair it; empty if there is nothing to do.
     """
 
     name: str
@@ -73,7 +77,7 @@ class Component:
 
 @command(output.add_flags)
 def doctor(args: argparse.Namespace) -> int:
-    """Check every part of the installation, and print what was found.
+    """Check every component of the installation, and print the results.
 
     Returns:
         The exit status: 0 if everything that is necessary works, else `FELL_SHORT`.
@@ -100,13 +104,13 @@ def doctor(args: argparse.Namespace) -> int:
 
 
 def _print_parts(parts: Sequence[Component], *, is_good: bool) -> None:
-    """Print a table of the parts, what to do about each, and whether all is good.
+    """Print a table of the components with their fixes, and whether all are in order.
 
     Args:
         parts: the parts with their states.
         is_good: whether everything that is necessary works.
     """
-    # late: where rich is missing, --json still says so
+    # late: without rich, --json still works and reports it
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
@@ -207,7 +211,7 @@ def _describe_ending(status: int, error_text: str) -> str:
     Args:
         status: its exit status; if negative, minus the number of the signal that ended
             it.
-        error_text: what it wrote to standard error.
+        error_text: its output to standard error.
     """
     if status == 0:
         return ""
@@ -225,14 +229,16 @@ def _describe_ending(status: int, error_text: str) -> str:
 
 
 def check_packages(tried: dict[str, tuple[bool, str]]) -> Iterator[Component]:
-    """Yield what was found about the packages that were tried, with their versions.
+    """Yield a component for each package, with its version and whether it works.
 
-    Mitsuba and Dr.Jit have no trial of their own: a render tries both together, and has
-    an entry of its own.
+    Mitsuba and Dr.Jit are not tried separately. The component "render", which is no
+    package, tries both.
 
     Args:
-        tried: what `run_probe` returns.
+        tried: for each component, whether it works and a detail, as `run_probe` returns
+            them.
     """
+    # in the order of the trials in `doctor_probe.TRIALS`
     for name in (
         "numpy",
         "torch",
@@ -242,16 +248,17 @@ def check_packages(tried: dict[str, tuple[bool, str]]) -> Iterator[Component]:
         "mitsuba-oidn",
         *_SMALL_PACKAGES,
     ):
-        # "render" is a trial and no package
+        # "render" is no package and has no version; None is a missing package
         version = "" if name == "render" else find_installed_version(name)
         if version is None:
             yield _make_missing_package(name)
         elif name in ("mitsuba", "drjit"):
             yield Component(name, version, OK, "tried by the render below")
         elif name not in tried:
-            # A part before it crashed the process; usually that is an old libLLVM.
-            _, ending = tried[PROBE_PROCESS]
-            detail = f"not reached: {ending}"
+            # The process of the trials crashed before or at this one, usually because
+            # libLLVM is too old.
+            _, process_ending = tried[PROBE_PROCESS]
+            detail = f"not reached: {process_ending}"
             yield Component(name, version, BROKEN, detail, "see libLLVM below")
         else:
             is_working, detail = tried[name]
@@ -321,7 +328,7 @@ def find_installed_version(name: str) -> str | None:
 
 
 def _reinstall(name: str) -> str:
-    """Return what to type to install a package again."""
+    """Return the command that installs a package again."""
     return (
         f"pip install --force-reinstall --no-deps {name}, or make clean setup in a "
         "checkout"
@@ -404,7 +411,7 @@ def check_reference_weights() -> Component:
 
 
 def check_kernel_cache(folder: Path) -> Component:
-    """Check the folder in which Dr.Jit keeps compiled kernels between runs."""
+    """Check the folder in which Dr.Jit stores compiled kernels."""
     name = "kernel cache"
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -436,7 +443,7 @@ def check_disk(folder: Path) -> Component:
 def check_hardware() -> Component:
     """Check cores and memory; little memory is a warning."""
     cores = threads.count_cores()
-    memory = 0  # bytes; stays 0 where the system does not tell
+    memory = 0  # in bytes; stays 0 on systems that do not report it
     with suppress(AttributeError, ValueError, OSError):
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     cores_text = f"{cores} cores" if cores > 1 else f"{cores} core"

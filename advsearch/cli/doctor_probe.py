@@ -1,9 +1,9 @@
-"""What `advsearch doctor` tries in a process of its own, because a libLLVM that is too
-old takes its process down.
+"""The trials of `advsearch doctor`, which run in a process of their own.
 
-Each part that was tried prints one line of JSON: its name, whether it worked, and a
-detail or the error. A line that is missing at the end names the part that ended the
-process. Run by `advsearch.cli.doctor`, never imported by it.
+A libLLVM that is too old crashes the process. Each trial prints one line of JSON: the
+name of the component, whether it works, and a detail or the error. The first line that
+is missing belongs to the component that crashed the process. `advsearch.cli.doctor`
+runs this module as a program, and never imports it.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from functools import partial
 from typing import Any
 
 PIXELS = 8
-# four standard deviations of the brightness of those pixels at 4 samples; the slope's
-# are twice as large
+# Four standard deviations of the brightness of these pixels at 4 samples per pixel.
+# Those of its derivative are twice as large.
 NOISE = 0.08
 
 
@@ -99,7 +99,7 @@ def _describe_wall(mi: Any) -> dict[str, Any]:
 
 
 def probe_denoiser() -> str:
-    """Denoise a constant picture, which must stay what it is."""
+    """Denoise a constant picture, which must not change."""
     # what is probed
     import mitsuba_oidn
     import numpy as np
@@ -117,7 +117,7 @@ MODULES = {
     "matplotlib": "matplotlib.figure",
     "pyarrow": "pyarrow.parquet",
 }
-"""What is imported of a package, where it is not of its name."""
+"""The module of a package to import, if it is not the package itself."""
 
 PACKAGES = (
     "numpy",
@@ -135,19 +135,22 @@ TRIALS: dict[str, Callable[[], str]] = {
     "render": probe_renderer,
     "mitsuba-oidn": probe_denoiser,
 }
-"""Part and trial, in the order tried: what may end the process comes last."""
+"""The trial of each component, in the order in which they run. Those that may crash the
+process are the last.
+"""
 
 
 def main() -> int:
-    """Try every part, and print a line of JSON for each.
+    """Run every trial, and print a line of JSON for each.
 
-    After an error of one part, the next ones are still tried.
+    A trial imports or uses one component, and returns a detail as text. If it raises an
+    error, the next ones still run.
     """
     for name, trial in TRIALS.items():
-        printed = io.StringIO()
+        # Standard output is for the lines of JSON. What a library prints is dropped.
+        discarded_output = io.StringIO()
         try:
-            # only our lines go to standard output
-            with contextlib.redirect_stdout(printed):
+            with contextlib.redirect_stdout(discarded_output):
                 outcome = {"name": name, "ok": True, "detail": trial()}
         except Exception as error:
             outcome = {

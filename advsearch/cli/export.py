@@ -1,5 +1,5 @@
-"""`advsearch export`: a run's rows as a table for other programs, or what else comes
-out of it in another format.
+"""`advsearch export`: write the rows of a run as a table for other programs, or its
+images, its scene or its object in another format.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def _begin_lower(sentence: str) -> str:
     argument(
         "--json",
         action="store_true",
-        help="the same as --format json; with --out, tell what was written",
+        help="the same as --format json; with --out, print what was written as JSON",
     ),
     argument(
         "--kind",
@@ -56,22 +56,22 @@ def _begin_lower(sentence: str) -> str:
         "--size",
         metavar="MM",
         type=float,
-        help="print: the real object's longest side in millimetres (default: its own "
-        "where that is known, or 100)",
+        help="print: the real object's longest side in millimetres (default: that of "
+        "the object's file if it is known, otherwise 100)",
     ),
     argument(
         "--sheets",
         metavar="N",
         type=int,
-        help="print: sheets that may be written; more are refused (default: 200)",
+        help="print: maximum number of sheets; more are an error (default: 200)",
     ),
     argument("--paper", help="print: a4, a3 or letter (default: a4)"),
     argument(
         "--all",
         action="store_true",
         default=None,
-        help="coco, yolo: right predictions too (default: pictures that a model is "
-        "wrong about)",
+        help="coco, yolo: all pictures (default: only those about which a model is "
+        "wrong)",
     ),
     output.add_code_flag,
     argument(
@@ -93,14 +93,14 @@ def export(args: argparse.Namespace) -> int:
             belong to it.
     """
     out = None if args.out is None else Path(args.out)
-    # the suffix of the file, which may name the format
-    by_name = "" if out is None else out.suffix.removeprefix(".").lower()
+    # the suffix of the file, such as "csv", which may name the format
+    file_suffix = "" if out is None else out.suffix.removeprefix(".").lower()
     usable = EXPORTERS.list_usable()
-    format = _choose_format(args, by_name, usable)
+    format = _choose_format(args, file_suffix, usable)
     _reject_other_options(args, format, usable)
     # If the suffix of the file is that of no format, a table is written.
     if format in FORMATS or format not in EXPORTERS:
-        return _write_table(args, out, by_name)
+        return _write_table(args, out, file_suffix)
     exporter = EXPORTERS[format]()
     if out is None:  # all but tables are files or folders, which nothing can print
         raise InputError(f"--out: {format} writes {exporter.writes}; give its name")
@@ -137,24 +137,27 @@ def _reject_other_options(
 
 
 def _choose_format(
-    args: argparse.Namespace, by_name: str, usable: Mapping[str, type[Exporter]]
+    args: argparse.Namespace, file_suffix: str, usable: Mapping[str, type[Exporter]]
 ) -> str:
-    """Return the format that is asked for by name, or else by the suffix of the file.
+    """Return the format that ``--format`` names, or else the suffix of the file.
+
+    A suffix that belongs to no format is returned as it is: the caller then writes a
+    table.
 
     Args:
         args: arguments of the command.
-        by_name: the suffix of the file.
+        file_suffix: suffix of the file, such as "csv"; empty without a file.
         usable: exporters by the name of their format.
 
     Raises:
-        InputError: it was removed.
-        UnknownNameError: there is no such format.
+        InputError: ``--format`` names a format that was removed.
+        UnknownNameError: ``--format`` names no format.
     """
     format_of_suffix = {table: table for table in FORMATS}
     for name, exporter in usable.items():
         # setdefault: an exporter of another package gets no suffix that is taken
         format_of_suffix.setdefault(exporter.suffix or name, name)
-    format: str = args.format or format_of_suffix.get(by_name, by_name)
+    format: str = args.format or format_of_suffix.get(file_suffix, file_suffix)
     if format == "fiftyone":
         raise InputError(
             "--format: fiftyone was removed, since FiftyOne reads COCO; "
@@ -165,13 +168,13 @@ def _choose_format(
     return format
 
 
-def _write_table(args: argparse.Namespace, out: Path | None, by_name: str) -> int:
+def _write_table(args: argparse.Namespace, out: Path | None, file_suffix: str) -> int:
     """Write the rows of a run as a table to a file, or print them.
 
     Args:
         args: arguments of the command.
         out: the file; None prints the table.
-        by_name: the suffix of the file, without its dot.
+        file_suffix: the suffix of the file, without its dot.
 
     Returns:
         The exit status.
@@ -179,7 +182,7 @@ def _write_table(args: argparse.Namespace, out: Path | None, by_name: str) -> in
     Raises:
         InputError: flags contradict each other, or the run is a study without rows.
     """
-    format = args.format or _choose_table_format(args, out, by_name)
+    format = args.format or _choose_table_format(args, out, file_suffix)
     if args.json and out is None and format != "json":
         raise InputError(
             f"--json: prints JSON, but --format asks for {format}; leave "
@@ -194,7 +197,7 @@ def _write_table(args: argparse.Namespace, out: Path | None, by_name: str) -> in
             f"{folder}: is a study, whose rows are those of its parts; "
             f"export one of {parts}"
         )
-    # For a terminal the table goes through `print`, which escapes what would steer it;
+    # For a terminal the table goes through `print`, which escapes control characters;
     # else it is written as it is.
     is_for_terminal = out is None and sys.stdout.isatty()
     buffer = io.BytesIO()
@@ -205,17 +208,21 @@ def _write_table(args: argparse.Namespace, out: Path | None, by_name: str) -> in
         print(buffer.getvalue().decode("utf-8", "replace"), end="")
     if out is None:
         return output.OK
-    text = f"{count} rows in {out}" + ("" if by_name == format else f", as {format}")
+    text = f"{count} rows in {out}" + (
+        "" if file_suffix == format else f", as {format}"
+    )
     facts = {"command": "export", "rows": count, "format": format, "out": str(out)}
     return output.print_answer(args.json, facts, text, sys.stderr)
 
 
 def _choose_table_format(
-    args: argparse.Namespace, out: Path | None, by_name: str
+    args: argparse.Namespace, out: Path | None, file_suffix: str
 ) -> str:
-    """Return the format of a table from the suffix of its file; where that says
-    nothing, JSON if JSON is to be printed, else CSV.
+    """Return the format of a table: "csv", "json" or another of `FORMATS`.
+
+    The suffix of the file names it. Otherwise it is JSON if ``--json`` was given and
+    the table is printed, and CSV if not.
     """
-    if by_name in FORMATS:
-        return by_name
+    if file_suffix in FORMATS:
+        return file_suffix
     return "json" if args.json and out is None else "csv"

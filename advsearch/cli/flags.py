@@ -1,8 +1,7 @@
-"""Flags made from the settings of a command, and a configuration made from flags or
-from a file.
+"""Make flags from the settings of a command, and a configuration from flags or a file.
 
-Values are texts, which the configuration reads: a wrong one is reported in one way
-wherever it came from.
+The configuration parses the values, which are strings. So a wrong value gets the same
+message whether it came from a flag or from a file.
 """
 
 from __future__ import annotations
@@ -20,23 +19,23 @@ from advsearch.questions.attack.settings import AttackConfig
 from advsearch.settings import Config, Setting, read_yaml, settings, split_names
 from advsearch.trust.code import allow_named
 
-_NO_SETTINGS = {
+# Flags that messages name too, although they belong to no setting.
+_OTHER_FLAGS = {
     "code": "--code",
     "sheets": "--sheets",
     "paper": "--paper",
     "size": "--size",
 }
-"""Flags which messages name too and which are no setting of a configuration."""
 
-SCENE = (
-    "a .glb or .gltf file, or a Mitsuba .xml file: the object is one of its nodes or "
-    "shapes by name, and the rest its "
-    "surroundings (the same as --object FILE#NAME)"
+SCENE_HELP = (
+    "a .glb or .gltf file, or a Mitsuba .xml file: --object is the name of one of its "
+    "nodes or shapes, and the rest of the file is the surroundings (the same as "
+    "--object FILE#NAME)"
 )
 
-# what the `command` of a file may say
-IN_A_FILE = tuple(name for name in CONFIGS if name != "render")
-MOST_NAMES = 50  # names of what is in a scene that one message lists
+# Commands that a file may name in `command`.
+COMMANDS_OF_FILES = tuple(name for name in CONFIGS if name != "render")
+MAX_NAMES = 50  # maximum number of names in a scene that a message lists
 
 AnyConfig = TypeVar("AnyConfig", bound=Config)
 
@@ -63,12 +62,15 @@ def add_settings(
         # SUPPRESS: a flag that was not given is absent from the arguments
         add = partial(headings[setting.group].add_argument, default=argparse.SUPPRESS)
         if setting.field == "object":
-            add("--scene", metavar="FILE", help=SCENE)
+            # --scene is a flag but no setting: with it, the values of --object are
+            # names in the scene file. In the help it stands before --object.
+            add("--scene", metavar="FILE", help=SCENE_HELP)
         options: dict[str, Any] = {
             "action": "append" if setting.repeats else "store",
             "metavar": setting.metavar,
         }
         if setting.is_switch:
+            # a flag without a value, which sets the opposite of the default
             options = {"action": "store_const", "const": not setting.default}
         add(setting.flag, dest=setting.field, help=format_help(setting), **options)
 
@@ -95,7 +97,7 @@ def make_config(
     if "scene" in args and data.get("object") is None:
         raise InputError(
             f"object: expected something in {args.scene}, got nothing; "
-            f"name one of {_format_inside(args.scene)}"
+            f"name one of {_format_object_names(args.scene)}"
         )
     if "scene" in args and isinstance(data.get("object"), str):
         # names of objects are those in the scene file: FILE#NAME
@@ -103,15 +105,18 @@ def make_config(
             f"{args.scene}#{name}" for name in split_names(data["object"])
         )
     config = config_type(**data)
-    # Code that a person typed as a flag may run. Code that a file names needs --code,
-    # so that only the settings in `typed` are allowed.
+    # Python code that these settings name may run, since the user typed them. Those in
+    # `defaults` come from the file of a run; code in them needs --code. The
+    # configuration is made first, since it parses the strings of the flags.
     allow_named({name: getattr(config, name) for name in typed})
     return config
 
 
 def read_command(file: str | Path) -> str:
-    """Return the command that a file is for. Raises FileFormatError where it is not a
-    file with settings.
+    """Return the command that a file of settings is for; "attack" if it names none.
+
+    Raises:
+        FileFormatError: it is no file with settings.
     """
     return str(read_yaml(file).get("command", "attack"))
 
@@ -122,20 +127,22 @@ def read_file_config(
     """Return the configuration that a file describes.
 
     Args:
-        command: command that the file names.
-        file: YAML with settings.
+        command: command that the file names, from `read_command`.
+        file: YAML file with settings.
         changes: values by name that replace those of the file.
 
     Raises:
         UnknownNameError: there is no such command.
     """
-    if command not in IN_A_FILE:
-        raise UnknownNameError("command", command, IN_A_FILE, f"It stands in {file}.")
+    if command not in COMMANDS_OF_FILES:
+        raise UnknownNameError(
+            "command", command, COMMANDS_OF_FILES, f"It stands in {file}."
+        )
     return CONFIGS[command].from_yaml(file, changes)
 
 
-def _format_inside(scene: str) -> str:
-    """Return the names in a scene file that can be the object, as an error lists them.
+def _format_object_names(scene: str) -> str:
+    """Return the names in a scene file that can be the object, as text for a message.
 
     Raises:
         InputError: there is none.
@@ -156,8 +163,8 @@ def _format_inside(scene: str) -> str:
             f"--scene: {path} has nothing that can be the object; "
             "expected a shape or a node with a mesh"
         )
-    text = ", ".join(format_name(name, quoted=False) for name in names[:MOST_NAMES])
-    n_omitted = len(names) - MOST_NAMES
+    text = ", ".join(format_name(name, quoted=False) for name in names[:MAX_NAMES])
+    n_omitted = len(names) - MAX_NAMES
     return f"{text} or {n_omitted:,} more" if n_omitted > 0 else text
 
 
@@ -170,7 +177,7 @@ def format_as_flags(message: str) -> str:
     --denoise none``.
     """
     known = [setting for config in CONFIGS.values() for setting in settings(config)]
-    flags = {**_NO_SETTINGS, **{setting.name: setting.flag for setting in known}}
+    flags = {**_OTHER_FLAGS, **{setting.name: setting.flag for setting in known}}
     switches = {setting.name for setting in known if setting.is_switch}
 
     def write_flag(match: re.Match[str]) -> str:
@@ -181,7 +188,8 @@ def format_as_flags(message: str) -> str:
             return flags[name]
         return f"{flags[name]} {value}"
 
-    # a pattern for any known setting
+    # A pattern for any known setting. One name may begin with another, since in each
+    # use something has to follow the name: "=", a backtick or ": ".
     names = f"(?P<name>{'|'.join(flags)})"
     # in backticks, perhaps with a value
     message = re.sub(rf"`{names}(=(?P<value>[^`]*))?`", write_flag, message)
@@ -194,7 +202,7 @@ def format_as_flags(message: str) -> str:
 
 
 def format_help(setting: Setting) -> str:
-    """Return what the help says of a setting; of a switch, what its flag does."""
+    """Return the help text of a setting; for a switch, the text of what its flag does."""
     text = setting.text
     if setting.is_switch:
         text = setting.switched or setting.description

@@ -1,5 +1,5 @@
-"""`advsearch import`: what is understood of a mesh or scene file, before anything is
-searched; and `import-3db`.
+"""`advsearch import`, which describes what advsearch reads from a mesh or scene file,
+and `advsearch import-3db`.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from advsearch.runs.summary import read_result
 if TYPE_CHECKING:
     from advsearch.scene.importing.scenes import Contents
 
-VIEWS = 4  # views of the picture, and the side of each in pixels
-SIDE = 192
-# what is understood of a file, as JSON and in lines
+VIEWS = 4  # number of views in the picture of an object
+SIDE = 192  # width and height of each view in pixels
+# The description of a file: as a mapping for JSON, and as lines of text.
 Understood = tuple[dict[str, Any], list[str]]
 
 
@@ -35,7 +35,7 @@ Understood = tuple[dict[str, Any], list[str]]
     argument(
         "--out",
         metavar="FILE",
-        help="a picture of all that is in it, from four sides (.png)",
+        help="picture to write of the contents, from four sides (.png)",
     ),
     output.add_flags,
     more=". Nothing is written but the picture",
@@ -47,7 +47,7 @@ Understood = tuple[dict[str, Any], list[str]]
     ),
 )
 def file(args: argparse.Namespace) -> int:
-    """Print what is understood of a mesh or scene file, and return the exit status.
+    """Print what advsearch reads from a mesh or scene file, and return the exit status.
 
     With `--out`, a picture of it is rendered, too.
 
@@ -83,7 +83,7 @@ def _describe_mesh_file(file: str, contents: Contents) -> Understood:
     mesh_object = contents.object
     materials = mesh_object.mesh.materials  # indices of faces by name
     clips, joints, targets = _list_motions(mesh_object.mesh.rig)
-    slow = _explain_slow_features(mesh_object)
+    slow_features = _explain_slow_features(mesh_object)  # a sentence for each
     facts = {
         **_describe_object(mesh_object),
         "materials": [
@@ -95,7 +95,7 @@ def _describe_mesh_file(file: str, contents: Contents) -> Understood:
         "clips": clips,
         "joints": joints,
         "targets": targets,
-        "slow": slow,
+        "slow": slow_features,
         "warnings": list(mesh_object.warnings),
     }
     width, height = facts["texture"]
@@ -114,7 +114,7 @@ def _describe_mesh_file(file: str, contents: Contents) -> Understood:
         "morph targets (--control 'body={NAME.weight: [0, 1]}')": targets,
     }
     lines += _format_names(names_by_kind)
-    lines += [f"Note: {note}" for note in (*mesh_object.warnings, *slow)]
+    lines += [f"Note: {note}" for note in (*mesh_object.warnings, *slow_features)]
     return facts, lines
 
 
@@ -137,7 +137,7 @@ def _describe_node(node: Any) -> dict[str, Any]:
 
 def _describe_object(mesh_object: Any) -> dict[str, Any]:
     """Return size and orientation of an object, for JSON."""
-    width, height = mesh_object.base_color.shape[1::-1]
+    height, width = mesh_object.base_color.shape[:2]
     up = mesh_object.up
     front = mesh_object.front
     return {
@@ -207,9 +207,10 @@ def _format_nodes(file: str, nodes: Sequence[Any]) -> list[str]:
 
 
 def _describe_mitsuba_file(file: str, out: Path | None) -> Understood:
-    """Describe what advsearch understands of a Mitsuba file; render it if `out` is given.
+    """Describe what advsearch reads from a Mitsuba file, and render it if `out` is
+    given.
 
-    The first shape that is no light is taken as the object.
+    The first shape that is no light is loaded as the object.
 
     Args:
         file: path of the file, as the user wrote it.
@@ -241,7 +242,7 @@ def _describe_mitsuba_file(file: str, out: Path | None) -> Understood:
             f"{file}: no shape of it can be the object, so that it cannot "
             "be pictured; leave --out out"
         )
-    # what is rendered as the file has it, with the reason by the name of the shape
+    # Shapes that advsearch renders but cannot change, with the reason.
     unchanged_shapes = dict(contents.unchanged)
     names_by_kind = {
         "objects": list(contents.objects),
@@ -256,11 +257,12 @@ def _describe_mitsuba_file(file: str, out: Path | None) -> Understood:
             f"--object {contents.objects[-1]}"
         )
     lines += [f"Note: {warning}" for warning in warnings]
-    return {
+    facts = {
         **names_by_kind,
-        "kept": unchanged_shapes,
+        "kept": unchanged_shapes,  # for JSON as a mapping from shape to reason
         "warnings": list(warnings),
-    }, lines
+    }
+    return facts, lines
 
 
 def _describe(parser: argparse.ArgumentParser) -> None:
@@ -272,9 +274,11 @@ def _describe(parser: argparse.ArgumentParser) -> None:
 
 @command(
     _describe,
-    argument("folder", metavar="FOLDER", help="what 3DB wrote"),
+    argument("folder", metavar="FOLDER", help="folder that 3DB wrote"),
     argument("--run", help="name or folder of the run (default: runs/FOLDER-3db-NNN)"),
-    argument("--overwrite", action="store_true", help="replace the run that is there"),
+    argument(
+        "--overwrite", action="store_true", help="replace a run that exists already"
+    ),
     output.add_flags,
 )
 def threedb(args: argparse.Namespace) -> int:

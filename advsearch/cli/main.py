@@ -1,8 +1,7 @@
-"""`advsearch`: run the command that is asked for, and turn what goes wrong into a
-message and an exit status.
+"""`advsearch`: run a command, and turn errors into a message and an exit status.
 
-Exit status: 0 the command did its work, 1 a bug, 2 bad input, 3 a check that fell
-short, 130 interrupted.
+Exit status: 0 if the command did its work, 1 for a bug, 2 for bad input, 3 if a check
+or test did not pass, 130 if the command was interrupted.
 """
 
 from __future__ import annotations
@@ -37,7 +36,11 @@ from advsearch.errors import (
     InputError,
     UnknownNameError,
 )
-from advsearch.interrupts import INTERRUPTS, end_at_the_second, unless_interrupted
+from advsearch.interrupts import (
+    INTERRUPTS,
+    end_process_at_second_interrupt,
+    report_unraisable_error,
+)
 from advsearch.registry import (
     EXPERIMENTS,
     get_experiment,
@@ -52,7 +55,7 @@ if TYPE_CHECKING:
     from advsearch.settings import Config
 
 # --------------------------------------------------------------------------------
-# The commands: what the help lists, and what carries each out.
+# The commands in the help, and the classes that run them.
 #
 # An experiment's command is made from it (`advsearch.experiment.Experiment`). Others
 # are functions of this package made a `command`, imported when they are used, so that
@@ -62,7 +65,7 @@ Argument = Callable[[argparse.ArgumentParser], object]  # adds something to a pa
 
 
 def argument(*names: str, **options: Any) -> Argument:
-    """Return what adds an argument to a parser, as its `add_argument` does."""
+    """Return a function that adds an argument to a parser, as `add_argument` does."""
     return methodcaller("add_argument", *names, **options)
 
 
@@ -70,12 +73,12 @@ def argument(*names: str, **options: Any) -> Argument:
 class PlainCommand:
     """A command that runs no experiment."""
 
-    # does what the arguments say, and returns the exit status
+    # runs the command with parsed arguments, and returns the exit status
     run: Callable[[argparse.Namespace], int]
-    # what adds them, in the order in which the help shows them
+    # functions that add the arguments to a parser, in the order of the help
     arguments: tuple[Argument, ...]
-    more: str = ""  # what its help says after what it does
-    examples: tuple[str, ...] = ()  # lines of a shell, without `advsearch`
+    more: str = ""  # text that the help appends to the description
+    examples: tuple[str, ...] = ()  # command lines for the help, without `advsearch`
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         for add in self.arguments:
@@ -87,7 +90,7 @@ def command(
 ) -> Callable[[Callable[[argparse.Namespace], int]], PlainCommand]:
     """Return a decorator that makes a `PlainCommand` of a function.
 
-    The module and the name of the function stand in `GROUPS`.
+    The module and the name of the function are in `GROUPS`.
     """
     return lambda run: PlainCommand(run, arguments, more, examples)
 
@@ -96,9 +99,10 @@ def command(
 class ExperimentCommand:
     """The command of an experiment.
 
-    An experiment may be about runs, files or names: its subject, which is the setting
-    `Experiment.about` (empty without a subject). `--code` allows the Python code that
-    such a run or file names.
+    Many experiments have a subject: a run, a file or a name that they are about. It is
+    the value of one setting, whose name is `Experiment.about` (empty for an experiment
+    without a subject). Since a run or a file may name Python code, `--code` allows this
+    code to run.
     """
 
     experiment: Experiment[Any]
@@ -126,17 +130,17 @@ class ExperimentCommand:
 
         add_settings(parser, self.experiment.settings)
         output.add_quiet_flags(parser)
-        about = self.experiment.about
+        subject_setting = self.experiment.about
         positional = self.experiment.positional
         if positional:
             parser.add_argument(
-                about,
+                subject_setting,
                 metavar=positional.metavar,
                 nargs="*" if positional.is_repeatable else "?",
                 default=argparse.SUPPRESS,
-                help=f"as `--{about}`{positional.help_suffix}",
+                help=f"as `--{subject_setting}`{positional.help_suffix}",
             )
-        if about:
+        if subject_setting:  # its run or file may name code
             output.add_code_flag(parser)
 
     def run(self, args: argparse.Namespace) -> int:
@@ -148,8 +152,8 @@ class ExperimentCommand:
         Raises:
             InputError: the subject is missing.
         """
-        about = self.experiment.about
-        subject = getattr(args, about, None)
+        subject_setting = self.experiment.about
+        subject = getattr(args, subject_setting, None)
         if self.experiment.choices and subject == "list":
             return self._print_choices(as_json=args.json)
         is_missing = subject in (None, [])
@@ -161,7 +165,7 @@ class ExperimentCommand:
             )
         # several words on the command line are one setting, with commas
         if isinstance(subject, list):
-            setattr(args, about, ",".join(subject))
+            setattr(args, subject_setting, ",".join(subject))
         return self.run_config(
             self.read_config(args), as_json=args.json, quiet=args.quiet
         )
@@ -193,14 +197,15 @@ class ExperimentCommand:
         from advsearch.settings import settings, split_names
 
         config_type = self.experiment.settings
-        about = self.experiment.about
+        subject_setting = self.experiment.about
         read_defaults = self.experiment.defaults_from_run
         if read_defaults is None:
             return make_config(args, config_type)
-        if about in args:
-            run_name = getattr(args, about)
+        if subject_setting in args:  # the earlier run was given
+            run_name = getattr(args, subject_setting)
             positional = self.experiment.positional
             if positional and positional.is_repeatable:
+                # the first run; an empty text is passed on, to be rejected as a name
                 run_name = next(iter(split_names(run_name)), run_name)
             defaults = read_defaults(find_run(run_name) / CONFIG, vars(args))
             return make_config(args, config_type, **defaults)
@@ -211,7 +216,7 @@ class ExperimentCommand:
         ]
         if missing:
             command = f"advsearch {self.name}"
-            run_flag = f"--{about.replace('_', '-')} RUN"
+            run_flag = f"--{subject_setting.replace('_', '-')} RUN"
             raise InputError(
                 f"{command}: expected {missing[0]} NAME, or {run_flag}; "
                 f"see {command} --help"
@@ -253,8 +258,8 @@ GROUPS = {
         "web server can serve",
         "dashboard": "dashboard:dashboard show the pages of runs in a browser on this "
         "machine",
-        "report": "report:report write what runs show, and no more than that, for a "
-        "model card or a safety case",
+        "report": "report:report write the evidence of runs for a model card or a "
+        "safety case, with nothing that they do not show",
         "list": "show:list_all list all names: objects, environments, controls, "
         "policies, tasks, objectives, models "
         "and recipes",
@@ -263,8 +268,8 @@ GROUPS = {
     },
     "trust: does a result hold, and is the tool right?": {
         **dict.fromkeys(("test", "replay", "check", "precision", "stability"), ""),
-        "doctor": "doctor:doctor check every part that a run needs, with versions and "
-        "how to mend it",
+        "doctor": "doctor:doctor check every component that a run needs, with its "
+        "version and how to repair it",
     },
     "files and runs: repeat, continue, bring in, take out": {
         "run": "run:run do what a YAML file describes; the run.yaml of a run repeats it",
@@ -281,8 +286,10 @@ GROUPS = {
         "import-3db": "imports:threedb turn a folder that 3DB wrote into a run",
     },
 }
-"""Each command, in the groups and the order of the help: empty for an experiment; for
-another command its module in this package, its function there and what it does.
+"""All commands, by group, in the order of the help.
+
+The text of a command is "MODULE:FUNCTION what it does", with a module of this package.
+It is empty for an experiment, which `catalog` describes.
 """
 
 COMMANDS_OF_THIS_PACKAGE = {
@@ -322,11 +329,12 @@ def _is_available(name: str, target: str) -> bool:
 
     Args:
         name: name of the command.
-        target: its entry in `GROUPS`, "MODULE:FUNCTION what it does"; empty for an
-            experiment.
+        target: text of the command in `GROUPS`, "MODULE:FUNCTION what it does"; empty
+            for an experiment.
     """
     if not target:
         return name in EXPERIMENTS
+    # an installation may lack the module of an optional command
     module = target.partition(":")[0]
     return is_present(f"advsearch.cli.{module}")
 
@@ -342,7 +350,7 @@ def get_command(name: str) -> ExperimentCommand | PlainCommand:
 
 
 def get_command_help(name: str) -> str:
-    """Return what a command does, in a clause."""
+    """Return the description of a command, as a clause."""
     target = COMMANDS_OF_THIS_PACKAGE.get(name)
     if target is None:
         return get_experiment_help(name)
@@ -358,7 +366,7 @@ _EXAMPLES = """examples:
 
 
 class Parser(argparse.ArgumentParser):
-    """argparse, but what is wrong with the arguments is an `InputError`."""
+    """An argument parser that raises `InputError` for wrong arguments."""
 
     def error(self, message: str) -> NoReturn:
         raise InputError(f"{message}; see {self.prog} --help")
@@ -398,10 +406,12 @@ def _run_interruptibly(words: list[str]) -> int:
     Args:
         words: words of the command line, without the program's name.
     """
-    sys.unraisablehook = unless_interrupted
+    sys.unraisablehook = report_unraisable_error
     try:
+        # The first Ctrl-C raises KeyboardInterrupt in Python code. The second one ends
+        # the process, by a thread of its own, even while native code runs.
         signal.signal(signal.SIGINT, INTERRUPTS)
-        end_at_the_second()  # a second Ctrl-C ends the process at once
+        end_process_at_second_interrupt()
         status = _status(words)
         INTERRUPTS.ended = True
         return status
@@ -456,7 +466,7 @@ def _run_and_report_errors(words: list[str]) -> int:
         print(f"advsearch: error: {shorten_words(text)}", file=sys.stderr)
         return BAD_INPUT
     except BrokenPipeError:
-        # nobody reads the output any more, as behind `head`
+        # the output is closed, for instance by `head`
         return OK
 
 
@@ -539,7 +549,7 @@ def make_parser_without_commands() -> tuple[
         dest="command",
         metavar="COMMAND",
         title="commands",
-        help="one of those below; advsearch COMMAND --help explains it",
+        help="one of the commands below; advsearch COMMAND --help explains it",
         parser_class=Parser,
     )
     return parser, subparsers
@@ -548,7 +558,7 @@ def make_parser_without_commands() -> tuple[
 def _list_commands_with_help() -> list[str]:
     """Return the lines of the help that list the commands in their groups.
 
-    Names are in a column, with the text of each command beside its name.
+    The lines have a column of names and a column of descriptions.
     """
     groups = group_commands()
     longest_name = max(len(name) for group in groups.values() for name in group)

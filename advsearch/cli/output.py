@@ -1,11 +1,13 @@
-"""What every command prints with: JSON alone on standard output, messages and progress
-on standard error.
+"""Print results, messages and progress.
 
-What is printed holds names that others chose: of files, labels, objects, runs. Here is
-the one place where the control characters in them, which could steer a terminal or
-forge a line, become readable escapes; and where a full disk behind standard output
-becomes a message. Progress is bars on a terminal, and a plain line now and then
-elsewhere.
+Results go to standard output; with ``--json`` it contains nothing but JSON. Messages
+and progress go to standard error: progress bars on a terminal, otherwise a line from
+time to time.
+
+Names of files, labels, objects and runs may come from other people. Control characters
+in them could control the terminal or imitate a line of output, so this module prints
+them as readable escapes. It also turns a full disk behind standard output into a
+message.
 """
 
 from __future__ import annotations
@@ -39,11 +41,9 @@ if TYPE_CHECKING:
 OK = 0
 BAD_INPUT = 2
 INTERRUPTED = 130
-"""Exit statuses of a command that did its work, was given what it cannot take, and was
-interrupted.
-"""
+"""Exit statuses: the command did its work, got wrong input, or was interrupted."""
 
-# most characters of a name in a message; of a longer one the ends are shown
+# Maximum length of a name in a message. Of a longer one only both ends are printed.
 MAX_WORD_LENGTH = 300
 
 
@@ -58,10 +58,11 @@ def shorten_words(text: str) -> str:
 
 
 class Screen:
-    """A text stream that writes text through `escape_text` to another stream.
+    """A text stream that writes to another stream, with escapes for control characters.
 
-    All else is the other stream's own. Where writing fails, it raises an error if
-    `raises_errors`, else the text is dropped.
+    Text goes through `escape_text`. Other attributes are those of the other stream. If
+    writing fails, an error is raised if `raises_errors` is set; otherwise the text is
+    dropped.
     """
 
     def __init__(self, stream: TextIO, *, raises_errors: bool) -> None:
@@ -86,7 +87,7 @@ def output_errors() -> Iterator[None]:
     """Turn errors of standard output inside the block into errors with a message.
 
     Raises:
-        BrokenPipeError: nobody reads it any more, which is no failure.
+        BrokenPipeError: the reader has closed the output, which is no failure.
         StorageError: it cannot be written for another reason.
     """
     try:
@@ -101,9 +102,7 @@ def output_errors() -> Iterator[None]:
 
 @contextmanager
 def escape_output() -> Iterator[None]:
-    """Inside the block, let all that is printed go through a `Screen`, which escapes
-    what would steer a terminal.
-    """
+    """Escape control characters in all output that is printed inside of the block."""
     stdout = sys.stdout
     stderr = sys.stderr
     sys.stdout = _screen(stdout, raises_errors=True)
@@ -152,7 +151,7 @@ def end_output() -> None:
 def _screen(stream: Any, *, raises_errors: bool) -> TextIO:
     """Return a `Screen` that writes to a stream; the stream itself if it is one.
 
-    Without a stream, everything is dropped: Python has none where the descriptor was
+    Without a stream, everything is dropped. Python has none if its descriptor was
     closed.
     """
     if isinstance(stream, Screen):
@@ -181,8 +180,8 @@ def add_code_flag(parser: argparse.ArgumentParser) -> None:
 
 
 def add_quiet_flags(parser: argparse.ArgumentParser) -> None:
-    """Add ``--json`` and ``--quiet``, for commands that take their time."""
-    add_flags(parser)
+    """Add ``--json`` and ``--quiet``, for commands that take long."""
+    add_flags(parser)  # --json
     parser.add_argument(
         "--quiet",
         action="store_true",
@@ -216,13 +215,14 @@ def print_json(value: Any) -> None:
     text = json.dumps(
         to_json_value(value), indent=2, allow_nan=False, ensure_ascii=False
     )
-    # Letters of other languages stay; invisible ones become escapes of JSON. [1:-1]
-    # takes off the quotes that `json.dumps` adds.
+    # `ensure_ascii=False` above leaves letters of other languages readable, but also
+    # characters that are not printable. These become escapes such as \u200b: without
+    # the option, `json.dumps` escapes them; [1:-1] removes its quotes.
     text = "".join(
         sign if sign.isprintable() or sign == "\n" else json.dumps(sign)[1:-1]
         for sign in text
     )
-    # DEL is the one that json.dumps leaves as it is
+    # DEL is the only such character that `json.dumps` does not escape.
     print(text.replace("\x7f", "\\u007f"))
 
 
@@ -266,7 +266,7 @@ def make_resume_command(run: str | Path) -> str:
 
     words = ["advsearch", "resume", format_run_name(run)]
     file = Path(run) / CONFIG
-    # where the file cannot be read, the printed command will say so when it is run
+    # If the file cannot be read, the printed command reports it when it is run.
     with suppress(AdvsearchError):
         config = read_file_config(read_command(file), file, {})
         if not isinstance(config, SceneConfig):
@@ -404,11 +404,11 @@ def open_answer_progress() -> AbstractContextManager[Progress]:
 
 
 class InterruptCheckingProgress:
-    """A progress that passes everything on to another one, and looks for interrupts.
+    """A display of progress that also raises interrupts again that were lost.
 
-    Modules that are being imported, destructors and native code may swallow an
-    interrupt or turn it into another error. It is raised again at the next stage or
-    step.
+    All calls are passed on to another display. Modules that are being imported,
+    destructors and native code may swallow an interrupt, or turn it into another error.
+    It is raised again at the next stage or step.
     """
 
     def __init__(self, progress: Progress) -> None:
@@ -425,7 +425,7 @@ class InterruptCheckingProgress:
         """See `Progress.stage`.
 
         Raises:
-            KeyboardInterrupt: there was an interrupt that nobody has handled.
+            KeyboardInterrupt: there was an interrupt that was not handled.
         """
         INTERRUPTS.look()
         self._progress.stage(name, total, hint=hint, at_most=at_most)

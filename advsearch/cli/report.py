@@ -1,4 +1,4 @@
-"""`advsearch report`: runs as evidence for a model card or a safety case."""
+"""`advsearch report`: write the evidence of runs for a model card or a safety case."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from advsearch.cli.main import argument, command
 from advsearch.extend import InputError
 
 NAME = "evidence"
-# the file that says where photographs were taken, and its most bytes
+# The file with the camera poses of photographs, and its maximum size in bytes.
 POSES = "poses.csv"
 LARGEST_POSES = 1 << 20
 
@@ -26,51 +26,52 @@ LARGEST_POSES = 1 << 20
         "runs",
         nargs="+",
         metavar="RUN",
-        help="names or folders of runs; of a recipe, its parts",
+        help="names or folders of runs; for a recipe, those of its parts",
     ),
     argument(
         "--evidence",
         action="store_true",
-        help="claims with what a reader needs to judge them",
+        help="write claims, with the evidence that a reader needs to assess them",
     ),
     argument(
         "--criterion",
         metavar="SHARE",
         type=float,
-        help="share of right predictions that is asked for",
+        help="required fraction of right predictions",
     ),
     argument(
         "--exposure",
         metavar="FILE",
-        help="how common conditions are: YAML such as environment: {street: 0.8, noon: "
-        "0.2}",
+        help="YAML file with the frequency of conditions, such as environment: {street: "
+        "0.8, noon: 0.2}",
     ),
     argument(
         "--photographs",
         metavar="FOLDER",
         help="photographs aligned with renderings of the first run, by their names: "
         "rendering-12.jpg, "
-        "rendering-12-again.jpg; its model judges them, and the run keeps them",
+        "rendering-12-again.jpg; the model of the run evaluates them, and they are "
+        "stored in the run",
     ),
     argument(
         "--twins",
         metavar="RUN",
-        help="a run of advsearch twins, which states how far verdicts hold for "
-        "photographs",
+        help="a run of advsearch twins, which measured how well results on renders hold "
+        "for photographs",
     ),
     argument(
         "--by",
         metavar="NAME",
-        help="who answers for it, as it is to be written",
+        help="name of the responsible person, as it is written in the report",
         default="",
     ),
     argument(
         "--out",
         metavar="FOLDER",
-        help="where the three files go (default: %(default)s)",
+        help="folder for the three files (default: %(default)s)",
         default=NAME,
     ),
-    argument("--overwrite", action="store_true", help="replace what is there"),
+    argument("--overwrite", action="store_true", help="replace existing files"),
     output.add_code_flag,
     output.add_flags,
     more=": a page, Markdown and JSON",
@@ -166,8 +167,8 @@ def _add_photographs(folder: str, name: str) -> None:
     """Let the model of a run judge photographs, and add them to the run.
 
     Args:
-        folder: folder with photographs. Which rendering of the run a photograph shows
-            is in its name, or in the file `POSES` beside it.
+        folder: folder with photographs. The name of a photograph, or the file `POSES`
+            in the folder, states which rendering of the run it shows.
         name: name of the run.
 
     Raises:
@@ -193,10 +194,14 @@ def _add_photographs(folder: str, name: str) -> None:
 
 
 def _check_photographs(files: Sequence[Path], folder: str) -> None:
-    """Check that there are photographs, and that each names its rendering.
+    """Check that there are photographs, and that each is matched to a rendering.
+
+    The name of a photograph has the number of its rendering, such as
+    "rendering-12.jpg". If the folder has the file `POSES`, the photographs were given
+    such names before (`_copy_named_by_pose`).
 
     Raises:
-        InputError: there are none, or one does not.
+        InputError: there are no photographs, or one has no number in its name.
     """
     unnumbered_files = [
         file.name for file in files if not file.stem.startswith("rendering-")
@@ -206,7 +211,7 @@ def _check_photographs(files: Sequence[Path], folder: str) -> None:
             f"photographs: {unnumbered_files[0]}: expected the number of a "
             "rendering in its "
             "name, such as rendering-12.jpg, "
-            f"or {POSES} beside it; advsearch dashboard aligns photographs by phone"
+            f"or {POSES} in the folder; advsearch dashboard aligns photographs by phone"
         )
     if not files:
         raise InputError(
@@ -247,7 +252,7 @@ def _copy_named_by_pose(folder: Path, run: Path, out: Path) -> Path:
         file = folder / Path(str(pose.pop("file", ""))).name
         if not file.is_file():
             raise InputError(
-                f"{location}: expected the name of a photograph beside it "
+                f"{location}: expected the name of a photograph in the same folder "
                 f"under `file`, got {file.name!r}"
             )
         steps = [step for step, values in rows if _has_pose(values, pose)]
@@ -283,10 +288,16 @@ def _has_pose(values: Mapping[str, object], pose: Mapping[str, str | None]) -> b
 
 
 def _is_equal_value(value: object, text: str | None) -> bool:
-    """Return whether a text writes a value: the same name, or nearly the same number."""
-    if text is None or value is None or isinstance(value, str):
-        return text is not None and value == text.strip()
+    """Return whether a text is a value: the same name, or nearly the same number.
+
+    A missing text or a missing value (None) equals nothing.
+    """
+    if text is None or value is None:
+        return False
+    if isinstance(value, str):
+        return value == text.strip()
     try:
+        # the text may be rounded
         return math.isclose(float(str(value)), float(text), rel_tol=1e-3, abs_tol=1e-3)
     except ValueError:
         return False

@@ -1,5 +1,5 @@
-"""`advsearch run`: do what a YAML file describes; `resume`: go on with a run that was
-stopped; `runs`: those here.
+"""The commands `advsearch run`, which runs an experiment from a YAML file; `resume`,
+which continues a run that was stopped; and `runs`, which lists the runs in a folder.
 """
 
 from __future__ import annotations
@@ -28,17 +28,18 @@ from advsearch.viewer.pages import write_page
     argument(
         "file",
         metavar="FILE",
-        help="YAML with settings and values, such as a run's run.yaml",
+        help="YAML file with settings, such as the run.yaml of a run",
     ),
     argument(
         "change", metavar="NAME=VALUE", nargs="*", help="a setting to change: steps=80"
     ),
     argument(
         "--run",
-        help="where the run is kept: a name (kept in runs/) or the path of a folder",
+        help="where the run is stored: a name (for a folder in runs/) or the path of a "
+        "folder",
     ),
     argument(
-        "--overwrite", action="store_true", help="replace a run that is there already"
+        "--overwrite", action="store_true", help="replace a run that exists already"
     ),
     output.add_code_flag,
     output.add_quiet_flags,
@@ -60,15 +61,18 @@ def parse_changes(words: Sequence[str]) -> dict[str, object]:
     Args:
         words: words of the command line, such as "steps=80" or "controls.pose.yaw=3".
 
+    Returns:
+        The values by name as it was typed: ``{"controls.pose.yaw": 3}``.
+
     Raises:
         InputError: a word is no such assignment.
     """
     changes = dict(parse_assignment(text, f"change {text!r}") for text in words)
-    # the nested mapping that dotted names stand for
-    typed = dict[str, object]()
+    # `allow_named` expects settings in nested form: {"controls": {"pose": {"yaw": 3}}}
+    nested_changes = dict[str, object]()
     for name, value in changes.items():
-        set_dotted(typed, name, value)
-    allow_named(typed)
+        set_dotted(nested_changes, name, value)
+    allow_named(nested_changes)
     return changes
 
 
@@ -78,7 +82,7 @@ def run_file(
     args: argparse.Namespace,
     resumed: Path | None = None,
 ) -> int:
-    """Run what a YAML file describes, and return the exit status.
+    """Run the experiment that a YAML file describes, and return the exit status.
 
     Args:
         file: file with settings.
@@ -93,8 +97,10 @@ def run_file(
             as one that connects to other machines.
     """
     config = read_file_config(read_command(file), file, changes)
-    # `left_out` has the settings that count only when typed; they are not set. If such
-    # a setting decides no number of the result, a run is continued without it.
+    # `left_out` has the settings of the file that count only when a person types them,
+    # such as an address to connect to. The configuration lacks them. A new run would
+    # silently differ from the file, so it is an error. A run that is resumed was
+    # started with them; it goes on if they do not change its numbers.
     for setting in config.left_out:
         decides_numbers = setting.name not in config.changeable_settings
         if resumed is None or decides_numbers:
@@ -120,11 +126,11 @@ def run_file(
         "change",
         metavar="NAME=VALUE",
         nargs="*",
-        help="a setting to change that decides no number: threads=2",
+        help="a setting to change on which no result depends: threads=2",
     ),
     output.add_code_flag,
     output.add_quiet_flags,
-    more="; what it has evaluated is not rendered again",
+    more="; configurations that were evaluated before are not rendered again",
     examples=(
         "resume mug-texture-001",
         "resume mug-check-001 seconds=600",
@@ -172,12 +178,12 @@ def resume(args: argparse.Namespace) -> int:
     return run_file(path / CONFIG, changes, args, resumed=path)
 
 
-MOST_NAMES = 4  # controls of a run that the table names
+MOST_NAMES = 4  # maximum number of controls of a run that the table names
 
 
 @command(
     argument(
-        "folder", nargs="?", metavar="FOLDER", help="where to look (default: runs)"
+        "folder", nargs="?", metavar="FOLDER", help="folder of runs (default: runs)"
     ),
     output.add_flags,
 )

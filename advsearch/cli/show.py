@@ -1,8 +1,7 @@
-"""`advsearch show`: what a run found, what a control can vary, the options of a policy
-or a task, or a recipe.
+"""The commands `advsearch show`, `advsearch list` and `advsearch labels`.
 
-And what `advsearch render` says: a picture of a scene, or a sheet of views around it,
-with the model's predictions.
+`show` prints the result of a run, the parameters of a control, the options of a policy
+or a task, or a recipe.
 """
 
 from __future__ import annotations
@@ -59,18 +58,19 @@ def _set_usage(parser: argparse.ArgumentParser) -> None:
     argument(
         "--picture",
         action="store_true",
-        help="draw a run's pictures in a terminal that can",
+        help="draw the pictures of the run in the terminal, if it supports images",
     ),
     output.add_flags,
 )
 def show(args: argparse.Namespace) -> int:
-    """Show a run, or a control, policy, task or recipe that is given by kind and name.
+    """Print a run, or a control, policy, task or recipe, which is given by its kind and
+    name.
 
     Returns:
         The exit status.
 
     Raises:
-        InputError: the words name nothing that can be shown.
+        InputError: the words name none of these.
     """
     if args.picture and (args.json or len(args.what) > 1):
         raise InputError(
@@ -80,6 +80,7 @@ def show(args: argparse.Namespace) -> int:
     match args.what:
         case ["control" | "policy" | "task" as kind, name]:
             return _show_declared(kind, name, args.json)
+        # An experiment with a list of named choices, such as "recipe NAME".
         case [command, name] if _find_choice_description(command) is not None:
             describe = load_attribute(_find_choice_description(command))
             text, facts = describe(name)
@@ -176,7 +177,7 @@ def _show_unfinished(run: ListedRun, as_json: bool) -> int:
     """Show a run without a result: how far it is, and how it can be resumed.
 
     Args:
-        run: what the listing of runs knows of it.
+        run: its entry in the list of runs.
         as_json: print JSON instead of text.
 
     Returns:
@@ -282,7 +283,7 @@ def _describe_options(
     options = list[dict[str, Any]]()
     for option, field in list_declared_options(entry).items():
         default = get_option_default(field)
-        # an object, such as another task, stands by its name
+        # an object, such as another task, is represented by its name
         default = to_json_value(getattr(default, "name", default))
         options.append(
             {"name": option, "type": get_option_type(field), "default": default}
@@ -327,13 +328,15 @@ def _format_searched(parameter: Parameter) -> str:
 
 def _make_choice_row(choice: Choice) -> dict[str, str]:
     """Return the row of a table for a setting of a control, with its allowed values."""
-    allowed = ", ".join(choice.options)  # empty if it is a number
-    if choice.integer_bounds:  # a whole number between two bounds
-        allowed = f"{choice.integer_bounds[0]} to {choice.integer_bounds[1]}"
-    elif choice.max_value and choice.signed:  # a number of either sign
+    if choice.integer_bounds:
+        lower, upper = choice.integer_bounds
+        allowed = f"{lower} to {upper}"
+    elif choice.max_value and choice.signed:
         allowed = f"{-choice.max_value:g} to {choice.max_value:g}"
-    elif choice.max_value:  # a positive number
+    elif choice.max_value:
         allowed = f"over 0 to {choice.max_value:g}"
+    else:  # a name, or anything if there are no options
+        allowed = ", ".join(choice.options)
     default = _format_cell(choice.default)
     return {
         "name": choice.name,
@@ -356,15 +359,15 @@ def _format_cell(value: JsonValue) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-HEIGHT = 16  # of a picture, in lines
+HEIGHT = 16  # height of a picture in lines of the terminal
 EXTRA = "pip install 'advsearch[terminal]'"
 
-# what is shown of an attack; of another run, the first picture there is
+# Pictures of an attack that are drawn. Of another run, the first picture is drawn.
 FIRST = ("clean", "adversarial")
 
 
 def find_best_images(run: Path) -> list[Path]:
-    """Return the pictures of a run that say most; none where it has none."""
+    """Return the most informative pictures of a run; empty if it has none."""
     folder = run / IMAGES
     files = [folder / f"{name}.png" for name in FIRST]
     if not all(file.is_file() for file in files):
@@ -404,7 +407,7 @@ def _find_drawing() -> tuple[Callable[[Path], None] | None, str]:
 
     Returns:
         The function of a picture's path, None if nothing can be drawn; and a sentence
-        about why not, empty if there is nothing to say.
+        with the reason, which is empty otherwise.
     """
     if not sys.stdout.isatty():
         return None, ""
@@ -428,7 +431,7 @@ def _find_drawing() -> tuple[Callable[[Path], None] | None, str]:
 # --------------------------------------------------------------------------------
 
 
-CASES = "cases"  # of `stability`, which are not among all names
+CASES = "cases"  # names of the cases of `stability`, which "list all" leaves out
 
 _EVERY = {
     "objects": "advsearch.scene.library:list_objects",
@@ -446,8 +449,8 @@ REGISTRIES = {
     for kind, target in _EVERY.items()
     if is_present(target.partition(":")[0])
 }
-"""Where the names of each kind are: a mapping from them, or a function that returns
-them.
+"""The "module:attribute" with the names of each kind: a mapping with the names as keys,
+or a function that returns one.
 """
 
 MODELS = {
@@ -512,7 +515,7 @@ def list_all(args: argparse.Namespace) -> int:
         "word",
         metavar="WORD",
         nargs="?",
-        help="what the names should be like; all without it",
+        help="word that the names should resemble; without it, all names",
     ),
     partial(add_settings, only=("model", "labels")),
     output.add_flags,
@@ -574,7 +577,7 @@ def _select_labels(names: Sequence[str], word: str | None) -> dict[int, str]:
 
     Args:
         names: all class names.
-        word: what the names should be like; None for all.
+        word: word that the names should resemble; None for all.
     """
     # late, so that --help answers at once
     from advsearch.models.labels import find_similar_labels, is_nothing_name

@@ -1,10 +1,10 @@
-"""Batches of work: in this process (`InProcess`) or by workers
+"""Compute batches of work in this process (`InProcess`) or by workers
 (`workers.open_workers`).
 
-All kinds of workers have one interface, `concurrent.futures.Executor`: a pure function
-of a module and picklable arguments go in, a future comes out. The result of a batch
-depends on the batch and the run's settings alone, so that any worker may compute it,
-any number of times.
+All kinds of workers have the interface of `concurrent.futures.Executor`: `submit` takes
+a pure function of a module and picklable arguments, and returns a future. The result of
+a batch depends only on the batch and the settings of the run, so any worker may compute
+it, and more than once.
 """
 
 from __future__ import annotations
@@ -22,8 +22,7 @@ from advsearch.trust.code import allowed_code
 # a pure function of a batch that computes its result
 BatchFunction = Callable[[Sequence[Any]], Any]
 
-# workers that may die of a call before it is given up
-MAX_DEATHS = 3
+MAX_DEATHS = 3  # number of workers that may die during a call before it fails
 
 
 @dataclass(frozen=True)
@@ -33,12 +32,14 @@ class WorkerTask:
     # "package.module:function", which takes the settings and returns a `BatchFunction`
     function: str
     settings: JsonObject
-    # settings that may hold paths, separated by commas, whose files are sent along
+    # names of settings that may hold paths, separated by commas; these files are sent
+    # to workers that lack them
     files: tuple[str, ...] = ()
-    threads: int = 1  # threads for rendering, of a worker
-    # seconds that a batch may always take; None: by the median of earlier ones
+    threads: int = 1  # number of threads with which a worker renders
+    # Seconds that a batch may take at least before its worker is stopped. None if the
+    # limit depends only on the median of earlier batches.
     seconds: float | None = None
-    # modules of users that a worker may import, as this process
+    # modules of the user that this process may import, and workers, too
     code: tuple[str, ...] = field(default_factory=allowed_code)
     # SHA-256 of the files by path, for workers elsewhere
     digests: Mapping[str, str] = field(default_factory=dict)
@@ -46,20 +47,21 @@ class WorkerTask:
 
 @dataclass(frozen=True, eq=False)
 class BatchResult:
-    """The result of a batch, or of a single item of a batch of which workers died."""
+    """The result of a batch, or of a single item during which workers died."""
 
     items: Sequence[Any]
-    value: Any  # what the call returned
+    value: Any  # return value of the call
     worker: str = ""  # empty in this process
     # name in `WorkerStats.machines`; None if it is like this machine
     machine: str | None = None
-    lost: str = ""  # why there is no value, of a single item only
+    # Why there is no value; empty if there is one. Only a single item has no value.
+    lost: str = ""
 
     def require_value(self, title: str) -> Any:
         """Return the value of the batch, which must have been computed.
 
         Args:
-            title: what the batch was, for the message.
+            title: name of the batch, for the message.
 
         Raises:
             ClusterError: if there is no value.
@@ -73,15 +75,17 @@ class BatchResult:
 class WorkerStats:
     """Counts and times of the workers of a run."""
 
-    workers: int = 0  # connected now
-    max_running: int = 0  # maximum that computed at once
-    lost: int = 0  # lost that died
-    refused: int = 0  # refused that do not suit the task
-    retried: int = 0  # batches that were submitted again
-    batches: int = 0  # batches that are finished
-    busy: float = 0.0  # seconds that workers computed batches
-    loading: float = 0.0  # seconds that they loaded scenes and models
-    alive: float = 0.0  # seconds that they were connected, without loading
+    workers: int = 0  # number of workers that are connected now
+    max_running: int = 0  # maximum number of batches that ran at the same time
+    lost: int = 0  # number of workers that died or disconnected
+    refused: int = 0  # number of workers that cannot do the task
+    retried: int = 0  # number of batches that were submitted again
+    batches: int = 0  # number of finished batches
+    # Seconds, summed over all workers: computing batches, loading scenes and models,
+    # and being connected (without loading).
+    busy: float = 0.0
+    loading: float = 0.0
+    alive: float = 0.0
     # machines that differ from this one, by name
     machines: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
@@ -130,18 +134,18 @@ class InProcess:
 
 
 class WorkerDiedError(Exception):
-    """Raised by a future if `MAX_DEATHS` workers died of its call."""
+    """Raised by a future if `MAX_DEATHS` workers died during its call."""
 
 
 class WorkerExecutor(Executor):
-    """An executor that submits a call again if a worker dies of it.
+    """An executor that submits a call again if its worker dies.
 
-    A future ends with a WorkerDiedError if `MAX_DEATHS` died. It ends with a
+    A future ends with a WorkerDiedError if `MAX_DEATHS` workers died. It ends with a
     BrokenExecutor, or is cancelled, if the connection to the workers was lost; then the
     call has to be submitted again.
     """
 
-    description: str  # what it is, in a user's words
+    description: str  # name for messages, such as "4 workers on this machine"
     stats: WorkerStats
 
     @abstractmethod

@@ -1,9 +1,10 @@
 """An executor on the workers of a Dask scheduler, on other machines or this one.
 
-Dask itself gives a call to another worker where one dies, and starts workers again
-(their nannies do). Why not `Client.get_executor`: its future never ends where fetching
-the result fails, and it cannot leave out a worker that has another advsearch. Relied on
-(https://distributed.dask.org): a worker plugin reaches also workers that come later.
+If a worker dies, Dask gives its call to another worker, and starts a new worker.
+`Client.get_executor` is not used: its future never ends if fetching the result fails,
+and it cannot exclude a worker with another version of advsearch. This module relies on
+Dask to send a worker plugin also to workers that connect later
+(https://distributed.dask.org).
 """
 
 from __future__ import annotations
@@ -42,26 +43,25 @@ from advsearch.cluster.worker import (
 from advsearch.errors import ClusterError, FileFormatError, InputError
 from advsearch.settings import read_yaml
 
-# seconds to find a scheduler at first, and to find it again when it has gone
+# Maximum seconds to connect to a scheduler at first, and after the connection was lost.
 CONNECT_SECONDS = 30.0
 RECONNECT_SECONDS = 120.0
-LOOK_SECONDS = 0.5  # seconds between two looks at who is there, and between two tries
-MAX_TRIES = 10  # of a call that workers cannot begin
-# seconds that a scheduler may take to say which workers there are, and a worker to end
+LOOK_SECONDS = 0.5  # seconds between two queries for the workers, and between retries
+MAX_TRIES = 10  # maximum number of tries of a call that workers cannot start
+# Maximum seconds for a reply of the scheduler, and for the end of a worker.
 RESPONSE_SECONDS = 20.0
 
 SILENT = logging.CRITICAL + 1
-"""Level of Dask's log: what matters of it is said in a user's words, and a worker that
-dies is no error here.
+"""Level of Dask's log, which is above all levels. Errors are reported by this module,
+and a worker that dies is no error here.
 """
-
 CONFIG = {
-    # that of a scheduler started by itself is its own
+    # A scheduler that was not started by this process has a limit of its own.
     "distributed.scheduler.allowed-failures": MAX_DEATHS - 1,
-    # a worker that starts on a busy machine takes its time
+    # a worker that starts on a busy machine may take long
     "distributed.comm.timeouts.connect": "120s",
     "distributed.comm.timeouts.tcp": "120s",
-    # one that is not back after this is not started again
+    # a lost worker that is not back after this time is not started again
     "distributed.deploy.lost-worker-timeout": "1h",
     "distributed.worker.profile.enabled": False,
     "distributed.admin.system-monitor.gil.enabled": False,
@@ -69,24 +69,24 @@ CONFIG = {
 
 PATIENCE = 300.0
 LESS_PATIENCE = 15.0
-"""Seconds without any worker after which there is no hope; where those that are there
-are refused, fewer.
+"""Seconds without a fit worker after which the run ends: `PATIENCE` if no worker is
+connected, or `LESS_PATIENCE` if workers are connected that were refused.
 """
 
-# that end a call whose worker is not there
+# Errors of Dask for a call whose worker has disconnected. The call is repeated.
 NO_WORKER = ("NoValidWorkerError", "NoWorkerError")
 
 
 @dataclass(frozen=True)
 class ClusterSite:
-    """Where workers run: the address of a scheduler, or what starts a cluster.
+    """Where workers run: at a running scheduler, or in a cluster to start.
 
     Attributes:
-        description: its name for messages.
-        address: address of a scheduler that runs.
-        start: what starts a cluster.
-        security: keywords of Dask's `Security`.
-        count: number of workers that it starts with; None for its default.
+        description: name for messages.
+        address: address of a running scheduler; empty if a cluster is started.
+        start: function that starts a cluster; None if there is a scheduler.
+        security: keywords of Dask's `Security`; None for no encryption.
+        count: number of workers that the cluster starts with; None for its default.
     """
 
     description: str
@@ -126,9 +126,10 @@ def call_on_worker(function: Callable[..., Any], *args: Any) -> tuple[str, Any]:
 
 
 class DaskExecutor(WorkerExecutor):
-    """An executor on a Dask cluster, see `WorkerExecutor`; it has to be shut down.
+    """An executor on a Dask cluster, see `WorkerExecutor`. It has to be shut down.
 
-    `contents` are files for workers that lack them.
+    A worker is fit if it can do the task. It is refused if it has another version of
+    advsearch, or if a call showed that it cannot.
     """
 
     def __init__(
@@ -195,10 +196,13 @@ class DaskExecutor(WorkerExecutor):
         deadline = time.monotonic() + seconds
         dask.config.set(CONFIG)
         logging.getLogger("distributed").setLevel(SILENT)
+        # Until the deadline, `_connect` may fail early, as while a scheduler starts.
         while True:
             try:
                 self._client = self._connect(security, deadline)
                 break
+            # Dask raises these if nothing answers at the address, or something else
+            # does
             except (
                 OSError,
                 TimeoutError,
@@ -214,6 +218,7 @@ class DaskExecutor(WorkerExecutor):
                         "advsearch resume"
                     ) from error
                 time.sleep(LOOK_SECONDS)
+        # compared in `count_workers`, to notice that the client has connected again
         self._connection = self._client.scheduler_comm
         # Dask draws its pages with bokeh; without it the link leads to an error.
         has_pages = importlib.util.find_spec("bokeh") is not None
@@ -260,8 +265,8 @@ class DaskExecutor(WorkerExecutor):
         now = time.monotonic()
         if now - self._looked_at >= LOOK_SECONDS:
             client = self._client
-            # A client that connects again by itself does so by another connection. The
-            # calls that were running are lost all the same.
+            # A client may connect again by itself. Then it is running, but with another
+            # connection, and the calls that were running are lost.
             is_connected = (
                 client.status == "running" and client.scheduler_comm is self._connection
             )
@@ -272,8 +277,8 @@ class DaskExecutor(WorkerExecutor):
             with suppress(OSError, TimeoutError, asyncio.TimeoutError):
                 self._look()
             self._looked_at = time.monotonic()
-        # Workers are only looked for when they are counted. A long time without a count
-        # is no time without workers.
+        # The time without fit workers begins now if there is one now, or if this method
+        # was not called for so long that workers may have come and gone.
         was_long_ago = now - self._counted_at > LESS_PATIENCE
         if self._fit or was_long_ago:
             self._alone_since = now
@@ -310,6 +315,7 @@ class DaskExecutor(WorkerExecutor):
                 fit |= {address}
             else:
                 self._refuse_version(address, its_version)
+        # A call that ran during these queries may have refused a worker that was fit.
         self._fit = fit - set(self._refused)
 
     def _refuse_version(self, address: str, version: Any) -> None:
@@ -319,7 +325,8 @@ class DaskExecutor(WorkerExecutor):
             address: address of the worker.
             version: its version, or the error that reading the version raised. An
                 ImportError or AttributeError means that advsearch is missing or old.
-                After another error, as of a slow worker, the next look asks again.
+                After any other error, such as that of a slow worker, the version is
+                read again later.
         """
         if isinstance(version, str):
             self._refuse(
@@ -353,8 +360,8 @@ class DaskExecutor(WorkerExecutor):
     def _check_hope(self, now: float) -> None:
         """Raise ClusterError if there has been no fit worker for too long.
 
-        If workers are connected but all were refused, the wait is shorter, since these
-        will not become fit.
+        The wait is shorter if workers are connected and were refused, since these will
+        not become fit. If a fit worker is connected, `_alone_since` is recent.
 
         Args:
             now: time (`time.monotonic`) of this check.
@@ -434,13 +441,14 @@ class DaskExecutor(WorkerExecutor):
             )
             try:
                 result = await self._wait(future, workers)
-                if result is not None:
+                if result is not None:  # None if its worker has disconnected
                     address, value = result
-                    if not await self._is_refused(client, address, value):
+                    is_rejected = await self._rejects_reply(client, address, value)
+                    if not is_rejected:
                         return value
             except asyncio.CancelledError:
                 # Dask cancels the future of a lost worker: then the call is repeated.
-                # If asyncio cancels this call, nobody needs its result any more.
+                # If asyncio cancels this call, its result is not needed any more.
                 if future.status != "cancelled":
                     raise
             except KilledWorker:
@@ -450,8 +458,10 @@ class DaskExecutor(WorkerExecutor):
             except Exception as error:
                 # `run_batch` catches errors and returns them in its reply. So this
                 # error means that the worker could not begin, for instance that it
-                # could not import the function.
-                if future.status == "error" and type(error).__name__ not in NO_WORKER:
+                # could not import the function. Other errors mean that the worker or
+                # the result was lost: then the call is repeated.
+                is_worker_lost = type(error).__name__ in NO_WORKER
+                if future.status == "error" and not is_worker_lost:
                     failed_starts += 1
                     if failed_starts == MAX_TRIES:
                         raise self._make_start_error(error) from error
@@ -493,11 +503,13 @@ class DaskExecutor(WorkerExecutor):
         finally:
             fetching.cancel()
 
-    async def _is_refused(self, client: Any, address: str, value: Any) -> bool:
-        """Return whether a call has to be run again because its worker could not do it.
+    async def _rejects_reply(self, client: Any, address: str, value: Any) -> bool:
+        """Send missing files or refuse an unfit worker, and return whether either was
+        necessary.
 
-        If the worker lacks files that were not sent yet, they are sent here. Otherwise
-        a worker that is unfit or lacks files is refused, and another one gets the call.
+        Then the call has to be run again. Files are sent if the worker lacks them and
+        they were not sent yet. Otherwise a worker that is unfit or lacks files is
+        refused, and another one gets the call.
 
         Args:
             client: client of the connection that was used.
@@ -505,11 +517,12 @@ class DaskExecutor(WorkerExecutor):
             value: value that the call returned, a `Reply` for batches.
         """
         failure = value.failure if isinstance(value, Reply) else None
+        # Another call may be sending them now; then `_send_files` waits for it.
         were_files_sent = self._sending is not None and self._sending.done()
         if failure is Failure.MISSING_FILES and not were_files_sent:
             await self._send_files(client)
             return True
-        # The worker is unfit, or could not write the files that were sent.
+        # A worker that still lacks files could not write those that were sent.
         if failure in (Failure.UNFIT, Failure.MISSING_FILES):
             self._refuse(address, value.error)
             return True
@@ -522,7 +535,8 @@ class DaskExecutor(WorkerExecutor):
                 make_file_plugin(self._contents), name=self._plugin_name
             )
             self._sending = asyncio.ensure_future(sending)
-        # a worker that cannot write says so with its next call
+        # Errors are ignored here: a worker that could not write the files replies
+        # `MISSING_FILES` to its next call.
         with suppress(Exception):
             await asyncio.shield(self._sending)
 
@@ -533,15 +547,15 @@ class DaskExecutor(WorkerExecutor):
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = True) -> None:
         """End all calls, remove the files that were sent, and disconnect.
 
-        Workers that this executor started end; others stay. The arguments are those of
-        `concurrent.futures.Executor`, and are not used.
+        Workers that this executor started end; others stay. The arguments of
+        `concurrent.futures.Executor` have no effect: all calls are cancelled.
         """
         for call in list(self._calls):
             call.cancel()
         client = self._client
         cluster = self._cluster
         is_connected = client is not None and client.status == "running"
-        if is_connected and self._sending is not None:
+        if is_connected and self._sending is not None:  # files were sent
             with suppress(Exception):
                 client.sync(
                     self._forget_files, client, callback_timeout=RESPONSE_SECONDS
@@ -568,8 +582,8 @@ CLUSTER_CLASSES = {
     **dict.fromkeys(JOBS, "dask_jobqueue"),
     "KubeCluster": "dask_kubernetes.operator",
 }
-"""Classes of clusters that a file may name, and where each is; anything else would be
-code that the file runs.
+"""Classes of clusters that a file may name, with the module of each. Others are
+rejected: with an arbitrary class, a file could run arbitrary code.
 """
 
 
@@ -632,11 +646,12 @@ def _read_site(path: Path, workers: int | None) -> ClusterSite:
 
     Args:
         path: path of the file.
-        workers: how many to start; None for what the file says.
+        workers: number of workers to start; None for the number in the file. Ignored
+            for the address of a scheduler, whose workers run already.
 
     Raises:
-        FileFormatError: if it has wrong or contradictory entries.
-        InputError: if a package for the cluster is not installed.
+        FileFormatError: the file has wrong or contradictory entries.
+        InputError: a package for the cluster is not installed.
     """
     entries: dict[str, Any] = read_yaml(path)
     _check_entries(path, entries)
@@ -698,7 +713,7 @@ def _read_scheduler(
         )
     if "workers" in entries:
         raise FileFormatError(
-            f"{path}: workers: the scheduler says how many there are; leave it out"
+            f"{path}: workers: the workers of a scheduler run already; leave it out"
         )
     return ClusterSite(address, address=address, security=security)
 
@@ -720,8 +735,8 @@ def _check_entries(path: Path, entries: dict[str, Any]) -> None:
         if unknown:
             got = f"got {', '.join(map(str, unknown))}"
         expected = (
-            "expected either address, or class with arguments and workers; "
-            "beside it security"
+            "expected either address, or class with arguments and workers; either "
+            "may have security"
         )
         raise FileFormatError(f"{path}: {expected}; {got}")
     for name in ("security", "arguments"):

@@ -1,12 +1,14 @@
 """An executor on processes of this machine.
 
-Why not `ProcessPoolExecutor`: a process that `spawn` starts imports the caller's script
-again, and modules of the standard library (pickle, runpy) from the current folder,
-where somebody else's file may stand for them; one process that dies ends all others
-with what they are at and have loaded; and processes stay when their parent is killed.
-These here begin with the parent's path, answer over a pipe, listen nowhere, and end
-when the parent does. Ctrl-C, which a terminal sends to its own session, does not reach
-them.
+`ProcessPoolExecutor` is not used for three reasons. A process that `spawn` starts
+imports the caller's script again, and modules of the standard library (pickle, runpy)
+from the current folder, where another file may have the same name. If one process dies,
+all others end, too, with their work and everything that they have loaded. And the
+processes remain if their parent is killed.
+
+The processes here get the module path of the parent, reply over a pipe, open no port,
+and end when the parent ends. Ctrl-C does not reach them, since they are not in the
+session of the terminal.
 """
 
 from __future__ import annotations
@@ -29,13 +31,15 @@ START_CODE = (
     "import sys; sys.path[:] = sys.argv[1:]; from advsearch.cluster.worker import "
     "serve; serve()"
 )
-"""What a worker process runs; its arguments are the path on which Python looks for
-modules. The path is set first, or a file in the current folder could stand for a module.
+"""The code that a worker process runs. Its arguments are the entries of `sys.path`.
+
+The path is set before anything else is imported: otherwise a file in the current folder
+could replace a module.
 """
 
 
 class WorkerProcess:
-    """One worker, which does one call at a time."""
+    """A worker process, which runs one call at a time."""
 
     def __init__(self) -> None:
         """Start the process.
@@ -45,6 +49,7 @@ class WorkerProcess:
         """
         # one thread for each process, since the processes share the cores
         environ = {**os.environ, "OMP_NUM_THREADS": "1", SERVE_VARIABLE: "1"}
+        # START_CODE takes the entries of the path as its arguments
         command = [sys.executable, "-c", START_CODE, *sys.path]
         self._popen = subprocess.Popen(
             command,
@@ -85,14 +90,14 @@ class WorkerProcess:
             self._popen.kill()
 
     def close(self) -> None:
-        """End it and release its pipes, which nobody may be reading."""
+        """End it and release its pipes, which may have no reader."""
         with suppress(OSError), self._popen:
             self._popen.kill()
 
 
 class LocalExecutor(WorkerExecutor):
-    """An executor of processes, each started when it is needed, and replaced if it
-    dies.
+    """An executor whose processes are started when they are needed, and replaced if
+    they die.
     """
 
     def __init__(self, count: int) -> None:
@@ -101,8 +106,10 @@ class LocalExecutor(WorkerExecutor):
         A process is started when it is needed for the first time.
 
         Raises:
-            InputError: this process is a worker itself.
+            InputError: this process is a worker itself. It comes here if it imports a
+                script of the user that starts a run when it is imported.
         """
+        # the variable is set in the environment of each worker
         is_worker = SERVE_VARIABLE in os.environ
         if is_worker:
             raise InputError(
@@ -145,7 +152,7 @@ class LocalExecutor(WorkerExecutor):
             try:
                 value = process.call(function, *args)
             except WorkerDiedError:
-                self._count_death(process)
+                self._count_death(process)  # removes it from the busy ones
                 continue
             with self._lock:
                 self._busy.discard(process)
@@ -175,7 +182,13 @@ class LocalExecutor(WorkerExecutor):
             self.stats.retried += 1
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End the processes, even in the middle of a call, whose result is lost."""
+        """End the processes, even in the middle of a call, whose result is lost.
+
+        Args:
+            wait: whether to wait until the processes have ended.
+            cancel_futures: an argument of `concurrent.futures.Executor`, not used:
+                calls that have not started are always cancelled.
+        """
         with self._lock:
             self._closed = True
             for process in self._busy:

@@ -1,8 +1,9 @@
-"""What runs on a worker: it loads a task with its first batch, and computes batches.
+"""The functions that run on a worker: they load a task and compute its batches.
 
-Errors are returned as values, as they may not survive being pickled. Files that a task
-needs are sent to workers that lack them; with a mesh goes its directory, with the files
-in it and below of the kinds that a scene consists of.
+A task is loaded with its first batch. Errors are returned as values, since an exception
+may not survive being pickled. Workers that lack the files of a task get them from the
+main process. With a mesh they get the files of its directory, and of directories below,
+that may be parts of a scene.
 """
 
 from __future__ import annotations
@@ -44,7 +45,8 @@ from advsearch.scene.mitsuba_backend.llvm import ensure_llvm
 from advsearch.trust.code import allow_code
 from advsearch.trust.named_files import is_inside
 
-PACKAGES = ("mitsuba", "drjit", "torch", "numpy")  # whose versions decide last bits
+# Packages whose versions may change the last bits of a result.
+PACKAGES = ("mitsuba", "drjit", "torch", "numpy")
 
 MachineInfo = dict[str, str]
 
@@ -99,12 +101,14 @@ REFERRED_SUFFIXES = {
     ".gltf": (".bin",),
     ".xml": (".obj", ".ply", ".serialized", ".exr", ".hdr"),
 }
-"""Suffixes of files that refer to others, and the suffixes of these besides
-pictures.
+"""Suffixes of files that refer to other files, with the suffixes of the other files.
+All of them may also refer to images.
 """
 
 ENVIRONMENT_SUFFIXES = (".glb", ".gltf", ".bin", ".exr", ".hdr")
-"""Suffixes of files besides pictures that the YAML file of an environment may name."""
+"""Suffixes of files that the YAML file of an environment may name, in addition to
+images.
+"""
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tga", ".tif", ".tiff")
 
@@ -245,25 +249,27 @@ def _has_digest(path: Path, digest: str) -> bool:
 def _split_paths(value: str) -> Iterator[str]:
     """Split the value of a setting into paths and the text between them.
 
-    ``/a.glb#NODE,/b.obj`` gives ``/a.glb``, ``#NODE``, ``,`` and ``/b.obj``. Another
-    example is ``/camera.csv+/object.csv``. Joined, the parts are the value again.
+    ``/a.glb#NODE,/b.obj`` gives ``/a.glb``, ``#NODE``, ``,`` and ``/b.obj``. A pair of
+    motion paths ``/camera.csv+/object.csv`` gives the two paths and ``+``. There may be
+    empty parts. Joined, the parts are the value without spaces around its commas.
     """
-    for part in re.split("(,)", value):
-        path, mark, node = part.strip().partition("#")
-        first, *second = split_paths(path)  # a pair of paths, or a single one
-        yield first
-        if second:
+    for entry_or_comma in re.split("(,)", value):
+        entry, mark, node = entry_or_comma.strip().partition("#")
+        first_path, *second_path = split_paths(entry)
+        yield first_path
+        if second_path:  # motion paths, which have no nodes
             yield "+"
-            yield from second
+            yield from second_path
         else:
             yield mark + node
 
 
-# tasks that a worker caches; the least recently used one is dropped
+# Maximum number of tasks that a worker caches. The least recently used one is dropped.
 MAX_LOADED = 2
-# seconds that loading may take, and a batch before there is a median
+# Seconds that loading may take. A batch may take as long while too few have finished to
+# know the median.
 LOAD_DEADLINE = 900.0
-# directories of a worker: Dr.Jit's kernels, and files that were sent
+# Directories of a worker: for Dr.Jit's compiled kernels, and for files that were sent.
 KERNELS = "kernels"
 INPUTS = "inputs"
 
@@ -272,12 +278,14 @@ _batch_lock = threading.Lock()
 
 
 class Failure(Enum):
-    """Why a worker has no result."""
+    """The reason why a worker returned no result."""
 
-    UNFIT = auto()  # another worker may do it
-    MISSING_FILES = auto()  # it has not got the files of the task
-    INPUT = auto()  # a user can mend it
-    BUG = auto()  # the error is a traceback
+    # The worker cannot do the task, for instance without libLLVM or a package, or with
+    # a full disk. Another worker may be able to.
+    UNFIT = auto()
+    MISSING_FILES = auto()  # the worker lacks files of the task
+    INPUT = auto()  # an error that the user can correct
+    BUG = auto()  # any other error; its text is a traceback
 
 
 @dataclass(frozen=True)
@@ -285,8 +293,8 @@ class Reply:
     """The reply of a worker to a batch."""
 
     value: Any = None
-    seconds: float = 0.0  # seconds that the batch took, and that loading took before it
-    loading: float = 0.0
+    seconds: float = 0.0  # seconds that computing the batch took
+    loading: float = 0.0  # seconds that loading the task took before
     machine: MachineInfo = field(default_factory=dict)
     worker: str = ""
     failure: Failure | None = None
@@ -329,10 +337,14 @@ def _describe_failure(error: Exception) -> tuple[Failure, str]:
     """
     if isinstance(error, MissingFilesError):
         return Failure.MISSING_FILES, f"it lacks {error}"
+    # The machine lacks software such as LLVM, or its disk is full: another worker may
+    # be able to do the task.
     if isinstance(error, (EnvironmentSetupError, StorageError)):
         return Failure.UNFIT, str(error)
+    # Any other error of this kind is about the input of the user.
     if isinstance(error, AdvsearchError):
         return Failure.INPUT, str(error)
+    # A file or a package is missing, for instance.
     if isinstance(error, (OSError, ImportError)):
         return Failure.UNFIT, f"{type(error).__name__}: {error}"
     return Failure.BUG, traceback.format_exc()
@@ -366,7 +378,9 @@ def load_task(task: WorkerTask) -> BatchFunction:
     if "DRJIT_CACHE_DIR" not in os.environ:
         (folder / KERNELS).mkdir(exist_ok=True)
         os.environ["DRJIT_CACHE_DIR"] = str(folder / KERNELS)
-    describe_machine()  # raises without libLLVM, before anything is loaded
+    # Only called for its error on a machine without libLLVM, before anything is loaded.
+    describe_machine()
+    # The user allowed this code to run in the main process.
     allow_code(*task.code)
     task = resolve_files(task, folder / INPUTS)
     threads.configure(task.threads)
@@ -380,7 +394,7 @@ def load_task(task: WorkerTask) -> BatchFunction:
 
 
 def _make_task_key(task: WorkerTask) -> str:
-    """Return a digest of all that decides what a loaded task computes."""
+    """Return a digest of everything on which the results of a loaded task depend."""
     described = [
         task.function,
         task.settings,
@@ -409,7 +423,7 @@ def make_private_directory() -> Path:
     return folder if is_private else Path(tempfile.mkdtemp(prefix="advsearch-"))
 
 
-# environment variable of a process that runs `serve`
+# Environment variable that is set in a process that runs `serve`.
 SERVE_VARIABLE = "ADVSEARCH_WORKER"
 
 

@@ -1,7 +1,7 @@
-"""Computes batches by workers: as many calls run at once as there are workers.
+"""Compute batches by workers: each worker runs one call at a time.
 
-Lost batches are submitted again, at last item by item, so that an item that kills its
-workers is known.
+A batch whose worker was lost is submitted again. If several workers die during it, its
+items are submitted one by one, to find the item that kills them.
 """
 
 from __future__ import annotations
@@ -38,14 +38,15 @@ from advsearch.errors import ClusterError
 from advsearch.interrupts import INTERRUPTS
 from advsearch.registry import load_attribute
 
-LOCAL = "local"  # the cluster that is this machine
+LOCAL = "local"  # name of the cluster that is this machine
 
-DEADLINE_FACTOR = 10.0  # times the median that a batch may take
-MIN_DEADLINE = 60.0  # seconds that it may take at least
-MEDIAN_WINDOW = 101  # batches, the last ones, of which the median is taken
-MIN_BATCHES = 5  # that a median takes
-
-# batches that may kill all their workers before a first one is done
+# A batch may take this many times the median time of earlier ones, and at least
+# MIN_DEADLINE seconds.
+DEADLINE_FACTOR = 10.0
+MIN_DEADLINE = 60.0
+MEDIAN_WINDOW = 101  # maximum number of batches of which the median is taken
+MIN_BATCHES = 5  # minimum number of batches for a median
+# Maximum number of batches whose workers die before any batch has finished.
 MAX_DEAD_STARTS = 5
 POLL_SECONDS = 0.5  # seconds between two counts of workers
 
@@ -112,7 +113,7 @@ class PoolWorkers:
                 if not running and not queued.has_next():
                     return
                 ended_future = self._wait(ended)
-                if ended_future is None:
+                if ended_future is None:  # none ended within POLL_SECONDS
                     continue
                 items = running.pop(ended_future)
                 error = _get_error(ended_future)
@@ -149,6 +150,8 @@ class PoolWorkers:
             return
         if not isinstance(error, WorkerDiedError):
             raise error
+        # Before any batch has finished, this counts as a failed start. Too many of them
+        # raise an error.
         self._count_dead_start()
         if len(items) > 1:
             queued.put_back_singly(items)
@@ -176,7 +179,8 @@ class PoolWorkers:
 
         Its worker ends itself then. The deadline is a multiple of the time that the
         items would take at the median speed of the last batches. Before there are
-        `MIN_BATCHES` of them, it is `LOAD_DEADLINE`.
+        `MIN_BATCHES` of them, it is `LOAD_DEADLINE`. It is at least `task.seconds`, if
+        the task states that time.
 
         Args:
             n_items: number of items of the batch.
@@ -209,10 +213,11 @@ class PoolWorkers:
         self.stats.batches += 1
         self.stats.busy += reply.seconds
         self.stats.loading += reply.loading
-        # `alive` counts the connected seconds without those of loading
+        # `compute` counts all seconds that workers are connected. The seconds of
+        # loading are subtracted, since they do not belong to `alive`.
         self.stats.alive -= reply.loading
         machine: str | None = digest_machine(reply.machine)
-        if machine == self._this_machine:
+        if machine == self._this_machine:  # then it needs no name
             machine = None
         elif machine is not None:
             self._note_machine(machine, reply)
@@ -254,8 +259,10 @@ class PoolWorkers:
 
 
 class _BatchQueue:
-    """The batches that have not been given out: first those that were put back, then
-    those of an iterable, which are taken when they are needed.
+    """The batches that wait for a worker.
+
+    Batches that were put back come first, then those of an iterable, which are taken
+    from it when they are needed.
     """
 
     def __init__(self, batches: Iterable[Sequence[Any]]) -> None:

@@ -1,9 +1,8 @@
-"""Figures: how they are drawn, those of studies, and of a surface. matplotlib with one
-style, into the bytes of files.
+"""Draw figures with matplotlib, in one style, as the contents of PNG and SVG files.
 
-Of studies: robust accuracy against epsilon, worst case and average, maps of the margin
-and of a sweep. Of `sweep --surface`: which parts of an object go with wrong
-predictions, on its map and from some sides.
+Figures of studies show robust accuracy against epsilon, the worst and the average case,
+and maps of the margin and of a sweep. Figures of `sweep --surface` show the parts of an
+object with which wrong predictions are correlated, on its texture and in views.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from advsearch.runs.files import to_8bit
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Figures = dict[str, bytes]  # A suffix, png or svg, to the content of a file
+Figures = dict[str, bytes]  # contents of files by suffix, png or svg
 BLUE = "#1d5fd0"
 RED = "#b3261e"
 GREY = "#5c606a"
@@ -45,7 +44,7 @@ STYLE: dict[Any, Any] = {
     "grid.linewidth": 0.7,
     "svg.hashsalt": "advsearch",
     "svg.fonttype": "none",
-    # names come from users: a dollar sign in one is no formula
+    # Names come from users: a dollar sign in one does not begin a formula.
     "text.parse_math": False,
 }
 
@@ -69,7 +68,7 @@ def render_figure(
     """Draw a figure and return it as the contents of files.
 
     Args:
-        draw: draws on the empty figure that it is given.
+        draw: function that draws on the empty figure.
         size: (width, height) of the figure in inches.
         kinds: suffixes of the files to make, png or svg.
         style: matplotlib settings that replace those of `STYLE`.
@@ -79,7 +78,8 @@ def render_figure(
 
     files = {}
     with matplotlib.rc_context({**STYLE, **(style or {})}), warnings.catch_warnings():
-        # an SVG keeps its texts, and the browser that shows it has the letter
+        # matplotlib warns of letters that its font lacks. An SVG contains the text
+        # itself, and a browser draws it with another font.
         warnings.filterwarnings("ignore", "Glyph .* missing from font")
         figure = matplotlib.figure.Figure(figsize=size, layout="constrained")
         draw(figure)
@@ -97,7 +97,7 @@ def render_figure(
 
 
 SERIES = (BLUE, RED, "#1f7a45", "#b4540a", "#6b3fa0", GREY)
-MARKS = "os^DvP"  # What tells series apart
+MARKS = "os^DvP"  # markers of the series
 
 
 def draw_fractions(
@@ -201,7 +201,8 @@ def _draw_search(
     best = np.fmax.accumulate(objective) if len(objective) else objective
     # of a long search only some points are drawn
     indices = _select_points(len(objective))
-    # a dot is a line without a length: all of them are one path, and a page stays small
+    # Each dot is drawn as a line of length 0 with round ends. So all dots are a single
+    # path in the SVG, which keeps the page small.
     axes.plot(
         _as_dots(indices + 1.0),
         _as_dots(objective[indices]),
@@ -236,8 +237,8 @@ def _as_dots(values: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
 
 MARGIN = "margin [logits]; below 0: wrong"
 ACCURACY = "accuracy"
-"""What the colours of a map may mean: red is wrong in both."""
-MAX_POINTS = 400  # Values of an axis that are drawn
+"""The quantities of the colors of a map. In both, red means wrong."""
+MAX_POINTS = 400  # maximum number of points that are drawn of a search
 
 
 def draw_heat_map(
@@ -272,7 +273,7 @@ def draw_heat_map(
 
 
 def format_axis_title(name: str, unit: str) -> str:
-    """Return what an axis is called: ``pose.yaw [degrees]``."""
+    """Return the title of an axis: ``pose.yaw [degrees]``."""
     return f"{name} [{unit}]" if unit not in ("", "name") else name
 
 
@@ -281,23 +282,22 @@ def render_axes(draw: Callable[[Any], object], size: tuple[float, float]) -> Fig
 
 
 # --------------------------------------------------------------------------------
-# Pictures with something drawn into them, boxes and masks of what is true and what is
-# said; or several on a sheet.
+# Images with boxes and masks of the ground truth and of predictions, and sheets of
+# several images.
 
 Floats = npt.NDArray[np.float32]
 TRUE_COLOR = (0, 190, 255)
 PREDICTED_COLOR = (255, 110, 0)
-"""Colours of what is true and of what the model says; told apart in any kind of colour
-vision.
+"""Colors of the ground truth and of predictions, which people with any type of color
+blindness can distinguish.
 """
-# Pixels of the longest side at least; smaller pictures are magnified, so that text can
-# be read
+# Minimum length of the longest side in pixels. Smaller images are magnified, so that
+# text is readable.
 MIN_IMAGE_SIDE = 512
-# How much of a tint covers a picture; how many letters are as high as its longest side
-TINT = 0.45
-LETTERS_PER_SIDE = 28
+TINT = 0.45  # opacity of a mask over an image
+LETTERS_PER_SIDE = 28  # the longest side divided by the height of a letter
 Box = tuple[float, float, float, float]
-Shape = Any  # What is drawn, a box or the pixels of a mask: `advsearch.tasks.Mark`
+Shape = Any  # a box or a mask to draw: `advsearch.tasks.Mark`
 
 
 def draw_marks(picture: Any, shapes: Sequence[Shape]) -> Floats:
@@ -311,7 +311,7 @@ def draw_marks(picture: Any, shapes: Sequence[Shape]) -> Floats:
 
     Args:
         picture: (H, W, 3), display-referred sRGB in [0, 1]; a small one is magnified.
-        shapes: what is drawn, with coordinates in pixels of `picture`.
+        shapes: shapes to draw, with coordinates in pixels of `picture`.
 
     Returns:
         The drawing (h, w, 3), float32 in [0, 1].
@@ -391,6 +391,7 @@ def _draw_boxes(
         draw.rectangle(
             corners, outline=TRUE_COLOR if shape.true else PREDICTED_COLOR, width=2
         )
+    # Boxes of the texts that were written so far, which the next text must not cover.
     text_boxes: list[tuple[int, int, int, int]] = []
     for shape, corners in boxes:
         text_box = _write_label(draw, shape, corners, image.size, font, text_boxes)
@@ -530,11 +531,12 @@ def _find_free_height(
     return next(filter(is_free, nearest_first), preferred_y)
 
 
-GAP = 8  # Pixels between tiles, and of a line of text
+# In pixels: the gap between tiles, and the heights of a line of text and of its font.
+GAP = 8
 LINE = 15
 FONT = 12
-# Pixels that a tile is wide at least, so that its text can be read; smaller pictures
-# are magnified
+# Minimum width of a tile in pixels, so that its text is readable. Smaller images are
+# magnified.
 MIN_TILE_WIDTH = 160
 
 

@@ -1,8 +1,8 @@
-"""Pictures as PDF sheets in true millimetres, to print, cut out and stick on.
+"""Write pictures to PDF sheets at their real size, to print, cut out and glue on.
 
-A first page has a square and a ruler to measure, and says what follows. Then come the
-pieces, each at its own size with bleed around it and marks where it is cut; one that is
-larger than a page goes on as many as it takes.
+The first page has instructions, and a square and a ruler to check the scale of the
+printer. The pieces follow, with bleed around them and marks where to cut. A piece that
+is larger than a page is cut into parts.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ Mask = npt.NDArray[np.bool_]
 INCH = 25.4
 # Width and height in millimetres
 PAPERS = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
-MARGIN = 15.0  # White around what is printed, and more below for the ruler, millimetres
-FOOT = 20.0
-SQUARE = 50.0  # Side of the square that is measured with a ruler, millimetres
-RULER = 100.0
-# Length of a mark where to cut, and its distance from the bleed, millimetres
-MARK_LENGTH = 5.0
-MARK_GAP = 1.0
-DEFAULT_MAX_SHEETS = 200  # Sheets that are written unless more are asked for
+# All lengths are in millimetres.
+MARGIN = 15.0  # width of the margins of a page
+FOOT = 20.0  # additional margin at the bottom, for the ruler
+SQUARE = 50.0  # side of the square that the user measures
+RULER = 100.0  # length of the ruler
+MARK_LENGTH = 5.0  # length of a mark where to cut
+MARK_GAP = 1.0  # distance of a mark from the bleed
+DEFAULT_MAX_SHEETS = 200  # default maximum number of sheets
 MAX_SHEETS = 10_000
 CHECKLIST = (
     "\u2610 Print all pages, and measure the square.",
@@ -51,17 +51,22 @@ CHECKLIST = (
     "\u2610 Compare: advsearch show, and advsearch report, say how often photographs "
     "and renderings agree.",
 )
-"""What is to be done, to tick off."""
+"""A checklist for the user."""
 MAX_PROFILE_BYTES = 16 << 20
-MAX_LISTED_PIECES = 30  # Pieces that the first page lists
+MAX_LISTED_PIECES = 30  # maximum number of pieces in the list on the first page
 
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """A picture with a name that is printed beside it: (h, w, 3) uint8 sRGB, with
-    `bleed` pixels on each side, in columns and in rows. Width and height of one pixel
-    are in millimetres; `inside` (h, w) is what is cut out, where it is less than the
-    rectangle within the bleed.
+    """A picture to print and cut out.
+
+    Attributes:
+        name: name that is printed next to it.
+        picture: (h, w, 3) uint8 sRGB, with the bleed.
+        pixel: (width, height) of a pixel in millimetres.
+        bleed: (columns, rows) of pixels beyond the line to cut, on each side.
+        inside: (h, w) bool, the part to cut out; None for the rectangle within the
+            bleed.
     """
 
     name: str
@@ -79,7 +84,7 @@ class Piece:
 
     @property
     def frame(self) -> tuple[float, float]:
-        """Bleed and marks on each side, millimetres: across and down."""
+        """Width of bleed and marks on each side, in millimetres: (x, y)."""
         return self.bleed[0] * self.pixel[0] + MARK_GAP + MARK_LENGTH, self.bleed[
             1
         ] * self.pixel[1] + MARK_GAP + MARK_LENGTH
@@ -87,11 +92,15 @@ class Piece:
 
 @dataclass(frozen=True, eq=False)
 class PlacedPart:
-    """A part of a piece on a page, with the name that is printed beside it.
+    """A part of a piece on a page.
 
-    Trim: first and last column and row of the part within the piece's picture,
-    half-open: x0, x1, y0, y1. Its left and upper edge are at x and y on the page,
-    millimetres from the upper left corner.
+    Attributes:
+        piece: the piece.
+        name: name that is printed next to the part.
+        trim: columns and rows of the part in the picture of the piece: (x0, x1, y0,
+            y1), of which x1 and y1 are excluded.
+        x: position of its left edge on the page in millimetres.
+        y: position of its upper edge.
     """
 
     piece: Piece
@@ -102,7 +111,7 @@ class PlacedPart:
 
     @property
     def extent(self) -> tuple[float, float]:
-        """Width and height that it takes with bleed and marks, millimetres."""
+        """Width and height with bleed and marks, in millimetres."""
         (x0, x1, y0, y1) = self.trim
         frame = self.piece.frame
         pixel = self.piece.pixel
@@ -126,8 +135,8 @@ def write_sheets(
 
     Args:
         path: path of the PDF.
-        pieces: what is printed, at least one.
-        title: title of the whole.
+        pieces: pieces to print, at least one.
+        title: title of the document.
         paper: a name in `PAPERS`.
         profile: the ICC profile of an RGB printer, to which colours are converted; None
             leaves them sRGB.
@@ -150,10 +159,9 @@ def write_sheets(
     pages = list(arrange_pages(pieces, PAPERS[paper]))
     if len(pages) > max_sheets:
         raise InputError(
-            f"sheets: it takes {len(pages)} sheets of {paper}, and up to {max_sheets} are "
-            "written; say that so many are "
-            f"wanted (`sheets={len(pages)}`), or give a larger `paper` or a smaller "
-            "`size`"
+            f"sheets: it takes {len(pages)} sheets of {paper}, but at most "
+            f"{max_sheets} are written; raise the limit (`sheets={len(pages)}`), or "
+            "use a larger `paper` or a smaller `size`"
         )
     with PdfPages(path, metadata={"Title": title, "CreationDate": None}) as file:
         file.savefig(_make_cover(pieces, title, PAPERS[paper], len(pages), profile))
@@ -243,9 +251,11 @@ def arrange_pages(
             x = 0.0
             y = 0.0
             row_height = 0.0
-        # a part is placed by its trimmed corner, inside its bleed and marks
-        frame = part.piece.frame
-        page.append(replace(part, x=MARGIN + x + frame[0], y=MARGIN + y + frame[1]))
+        # The position of a part is that of its corner inside of bleed and marks.
+        frame_width, frame_height = part.piece.frame
+        page.append(
+            replace(part, x=MARGIN + x + frame_width, y=MARGIN + y + frame_height)
+        )
         x = x + part_width
         row_height = max(row_height, part_height)
     if page:
@@ -258,7 +268,7 @@ def _cut_piece(piece: Piece, width: float, height: float) -> Iterator[PlacedPart
     Cuts lie between pixels. The parts have no position on a page yet.
 
     Args:
-        piece: what is printed.
+        piece: piece to print.
         width: width of a page inside its margins, millimetres.
         height: height of a page inside its margins, millimetres.
 
@@ -461,7 +471,7 @@ def _draw_cut_marks(
 
 
 def _draw_cut_line(axes: Axes, part: PlacedPart, inside: Mask) -> None:
-    """Draw the outline of what is cut out of a part.
+    """Draw the outline along which a part is cut out.
 
     Args:
         axes: axes of the page, in millimetres.

@@ -1,20 +1,21 @@
-"""What a person is shown of a result: said once, and set as text, as a page and in a
-notebook by whoever shows it.
+"""Views of results: the sentences, tables and charts that a user sees of a result.
 
-A question has `get_view(result)` in its `result`; of one that has not, the fields of its
-result are shown as they are called and described. All rules of wording claims are here
-too: sentences that a run stands for, and no more than that.
-A claim is one of four kinds:
+A view is made once, and then displayed as text in a terminal, as an HTML page, or in a
+notebook. An experiment has a function `get_view(result)`; without it, the fields of the
+result are displayed with their names and descriptions.
 
-- `found`: the search ended as `found` and fresh renders confirm it. It says that such a
-configuration exists.
-- `not found`: the search ran to its end and its best configuration was rendered afresh.
-  It says how many renders of which policy found none, and that this shows no absence.
-- `measured`: a share that was counted to the end, with its interval and what was
-counted.
-- `nothing claimed`: everything else: interrupted, wrong already, not verified, broken
-  off, of an unknown ending, or a run that says nothing about how often a model is
-  right.
+This module also words claims: sentences that the evidence of a run supports, without
+exaggeration. There are four kinds:
+
+- `found`: the search found an adversarial scene, and new renders confirm it. The claim
+  is that such a configuration exists.
+- `not found`: the search ran to its end, and its best configuration was rendered again.
+  The claim is that a number of renders of a policy found none; this does not prove that
+  there is none.
+- `measured`: a fraction of a complete count, with its confidence interval.
+- `nothing claimed`: everything else, such as a run that was interrupted or not
+  verified, a clean scene about which the model is wrong already, an unknown status, or
+  a run that does not measure how often a model is right.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MAX_UNFOLDED_ROWS = 24  # Rows of a table of fields above which it is folded
+MAX_UNFOLDED_ROWS = 24  # maximum number of rows of a table that is not folded
 _FIELDS_ELSEWHERE = (
     *(
         "run",
@@ -76,18 +77,16 @@ _FIELDS_ELSEWHERE = (
     *("command_line", "python_only"),
     *("figures", "model", "renders", "seed"),
 )
-"""Fields that stand in the heading or below, or nowhere."""
+"""Fields that are displayed in the heading or at the end, or not at all."""
 Column = str | Callable[[Any], str]
-"""How a cell is made of a row, which is called `0`: ``{0.seconds:.2f}``, or a
-function.
+"""How a cell is made from a row: a format, in which the row is `0`, such as
+``{0.seconds:.2f}``; or a function of the row.
 """
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture in the folder of the run, and what is said of it, behind a name if it
-    has one.
-    """
+    """A picture in the folder of the run, with a caption, after a name if it has one."""
 
     file: str
     caption: str
@@ -96,33 +95,33 @@ class Picture:
 
 @dataclass(frozen=True)
 class ResultPart:
-    """A part of a result; what is empty is left out.
+    """A part of the view of a result. Empty attributes are not displayed.
 
     Attributes:
         title: title of the part.
         text: paragraphs.
         heads: heads of the columns.
-        rows: texts, the first of which is the row's name.
-        note: how the table is to be read, for a page.
-        figure: file of a figure of the numbers in the run's folder, for a page.
-        pictures: groups, each of which stands side by side.
-        draw: draws a chart of the numbers on matplotlib's axes, for a page; `title` and
-            `text` say what is on it.
-        height: height of the chart, CSS pixels.
-        size: size of the figure that is kept of it, width and height in inches; None:
-            as high as the chart.
-        parts: the run among the parts that each row is of.
-        shares: shares in [0, 1], by row and column: the larger, the stronger the colour
-            of the cell.
-        bars: drawn beside each row on a page, decoration: from, to and a mark, in [0,
-            1]; None for no bar.
-        layout: layout of the pictures on a page: `pair`, `small`, `large`, `rows`, or
-            as many as they are.
-        live: name of what a script of the page fills; without the script the part is
-            hidden.
-        folded: whether a page shows it only when asked to.
-        only: `page`, `text` or `notebook`, the only one that shows it; empty if all
-            three do.
+        rows: rows of the table as texts, the first of which is the name of the row.
+        note: explanation of the table, for a page.
+        figure: file of a figure in the folder of the run, for a page.
+        pictures: groups of pictures; those of a group are displayed side by side.
+        draw: function that draws a chart on axes of matplotlib, for a page; `title` and
+            `text` describe it.
+        height: height of the chart in CSS pixels.
+        size: (width, height) in inches of the figure file of the chart; None to use the
+            height of the chart.
+        parts: for each row, the name of its run among the parts of the run.
+        shares: fractions in [0, 1], by row and column. The larger one is, the stronger
+            is the color of the cell.
+        bars: for each row a bar on a page, as (begin, end, mark) in [0, 1]; None for no
+            bar.
+        layout: layout of the pictures on a page: `pair`, `small`, `large` or `rows`;
+            empty to choose it by their number.
+        live: name of the part for the script of the page that fills it. Without the
+            script the part is hidden.
+        folded: whether a page displays it only on request.
+        only: `page`, `text` or `notebook` if only this one displays the part; empty for
+            all three.
     """
 
     title: str = ""
@@ -178,12 +177,19 @@ class ResultPart:
 
 @dataclass(frozen=True)
 class ShownResult:
-    """A result: what a reader should know first, in a sentence or two, the other
-    sections, and by name what it was done with, beside what all questions have
-    (environment, renders, time and seed). Cautions have to be known beside the
-    warnings; `about` is what it is of, in a few names, and empty: the object, the
-    controls and the model. Where `says_interrupted`, `statement` states by itself that an
-    interrupted run was interrupted.
+    """The view of a result.
+
+    Attributes:
+        statement: the main result, in one or two sentences.
+        sections: the other parts.
+        facts: other properties of the run by name, in addition to those of all runs
+            (environment, renders, time and seed).
+        about: names of the subjects of the result; empty for the object, the controls
+            and the model.
+        cautions: sentences to know before the result is used, in addition to the
+            warnings.
+        says_interrupted: whether `statement` itself states that an interrupted run was
+            interrupted.
     """
 
     statement: str
@@ -209,8 +215,8 @@ def takes_twins(command: str) -> bool:
 def list_remarks(result: Result, view: ShownResult) -> list[str]:
     """Return sentences to know before a result is used.
 
-    They are about its state (interrupted or running), about how far it holds for
-    photographs, and the cautions and warnings.
+    They are about its status (interrupted or running) and about how far results on
+    renders hold for photographs (twins), followed by the cautions and warnings.
 
     Args:
         result: the result.
@@ -218,6 +224,7 @@ def list_remarks(result: Result, view: ShownResult) -> list[str]:
     """
     ending = getattr(result, "ending", "")
     remarks = []
+    # otherwise the statement of the view says it
     if ending == INTERRUPTED and not view.says_interrupted:
         remarks.append("Not finished: these are the results so far.")
     if ending == RUNNING:
@@ -231,7 +238,7 @@ def list_remarks(result: Result, view: ShownResult) -> list[str]:
 
 
 def list_subjects(result: Result, view: ShownResult) -> list[str]:
-    """Return what a result is about: its own names, or object, controls and model."""
+    """Return the subjects of a result: its own names, or object, controls and model."""
     if view.about:
         return [*view.about]
     subjects = []
@@ -243,7 +250,7 @@ def list_subjects(result: Result, view: ShownResult) -> list[str]:
 
 
 def collect_facts(result: Result, view: ShownResult) -> dict[str, str]:
-    """Return what a result was made with, as texts by name, such as the seed.
+    """Return properties of a run as texts by name, such as the seed.
 
     Facts of the view come first, and replace common facts of the same name. So a view
     leaves out a common fact by an empty text.
@@ -411,32 +418,35 @@ Kind = Literal["found", "not found", "measured", "nothing claimed"]
 
 
 class Claim(Fields):
-    """One sentence that a run stands for, and no more than that."""
+    """A sentence that is supported by the evidence of a run."""
 
     kind: Kind = Field(
         description="`found`, `not found`, `measured` or `nothing claimed`"
     )
     statement: str
-    extent: Extent | None = Field(description="null where nothing was counted")
+    extent: Extent | None = Field(
+        description="the count behind the claim; null if nothing was counted"
+    )
 
     @classmethod
     def from_case(
         cls, name: str, ending: str, rate: VerifiedRate | None, spent: str | None = None
     ) -> Claim:
-        """Return the claim about one adversarial scene of several.
+        """Return the claim about one adversarial scene of several (`make_case_claim`).
 
         Args:
-            name: what the scene is called.
-            ending: how its search, or its trials, ended.
+            name: name of the scene in the claim.
+            ending: status of its search, or of its trials.
             rate: rate of its trials.
-            spent: what was searched; None for a scene that was only tried again.
+            spent: the effort of the search as text; None for a known scene that was
+                only rendered again.
         """
         return make_case_claim(name, ending, rate, spent)
 
 
 NOTHING_CLAIMED = "Nothing is claimed"
 NO_PROOF = "This does not show that there is none."
-# Endings of a search that ran to its end without finding anything
+# Statuses of a search that ran to its end without finding anything.
 FAILED_SEARCH_ENDINGS = ("budget spent", "stalled")
 
 
@@ -454,12 +464,16 @@ def make_case_claim(
 ) -> Claim:
     """Return the claim about one adversarial scene of many.
 
+    A confirmed scene gives the claim `found`. If the search found none, the claim is
+    `not found`; for a known scene that was only rendered again, and is not confirmed,
+    it is `measured`. Otherwise nothing is claimed.
+
     Args:
-        name: what the scene is called.
-        ending: how its search, or its trials, ended.
-        rate: rate of its trials.
-        spent: what was searched; None where nothing was searched, and a known scene was
-            only tried again.
+        name: name of the scene in the claim.
+        ending: status of its search, or of its trials (verification renders).
+        rate: rate of its trials; None without trials.
+        spent: the effort of the search as text; None for a known scene that was only
+            rendered again.
     """
     extent = make_rate_extent("fresh renders that count as a success", rate)
     reason = REASON_OF_ENDING.get(ending, f"it ended as {ending!r}")
@@ -470,42 +484,46 @@ def make_case_claim(
     if ending == "found" and rate.successes:
         statement = f"{name}: an adversarial scene holds in {rate_text}."
         return claim("found", statement, extent)
-    # Without a search of its own, a scene that fails in its trials shows nothing about
-    # other scenes: then only the rate is claimed.
     found_nothing = ending in FAILED_SEARCH_ENDINGS
-    is_only_tried_again = spent is None
-    if is_only_tried_again and (found_nothing or ending == "not verified"):
+    was_searched = spent is not None
+    if not was_searched and (found_nothing or ending == "not verified"):
+        # Nothing follows about other scenes, so only the rate of this one is claimed.
         statement = f"{name}: the adversarial scene is not confirmed, in {rate_text}."
         return claim("measured", statement, extent)
     if found_nothing:
-        text = (
+        statement = (
             f"{name}: no failure was found; the best configuration counts in "
-            f"{rate_text}."
+            f"{rate_text}. Searched were {spent}. {NO_PROOF}"
         )
-        return claim("not found", f"{text} Searched were {spent}. {NO_PROOF}", extent)
+        return claim("not found", statement, extent)
     return no_claim
 
 
 def make_average_claim(case: AverageCase, name: str) -> Claim:
-    """Return the claim about the average case of an attack."""
+    """Return the claim about the average case of an attack.
+
+    It is the accuracy in configurations that are sampled at random from those that the
+    search may reach, in contrast to the worst case.
+    """
     what = "configurations in which the model is right"
     extent = Extent.from_count(
         what, case.correct, case.configurations, case.interval, counts_right=True
     )
-    text = (
+    statement = (
         f"{name}: the model is right in {format_extent(extent)} configurations drawn "
-        "by chance"
+        "by chance from the whole space and budget."
     )
-    return claim("measured", f"{text} from the whole space and budget.", extent)
+    return claim("measured", statement, extent)
 
 
 def format_searches(renders: Mapping[str, int], policy: str, random: bool) -> str:
-    """Return how much was searched: ``24 renders by the policy auto and 24 by random
+    """Return the effort of a search: ``24 renders by the policy auto and 24 by random
     search``.
 
     Args:
-        renders: numbers of renders by purpose; "products" counts images that were
-            predicted instead of rendered.
+        renders: numbers of renders by purpose, such as "search" and "baseline".
+            "products" is the number of images that were predicted by products with a
+            matrix, and not rendered.
         policy: policy of the search.
         random: random search ran too, for comparison.
     """
@@ -549,7 +567,7 @@ _VOID = frozenset({"meta", "img", "br", "hr", "input", "link"})
 
 
 class Html(str):
-    """Markup that is safe to put into a page as it is."""
+    """HTML that may be inserted into a page without escaping."""
 
     __slots__ = ()
 
@@ -585,19 +603,17 @@ def join_html(*parts: str | None) -> Html:
     )
 
 
-DISPLAY_WIDTH = 224  # Width of a picture on the page, in pixels
-GAP = 4  # White between pictures, in pixels
-PIXELS_PER_INCH = 94  # Of a chart's height, to an inch of the figure
-FIGURE_WIDTH = 6.2  # Of a figure, in inches
+DISPLAY_WIDTH = 224  # width of a picture on the page in pixels
+GAP = 4  # gap between pictures in pixels
+PIXELS_PER_INCH = 94  # pixels of a chart's height for an inch of its figure file
+FIGURE_WIDTH = 6.2  # width of a figure file in inches
 
 
 class InNotebook:
-    """What a notebook shows of a result: what its question says of it, as HTML and as a
-    figure; and its table.
-    """
+    """The display of a result in a notebook: its view as HTML, a figure and a table."""
 
     tabular: ClassVar[str] = "table"
-    """The field that is its table."""
+    """The name of the field with the table."""
 
     def plot(self, axes: Any = None) -> Any:
         """Draw the figure of the result and return the matplotlib axes; nothing is
@@ -672,7 +688,7 @@ def make_notebook_html(
 
 def _make_section_html(part: ResultPart) -> Html:
     """Return the texts and the table of a part of a result as HTML."""
-    # the texts of a chart say what is on it, and the chart itself is not here
+    # the texts of a chart describe it, and the chart itself is not displayed here
     texts = part.text if part.draw is None else ()
     children = [make_element("p", text) for text in texts if text]
     if part.rows:
@@ -722,9 +738,9 @@ def _make_image(png: bytes, width: int, alt: str) -> Html:
 CHART_HEIGHT = 300
 WIDE_WIDTH = 720
 NARROW_WIDTH = 350
-"""Height and widths of a chart in CSS pixels: for a screen, and for a phone, which
-would shrink the letters of the wide one until nobody can read them. The style sheet
-shows one of them.
+"""Height and widths of a chart in CSS pixels. A page has a wide chart for a screen and
+a narrow one for a phone, on which the letters of the wide one would be too small. The
+style sheet displays one of them.
 """
 COLORS = {
     "search": "#010101",
@@ -732,8 +748,10 @@ COLORS = {
     "soft": "#030303",
     "line": "#040404",
 }
-"""Variables of the style sheet, and what stands for them while matplotlib draws."""
-# The same of the colours that figures have
+"""Variables of the style sheet for colors. While matplotlib draws, each is represented
+by a color that does not occur otherwise; it is replaced in the SVG.
+"""
+# Variables that replace the usual colors of figures.
 FIGURE_COLORS = {"search": BLUE, "baseline": RED, "soft": GREY}
 STYLE: dict[Any, Any] = {
     "font.size": 13.0,
@@ -771,7 +789,7 @@ def make_chart_svg(
     above the chart, in the color of the page's text.
 
     Args:
-        draw: draws on the axes that it is given.
+        draw: function that draws on axes of matplotlib.
         description: the text for readers who cannot see the chart.
         width: width in CSS pixels.
         height: height in CSS pixels.
@@ -798,7 +816,7 @@ def make_chart_svg(
     return make_element(
         "svg",
         make_element("title", description),
-        # the width tells the ids of two charts on a page apart
+        # with the width, the ids of two charts on a page differ
         _make_inline_svg(files["svg"].decode("utf-8"), prefix=f"{width}-"),
         viewBox=f"0 0 {width} {height}",
         class_="chart wide" if width == WIDE_WIDTH else "chart narrow",
@@ -808,26 +826,31 @@ def make_chart_svg(
 
 
 def _make_inline_svg(svg: str, prefix: str) -> Html:
-    """Return the shapes of an SVG file, made small and fit to stand in a page.
+    """Return the shapes of an SVG file as small markup to insert into a page.
 
-    The head of the file, clipping frames (everything lies inside the frame anyway),
-    digits of coordinates after the first decimal, and ids that nothing refers to are
-    left out. All other ids get a prefix, so that two charts on one page have no id in
-    common. Fixed colours become variables of the page's style.
+    Left out are the head of the file, clipping paths (everything is inside of them
+    anyway), decimals of coordinates after the first one, and ids without references.
+    All other ids get a prefix, so that two charts on one page have no id in common.
+    Colors become variables of the page's style sheet.
 
     Args:
         svg: content of the file that matplotlib wrote.
         prefix: prefix of the ids.
     """
+    # from the first group of shapes to the end of the file
     shapes = svg[svg.index("<g ") : svg.rindex("</svg>")]
     unneeded_patterns = (
         r"<clipPath.*?</clipPath>",
         r"<!--.*?-->",
         r' clip-path="[^"]*"',
-        r"(?<=\d\.\d)\d+(?=[^<>]*>)",  # digits after the first decimal, in a tag
+        # Digits after the first decimal: they follow "1.2", and are inside of a tag,
+        # since ">" is the next angle bracket.
+        r"(?<=\d\.\d)\d+(?=[^<>]*>)",
     )
     shapes = re.sub("|".join(unneeded_patterns), "", shapes, flags=re.DOTALL)
+    # Only `href` still refers to ids, since the clipping paths are gone.
     referenced_ids = set(re.findall(r'href="#([^"]+)"', shapes))
+    # The ids first, then the references to them, get the prefix.
     shapes = re.sub(
         r' id="([^"]*)"',
         lambda match: f' id="{prefix}{match[1]}"' if match[1] in referenced_ids else "",

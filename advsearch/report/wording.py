@@ -1,6 +1,4 @@
-"""Numbers and results in plain words, and what a task's predictions are called in
-sentences and tables, by its name.
-"""
+"""Format numbers, results and predictions as text for sentences and tables."""
 
 from __future__ import annotations
 
@@ -33,10 +31,12 @@ SEGMENTATION = "segmentation"
 DEPTH = "depth"
 SIMILARITY = "similarity"
 COMMAND = "command"
-"""Tasks whose predictions have words of their own; others are quoted."""
+"""Tasks for whose predictions there are special phrases. Those of other tasks are
+quoted.
+"""
 
 PLAIN_UNITS = ("", "1")
-"""Units that are not written after a value: of what has no unit, and of a plain number."""
+"""Units that are not written after a value."""
 
 _MARGINS = {
     CLASSIFICATION: "how far the right prediction leads the wrong one, in logits",
@@ -68,7 +68,7 @@ _WANTED = {
     "gone": "makes the model judge {} to be as far as what is behind it",
 }
 SUCCESS_ABOVE_ZERO = ("margin", "score", "vanish", *_WANTED)
-"""Objectives that are over 0 exactly where a prediction is what is sought."""
+"""Objectives that are positive exactly if the prediction is a success of the search."""
 
 _UNITS = {
     "logits": ("margin", "log_odds", "pixel_margin"),
@@ -80,37 +80,38 @@ _UNITS = {
     "those of the tasks": ("each",),
 }
 
-MAX_DECIMALS = 4  # Of a percentage
-PROBABILITY_DECIMALS = 1  # Of a probability that a model gives
-LABELS_WITHOUT_ARTICLE = (
-    "background",
-    "itself",
-    "something else",
-)  # Labels without an article
-_OUTCOMES = {
+MAX_DECIMALS = 4  # maximum number of decimals of a percentage
+# Maximum number of decimals of a probability that a model outputs, as a percentage.
+PROBABILITY_DECIMALS = 1
+# Labels of the tasks that get no article in a sentence.
+LABELS_WITHOUT_ARTICLE = ("background", "itself", "something else")
+_OUTCOME_NAMES = {
     Outcome.MISSED: "missed",
     Outcome.LOOSE: "loose",
     Outcome.WRONG_CLASS: "of another class",
     Outcome.PHANTOM: "elsewhere",
 }
-"""What a count of each is called, the usual ones first."""
-_LOOSELY = {DETECTION: "in a loose box", SEGMENTATION: "in part"}
-_DOING = {
+"""Names of wrong outcomes after a count, as in "3 missed", the usual ones first."""
+
+# Names of the outcome `LOOSE` by task.
+_LOOSE_NAMES = {DETECTION: "in a loose box", SEGMENTATION: "in part"}
+
+# Participles of all verbs with which `format_mistake` begins.
+_PARTICIPLES = {
     "calls": "calling",
     "finds": "finding",
     "sees": "seeing",
     "takes": "taking",
     "judges": "judging",
+    "predicts": "predicting",
+    "commands": "commanding",
 }
-_DOING |= {"predicts": "predicting", "commands": "commanding"}
-
-
-# A prediction of a model: `advsearch.tasks.Prediction`, or what a result holds of one
+# A prediction of a model: `advsearch.tasks.Prediction`, or its fields in a result.
 AnyPrediction = Any
 
 
 def percent(fraction: float | None, max_decimals: int = MAX_DECIMALS) -> str:
-    """Return ``83 %`` for 0.83. 100 and 0 are said only of exactly 1 and 0."""
+    """Return ``83 %`` for 0.83. Only exactly 1 and 0 become 100 and 0."""
     return (
         "unknown"
         if fraction is None
@@ -119,13 +120,13 @@ def percent(fraction: float | None, max_decimals: int = MAX_DECIMALS) -> str:
 
 
 def format_percent_number(fraction: float, max_decimals: int = MAX_DECIMALS) -> str:
-    """Return ``83`` for 0.83, ``4.6`` for 0.0459, ``0.02`` for 0.000211 and ``99.98``
-    for 0.99979.
+    """Return a fraction as a percentage without its sign.
 
-    Numbers are rounded to whole percents, except within five percent of 0 or 100. There
-    the text has as many decimals as show a distance from 0 or 100, from 1 to
-    `max_decimals`. A number that would still be rounded to 0 or 100 becomes ``under
-    0.01`` or ``over 99.99``.
+    It is ``83`` for 0.83, ``4.6`` for 0.0459, ``0.02`` for 0.000211, and ``99.98`` for
+    0.99979. Numbers are rounded to whole percents, except within five percent of 0 or
+    100. There the text has as many decimals as are necessary to differ from 0 or 100,
+    but at most `max_decimals`. A number that would still be rounded to 0 or 100 becomes
+    ``under 0.0001`` or ``over 99.9999`` with four decimals.
 
     Args:
         fraction: the fraction, in [0, 1].
@@ -136,10 +137,13 @@ def format_percent_number(fraction: float, max_decimals: int = MAX_DECIMALS) -> 
     distance = min(value, 100.0 - value)  # from 0 or 100
     if distance >= 5.0 or distance <= 0.0:
         return f"{value:.0f}"
-    decimals = min(max(1, -math.floor(math.log10(distance))), max_decimals)
+    # the position of the first decimal of the distance that is not 0
+    first_nonzero_decimal = -math.floor(math.log10(distance))
+    decimals = min(max(1, first_nonzero_decimal), max_decimals)
     text = f"{value:.{decimals}f}".rstrip("0").rstrip(".")
     if text not in ("0", "100"):
         return text
+    # Even with `max_decimals` it was rounded to 0 or 100.
     smallest = 10.0**-decimals
     if text == "0":
         return f"under {smallest:.{decimals}f}"
@@ -165,7 +169,7 @@ def format_fraction_of(
 
 
 def explain_repeats(name: str, repeats: int, units: int) -> str:
-    """Return sentences for a sweep in which nothing is drawn by chance.
+    """Return sentences for a sweep in which nothing is sampled at random.
 
     Then the repeats of a unit (such as a drive) differ in the noise of rendering alone,
     and are no independent predictions.
@@ -195,12 +199,13 @@ def add_article(name: str) -> str:
 
 
 def format_paired_rates(run: str, pair: Any) -> str:
-    """Return, in sentences, how often a model is right without and with an adversarial
-    scene.
+    """Return sentences about how often a model is right in the clean scene and in an
+    adversarial scene.
 
     Args:
-        run: the name of the run that found the scene.
-        pair: its `PairedRates`.
+        run: name of the run that found the adversarial scene.
+        pair: `PairedRates` of the clean scene and the adversarial one (`answer`). Its
+            difference is adversarial minus clean, as a fraction.
     """
     clean, adversarial = (
         f"{arm.correct} of {arm.configurations} ({percent(arm.accuracy)}, 95 % "
@@ -245,7 +250,8 @@ def format_objective(objective: str) -> str:
 def get_objective_name(objective: str) -> str:
     """Return the name of an objective for a reader.
 
-    The objective "margin" is the negative of the margin, and is called "margin loss".
+    Objectives are maximized, and "margin" and "pixel_margin" are negatives of margins.
+    So they are called "margin loss" and "margin loss of the pixels".
     """
     return {"margin": "margin loss", "pixel_margin": "margin loss of the pixels"}.get(
         objective, objective
@@ -259,20 +265,20 @@ def get_marks_legend(task: str) -> str:
 
 
 def format_goal(objective: str, thing: str) -> str:
-    """Return what a search with an objective looks for, as a clause: "makes the model
+    """Return the goal of a search with an objective, as a clause: "makes the model
     miss this mug".
     """
     return _WANTED.get(objective, "makes the model miss {}").format(thing)
 
 
 def format_prediction_cells(task: str, prediction: AnyPrediction) -> list[str]:
-    """Return the two cells of a prediction in a table: what is predicted, and a number.
+    """Return the two cells of a prediction in a table: the label, and a number.
 
     For instance ``["vase", "84 %"]`` and ``["no cup found", "best score of cup
     0.12"]``. The second cell is empty if there is no number.
 
     Args:
-        task: name of the task, which decides what the number is called.
+        task: name of the task, on which the name of the number depends.
         prediction: has the label, the probability and perhaps a payload.
     """
     label = prediction.label
@@ -292,13 +298,17 @@ def format_prediction_cells(task: str, prediction: AnyPrediction) -> list[str]:
 
 
 def _similarity_text(probability: float, payload: Any) -> str:
-    """Return how similar the best reference is, and the rank of the right one.
+    """Return how similar the image is to the best reference, and the rank of the right
+    one.
 
-    The rank is left out if the right reference is the best.
+    With reference images it is the probability of the best name. The rank is left out
+    if the right name is the best. Without them, the image is compared with the clean
+    one, and only the cosine is known.
 
     Args:
         probability: probability of the best reference.
-        payload: what the task stores: "cosine", and "rank" among "references".
+        payload: data that the task stores: "cosine", and with reference images "rank",
+            the rank of the right name among a number of "references".
     """
     text = percent(probability, PROBABILITY_DECIMALS)
     if not isinstance(payload, dict) or "cosine" not in payload:
@@ -317,29 +327,33 @@ def _detection_cells(label: str, score: float, payload: Any) -> list[str]:
     Args:
         label: the predicted label; "no cup" if the detector missed a cup.
         score: score of the box; if the object was missed, the best score of its class.
-        payload: what the task stores of the prediction, such as the overlap "iou".
+        payload: data that the task stores of the prediction, such as the overlap "iou".
     """
     outcome = get_outcome(payload)
-    stated = payload if isinstance(payload, dict) else {}
+    details = payload if isinstance(payload, dict) else {}
     if outcome is Outcome.MISSED:
-        class_name = stated.get("class", "it")
+        class_name = details.get("class", "it")
+        # "no cup found"
         return [f"{label} found", f"best score of {class_name} {score:.2f}"]
-    overlap = stated.get("iou")
+    overlap = details.get("iou")
     if outcome is Outcome.LOOSE and isinstance(overlap, float):
         return [label, f"score {score:.2f}, overlap {overlap:.2f}"]
     return [label, f"score {score:.2f}"]
 
 
 def format_prediction(task: str, prediction: AnyPrediction) -> str:
-    """Return a prediction on one line: ``vase, 91 %``, ``no cup found (best score of
-    cup 0.12)``.
+    """Return a prediction on one line.
+
+    Examples are ``vase, 91 %`` for classification, ``no cup found (best score of cup
+    0.12)`` for detection, and for segmentation ``accuracy over the object's pixels
+    83 %, most often vase``, where "vase" is the most frequent label of these pixels.
 
     Args:
         task: name of the task.
         prediction: has the label, the probability and perhaps a payload.
     """
     label, number = format_prediction_cells(task, prediction)
-    if not number:
+    if not number:  # the model outputs a label only
         return label
     if task == DETECTION:
         return f"{label} ({number})"
@@ -354,15 +368,12 @@ def format_prediction(task: str, prediction: AnyPrediction) -> str:
     return f"{accuracy}, most often {label}"
 
 
-VISIBLE_HEADS = (
-    "seen",
-    "box",
-    "distance",
-)  # Heads of `format_thing_rows`, behind the name
+# Heads of the columns of `format_thing_rows`, after that of the name.
+VISIBLE_HEADS = ("seen", "box", "distance")
 
 
 def format_thing_rows(things: Mapping[str, Any]) -> list[list[str]]:
-    """Return a table of what is visible of each thing: name, visible share, box,
+    """Return a table of the visible objects: name, visible fraction, box,
     distance.
 
     Args:
@@ -383,7 +394,7 @@ def format_thing_rows(things: Mapping[str, Any]) -> list[list[str]]:
 
 
 def format_image_prediction_cells(task: str, prediction: AnyPrediction) -> list[str]:
-    """Return one of the predictions of a whole picture, for a table: ``["cup", "score
+    """Return one of the predictions for a picture, for a table: ``["cup", "score
     0.77"]``, ``["mug", "91 %"]``.
     """
     if prediction.probability is None:
@@ -398,7 +409,7 @@ def format_image_prediction_cells(task: str, prediction: AnyPrediction) -> list[
 
 
 def format_image_prediction(task: str, prediction: AnyPrediction) -> str:
-    """Return one of the predictions of a whole picture on one line: ``cup (score
+    """Return one of the predictions for a picture on one line: ``cup (score
     0.77)``, ``mug 91 %``.
     """
     label, number = format_image_prediction_cells(task, prediction)
@@ -410,14 +421,14 @@ def format_image_prediction(task: str, prediction: AnyPrediction) -> str:
 def format_mistake(
     task: str, thing: str, label: str, outcome: Outcome | None = None
 ) -> str:
-    """Return what a model does wrong with a thing, as a clause: ``calls this mug a
-    vase``, ``finds no cup``.
+    """Return a mistake of a model as a clause: ``calls this mug a vase``, ``finds no
+    cup``.
 
     Args:
         task: task of the model.
-        thing: what it is called in the clause, such as "this mug".
-        label: label that the model predicts.
-        outcome: what became of the thing; None where the task has no outcomes.
+        thing: phrase for the object in the clause, such as "this mug".
+        label: label that the model predicts; "no cup" if the object was missed.
+        outcome: outcome of the prediction; None if the task has no outcomes.
     """
     if label == NOT_A_NUMBER:
         return f"predicts nothing for {thing}, for its output is not a number"
@@ -428,6 +439,8 @@ def format_mistake(
     if outcome is Outcome.LOOSE:
         return f"sees {thing}, but in a loose box"
     if outcome is Outcome.PHANTOM:
+        # the label is "mug elsewhere": "sees a mug elsewhere, and none where this mug
+        # is"
         return f"sees {add_article(label)}, and none where {thing} is"
     if task == CLASSIFICATION:
         return f"calls {thing} {add_article(label)}"
@@ -445,17 +458,18 @@ def format_mistake(
 def format_mistake_participle(
     task: str, label: str, outcome: Outcome | None = None
 ) -> str:
-    """Return what a model does wrong as a participle: ``calling it a vase``.
+    """Return a mistake of a model with a participle: ``calling it a vase``.
 
-    The sentence has named the thing already, so that it is "it" here.
+    The sentence has named the object already, so that it is "it" here.
 
     Args:
         task: task of the model.
         label: label that the model predicts.
-        outcome: what became of the thing, such as missed; None without outcomes.
+        outcome: outcome of the prediction, such as missed; None if the task has none.
     """
     verb, _, rest = format_mistake(task, "it", label, outcome).partition(" ")
-    return f"{_DOING[verb]} {rest.removesuffix(' for it')}"
+    # 'predicts "vase" for it' becomes 'predicting "vase"'
+    return f"{_PARTICIPLES[verb]} {rest.removesuffix(' for it')}"
 
 
 def format_outcomes(outcomes: Mapping[str, int] | None, task: str = "") -> str:
@@ -464,11 +478,11 @@ def format_outcomes(outcomes: Mapping[str, int] | None, task: str = "") -> str:
     Args:
         outcomes: counts by the name of the outcome; None if they are not known, for
             which the text is empty.
-        task: task of the model, which decides what a loose match is called.
+        task: task of the model, on which the name of a loose match depends.
     """
-    names = dict(_OUTCOMES)
-    if task in _LOOSELY:
-        names[Outcome.LOOSE] = _LOOSELY[task]
+    names = dict(_OUTCOME_NAMES)
+    if task in _LOOSE_NAMES:
+        names[Outcome.LOOSE] = _LOOSE_NAMES[task]
     texts = []
     for outcome, name in names.items():
         count = (outcomes or {}).get(outcome.value, 0)
@@ -572,13 +586,17 @@ def format_tally(event: str, number: int, trials: int, not_a_number: int = 0) ->
 
 
 def format_seconds(seconds: Any) -> str:
-    """Return ``14.6 s``, ``3 min 5 s`` or ``2 h 10 min``."""
+    """Return ``14.6 s``, ``3 min 5 s`` or ``2 h 10 min``.
+
+    Up to 100 seconds, and up to 100 minutes, the smaller unit is used alone, as in
+    ``99.0 s`` and ``90 min 0 s``.
+    """
     if seconds is None:
         return "unknown"
     total = round(float(seconds))
-    minutes, rest = divmod(total, 60)
     if total < 100:
         return f"{float(seconds):.1f} s"
+    minutes, rest = divmod(total, 60)
     if minutes < 100:
         return f"{minutes} min {rest} s"
     return f"{minutes // 60} h {minutes % 60} min"
@@ -590,8 +608,10 @@ def format_count(number: Any, thing: str) -> str:
 
 
 def format_workers(shared: SharedWork | None) -> str:
-    """Return how many workers shared the work, and where their time went; empty if one
-    process did all.
+    """Return the number of workers and how they spent their time.
+
+    The text is empty without workers. Times are summed over all workers, so they may
+    exceed the time of the run.
     """
     if shared is None:
         return ""
@@ -612,12 +632,13 @@ def format_workers(shared: SharedWork | None) -> str:
 def format_formation(
     formation: Formation, gains: Mapping[str, float] | None = None
 ) -> str:
-    """Return how images were formed: ``128 x 128 pixels, box filter, denoised (oidn),
-    exposure 0 stops, gain 1.35``.
+    """Return how images were computed: ``128 x 128 pixels, box filter, denoised (oidn),
+    exposure 0 stops, sampler multijitter, gain 1.35``.
 
     Args:
-        formation: the settings of it.
-        gains: gains of several scenes, by their names, where each has its own.
+        formation: settings of the computation.
+        gains: gains by scene, if each scene has its own. A scene is named by its object
+            and environment, as in "mug, studio".
     """
     height, width = formation.resolution
     denoised = "not denoised"
@@ -639,9 +660,7 @@ def format_formation(
 
 
 def format_number(value: Any) -> str:
-    """Return a value as text; a number with the digits that mean something to a
-    reader.
-    """
+    """Return a value as text; a float with four significant digits."""
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
@@ -690,11 +709,14 @@ NO_TWINS = (
 
 
 def format_twin_evidence(evidence: TwinEvidence) -> str:
-    """Return, in a sentence or two, how far a verdict on renders holds for photographs.
+    """Return, in one or two sentences, how far results on renders hold for photographs.
+
+    A twin is a render of the scene in a photograph. So "wrong twins" in the row are
+    renders for which the model is wrong.
 
     Args:
-        evidence: the matching row of a run that compared renders with photographs of
-            the same scene, and how well its object and surroundings match.
+        evidence: the row of a run of twins that is most similar to the run of the
+            result, and whether its object and surroundings are the same.
     """
     name = PurePath(evidence.run).name
     row = evidence.row

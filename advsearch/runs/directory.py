@@ -1,5 +1,5 @@
-"""The run directory: all that a run leaves behind (docs/runs.md), made, locked and
-filled here.
+"""Create, lock and fill run directories, which contain all files of a run
+(docs/runs.md).
 """
 
 from __future__ import annotations
@@ -45,25 +45,29 @@ if TYPE_CHECKING:
     from advsearch.runs.results import Result
     from advsearch.settings import Config
 
-HOME = Path("runs")  # where runs live that are called by name, in the current directory
+# The folder, in the current directory, of runs that are referred to by name.
+HOME = Path("runs")
 
+# Files and folders in the directory of a run.
 REPORT = "report.html"
-# of a sweep that has ended: its rows as columns of numbers
-# (advsearch/viewer/columns.py)
+# The rows of a finished sweep as columns of numbers (advsearch/viewer/columns.py).
 COLUMNS = "columns.bin"
 IMAGES = "images"
-SMALL_PICTURES = f"{IMAGES}/rows"  # of a sweep, in folders of a thousand
-PHOTOGRAPHS = f"{IMAGES}/photos"  # of the real thing, aligned with renderings
+SMALL_PICTURES = f"{IMAGES}/rows"  # images of a sweep, in folders of a thousand
+PHOTOGRAPHS = f"{IMAGES}/photos"  # photographs of the real object, aligned
 ARTIFACTS = "artifacts"
-# what was attacked, before and after, to turn in a browser
+# The attacked object, clean and adversarial, to rotate in a browser.
 OBJECT_FILE = f"{ARTIFACTS}/object.glb"
-AOV_FOLDER = "aov"  # of a sweep: the ground truth of each picture, by its number
-PARTS = "parts"  # runs that a study consists of
+AOV_FOLDER = "aov"  # ground truth of each image of a sweep, by its number
+PARTS = "parts"  # the runs of which a study consists
 
-# the note of parts that no file and no command can name: pairs of role and name
+# The note with the objects of a Python session that no file and no command can name, as
+# pairs of role and name.
 PYTHON_ONLY_NOTE = "only in Python"
-SETTINGS_NOTE = "settings"  # the note of settings that decide the run's numbers
-MAX_VALUE_LENGTH = 40  # characters of a value that an error states
+# The note with the settings on which the numbers of the run depend.
+SETTINGS_NOTE = "settings"
+
+MAX_VALUE_LENGTH = 40  # maximum length of a value in an error
 
 CONTENTS = (
     CONFIG,
@@ -76,18 +80,18 @@ CONTENTS = (
     AOV_FOLDER,
     PARTS,
 )
-"""All that a run writes. `overwrite` removes these and nothing else."""
+"""Everything that a run writes. `overwrite` removes these, and nothing else."""
 
 
 @final
 class RunDirectory:
-    """The directory of one run, locked against other processes until `close`. Make one
-    with `create`.
+    """The directory of a run, which is locked against other processes until `close`.
 
-    Used in a `with` block it is closed at the end; when the block raises before there
-    is any result, the directory of a new run is removed again, so that bad input leaves
-    nothing behind. Where it was removed or renamed meanwhile, the next write or the end
-    of the block is a StorageError.
+    Use `create`, `resume` or `open` to make one, and a `with` block to close it. If the
+    block of a new run raises an error before there is any result, the directory is
+    removed again, so that wrong input leaves nothing behind. If the directory is
+    removed or renamed in the meantime, the next write or the end of the block raises a
+    StorageError.
     """
 
     def __init__(self, path: Path, held: RunLock) -> None:
@@ -113,9 +117,9 @@ class RunDirectory:
         removed from it.
 
         Args:
-            run: a name (kept in ``runs/``) or a path; None takes ``runs/<default>-NNN``
-                with the next free number.
-            config: what the run does; a run without it can't be repeated or resumed.
+            run: a name (for a folder in ``runs/``) or a path; None for
+                ``runs/<default>-NNN`` with the next free number.
+            config: its settings; a run without them cannot be repeated or resumed.
             overwrite: whether the new run may replace another one.
             default: name of a run without a name.
 
@@ -222,6 +226,8 @@ class RunDirectory:
             InputError: another process works on it, or `config` would give other
                 numbers than the run began with.
         """
+        # A run whose directory this process had open may have been removed or renamed;
+        # this error is more helpful than that of `find_run`.
         check_not_moved(locate_run(run))
         path = find_run(run)
         check_links(path)
@@ -245,10 +251,11 @@ class RunDirectory:
         return f"start again with advsearch run {self.path / CONFIG}"
 
     def _note_start(self, config: Config) -> None:
-        """Store what decides the numbers of a new run.
+        """Store everything on which the numbers of a new run depend.
 
-        That is its settings, the versions of packages, digests of files, and which
-        parts were passed as Python objects.
+        These are its settings, the versions of packages, digests of files, and which
+        objects of a Python session it uses. In a new run `check_unchanged` stores its
+        values, since there are no earlier ones with which to compare them.
         """
         if config.python_only_parts:
             self.store.write_note(
@@ -257,7 +264,7 @@ class RunDirectory:
         self.check_unchanged(
             summary.VERSIONS_NOTE, summary.collect_versions(_known_settings(config))
         )
-        # the last note: where it is there, the others are too
+        # This note is the last one: if it exists, the others were stored, too.
         self.check_unchanged(SETTINGS_NOTE, config.get_deciding_settings())
 
     def _check_settings_unchanged(self, config: Config) -> None:
@@ -277,20 +284,21 @@ class RunDirectory:
                 )
             self._note_start(config)
             return
-        # Only files that are read again count. One that the run has copied into its
-        # store, such as a recipe, may have changed since.
-        read_again = {
+        self.check_unchanged(SETTINGS_NOTE, config.get_deciding_settings())
+        # Only files that a resumed run reads again are compared. One that the run has
+        # copied into its store, such as a recipe, may have changed or be missing.
+        settings_of_files = {
             name: value
             for name, value in _known_settings(config).items()
             if name not in summary.NOT_READ_AGAIN
         }
-        self.check_unchanged(SETTINGS_NOTE, config.get_deciding_settings())
+        # versions of packages, and digests of the files that these settings name
         self.check_unchanged(
-            summary.VERSIONS_NOTE, summary.collect_versions(read_again)
+            summary.VERSIONS_NOTE, summary.collect_versions(settings_of_files)
         )
 
     def check_unchanged(self, note: str, facts: Mapping[str, Any]) -> None:
-        """Check that what decides the numbers of a run is as it was when the run began.
+        """Check that facts on which the numbers of a run depend have not changed.
 
         Facts are settings, versions of packages, or digests of files. The first call
         stores them. Later calls compare with the stored ones, and store those that are
@@ -301,7 +309,7 @@ class RunDirectory:
             facts: values by name, such as {"torch": "2.13.0"}.
 
         Raises:
-            InputError: a fact is not what it was when it was stored first; the run
+            InputError: a fact differs from the stored one; the run
                 can't go on.
         """
         stored = self.store.read_json_note(note)
@@ -325,9 +333,10 @@ class RunDirectory:
             self.store.write_note(note, json.dumps({**facts, **before}))
 
     def check_files_unchanged(self, used_settings: Iterable[Mapping[str, Any]]) -> None:
-        """Store the versions of packages and the digests of files that settings name.
+        """Check that the files that settings name are those with which the run began.
 
-        For a resumed run they are compared with the stored ones.
+        Versions of packages are checked, too. In a new run all of these are stored, for
+        later comparison.
 
         Args:
             used_settings: settings by name, of each part of the run.
@@ -349,8 +358,8 @@ class RunDirectory:
 
         Args:
             *rows: one row for each evaluated configuration.
-            cached: what a search needs to be resumed and the last row lacks, such as
-                the gradient; None if there is nothing.
+            cached: data that a search needs to be resumed and the last row lacks, such
+                as the gradient; None if there is nothing.
         """
         self.store.append(rows, cached)
         if self._tracker is not None:
@@ -467,7 +476,7 @@ class RunDirectory:
     ) -> None:
         """Close the directory; after an error, remove it if it is new and empty.
 
-        Without an error it is checked first that nobody moved it meanwhile.
+        Without an error it is checked first that it was not moved in the meantime.
         """
         # A new directory is removed only if the block raised before it stored anything.
         if error is None:
@@ -546,18 +555,18 @@ def check_links(run: Path) -> None:
     Raises:
         FileFormatError: something is a link.
     """
-    check_no_links(run, CONTENTS, SMALL_PICTURES)
+    check_no_links(run, CONTENTS, SMALL_PICTURES)  # the last one is left out
 
 
 def locate_run(run: str | Path) -> Path:
-    """Return where `run` is kept: a bare name in ``runs/``, a path as it is."""
+    """Return the folder of a run: a name becomes ``runs/NAME``, a path is unchanged."""
     path = Path(run)
     is_name = isinstance(run, str) and os.sep not in run and run not in (".", "..")
     return HOME / path if is_name else path.expanduser()
 
 
 def format_run_name(path: str | Path) -> str:
-    """Return what a user types to name the run in a folder.
+    """Return the text by which a user refers to the run in a folder.
 
     It is the name of the folder if that is in ``runs/``, else its path.
     """
@@ -594,7 +603,7 @@ def read_python_only(path: Path) -> list[PythonOnly]:
 
     No file and no command can name them, so that the run cannot be repeated from its
     `run.yaml`. They are noted as pairs of role and name. A pair of another form is left
-    out, as the file may come from somebody else.
+    out, since another person may have written the file.
     """
     if not (path / store.NAME).is_file():
         return []
@@ -688,7 +697,7 @@ def _make_numbered_directory(default: str) -> Path:
             except FileExistsError:
                 continue
             return path
-    raise InputError(f"{HOME}: no number is free for {default}")
+    raise AssertionError("unreachable: `count` does not end")
 
 
 def _clear(path: Path) -> None:

@@ -1,7 +1,9 @@
-"""A run's rows for other programs: as a table (CSV, JSON, Parquet), a line for each,
-with a column for each metric and each value, its unit in the name: ``pose.yaw
-[degrees]``, ``camera.target[0]`` (docs/runs.md); and as folders of 3DB (Leclerc et al.
-2021): `details.log`, a JSON object a line, `class_maps.json`, and
+"""Write the rows of a run for other programs, and read folders of 3DB.
+
+A table (CSV, JSON, Parquet) has a line for each row, and a column for each metric and
+each value. The name of a column contains the unit: ``pose.yaw [degrees]``,
+``camera.target[0]`` (docs/runs.md). A folder of 3DB (Leclerc et al. 2021) contains
+`details.log` with a JSON object in each line, `class_maps.json`, and the images as
 ``images/<id>_rgb.png``.
 """
 
@@ -42,11 +44,10 @@ LEADING_COLUMNS = (
     ),
     *("label", "label_index", "probability", PAYLOAD),
 )
-# columns of the store before and after the values
+# The columns before and after those of metrics and values.
 TRAILING_COLUMNS = ("renders", "machine", "seconds", "time")
-ROWS_PER_GROUP = (
-    8192  # rows of a Parquet row group, and so what is held in memory at once
-)
+# Number of rows in a row group of Parquet, which are in memory at the same time.
+ROWS_PER_GROUP = 8192
 
 
 def write_rows(
@@ -95,7 +96,7 @@ def list_columns(rows: Iterable[Row]) -> list[str]:
     Metrics and values stand between the fixed columns, in the order in which they first
     occur.
     """
-    # the keys of these dictionaries are sets that keep their order
+    # the keys of these dictionaries serve as ordered sets
     metrics = dict[str, None]()
     values = dict[str, None]()
     for row in rows:
@@ -281,8 +282,8 @@ DETAILS = "details.log"
 CLASSES = "class_maps.json"
 IMAGES = "images"
 MAX_LOG_BYTES = 4 << 30
-MAX_LINE_BYTES = 1 << 20  # most bytes of one of its lines
-MAX_CLASSES_BYTES = 16 << 20  # most bytes of a `class_maps.json`
+MAX_LINE_BYTES = 1 << 20  # maximum size of a line of `details.log`
+MAX_CLASSES_BYTES = 16 << 20  # maximum size of `class_maps.json`
 
 
 def read_threedb(folder: Path) -> Iterator[tuple[Row, Path | None]]:

@@ -1,7 +1,6 @@
-"""Exporters: what writes a run in another format, by the word of `advsearch export
---format`.
+"""Exporters, which write a run in the format of `advsearch export --format`.
 
-A package outside adds its own (docs/extending.md).
+Other packages may add exporters (docs/extending.md).
 """
 
 from __future__ import annotations
@@ -18,11 +17,11 @@ from advsearch.runs.files import write_png
 
 
 class Exported(NamedTuple):
-    """What to report of an export.
+    """A report of an export.
 
     Attributes:
-        facts: fields of `advsearch export --json`.
-        text: the same in words.
+        facts: fields of the output of `advsearch export --json`.
+        text: the same as text.
     """
 
     facts: dict[str, object]
@@ -30,15 +29,16 @@ class Exported(NamedTuple):
 
 
 class Exporter(ABC):
-    """Write a run in another format than a table of its rows.
+    """The base class of exporters, for formats other than a table of rows.
 
     Attributes:
-        name: the word of `--format`.
-        writes: what the name after `--out` is of: "a PDF file".
-        example: a command line without `advsearch` in front.
-        suffix: suffix of files that are of this format if no other is requested,
-            without the dot; by default the name.
-        options: flags of `advsearch export` that belong to it: "size".
+        name: name of the format, the value of `--format`.
+        writes: kind of the file or folder that `--out` names, such as "a PDF file".
+        example: example of a command line, without `advsearch`.
+        suffix: suffix of files, without the dot, that are written in this format if
+            `--format` is missing; empty if it is the name.
+        options: flags of `advsearch export` that belong to this format, such as
+            "size".
     """
 
     name: ClassVar[str]
@@ -57,8 +57,8 @@ class Exporter(ABC):
         Args:
             run: the run's name or directory, see `advsearch.runs.directory.find_run`.
             out: the file or directory to write.
-            options: the values of `options`; None where one was not given.
-            progress: is told of long work.
+            options: the values of `options`; None for flags that were not used.
+            progress: object that displays the progress of long work.
 
         Raises:
             AdvsearchError: the run cannot be exported, or `out` cannot be written.
@@ -73,4 +73,4 @@ EXPORTERS: Registry[type[Exporter]] = Registry(
         isinstance(entry, type) and issubclass(entry, Exporter) and entry.name == name
     ),
 )
-"""Every exporter by its word, imported when it is used."""
+"""Every exporter by the name of its format, imported when it is used."""

@@ -1,6 +1,4 @@
-"""The files of a run: `results.sqlite`, its tables and how it is opened, and
-pictures.
-"""
+"""Read and write the files of a run: the database `results.sqlite`, and images."""
 
 from __future__ import annotations
 
@@ -28,11 +26,11 @@ from advsearch.trust.databases import (
 from advsearch.trust.stored_files import open_regular
 from advsearch.trust.writing import replace_file, storage_errors, write_bytes
 
-# in the header of every results.sqlite that is ours: "ADVS"
+# The bytes "ADVS", which are in the header of every results.sqlite of advsearch.
 APPLICATION_ID = 0x41445653
 VERSION = 10
-"""Of the tables; in the header of the file. Files of another version are read by the
-advsearch that wrote them.
+"""Version of the tables, which is in the header of the file. A file of another version
+can only be read by the version of advsearch that wrote it.
 """
 
 SCHEMA = f"""
@@ -110,7 +108,8 @@ def connect_to_write(path: Path) -> sqlite3.Connection:
             # Nothing in the new file can be lost, so that waiting for the disk is
             # not needed.
             db.execute("PRAGMA synchronous = OFF")
-            # before WAL mode, so that it is written into the file itself
+            # The id is set before WAL mode, in which changes are first written to
+            # another file, so that it is in the header from the beginning.
             db.execute(f"PRAGMA application_id = {APPLICATION_ID}")
             db.execute("PRAGMA journal_mode = WAL")
             db.executescript(f"BEGIN; {SCHEMA} COMMIT;")
@@ -159,18 +158,17 @@ Bytes = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.float32]
 
 BAD_PICTURE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
-"""What Pillow raises of a file that is no picture, a damaged one or one that is far too
-large.
-"""
+"""Exceptions of Pillow for a file that is no image, is corrupt, or is far too large."""
 
-DIFFERENCE_GAIN = 5.0
-ANIMATION_BYTES = 3_000_000
-# most frames of an animation; of more, every second, third, ... is shown, and always
-# the last
+DIFFERENCE_GAIN = 5.0  # factor by which an image of differences is amplified
+ANIMATION_BYTES = 3_000_000  # maximum size of an animation
+# Maximum number of frames of an animation. Of more frames some are left out, but never
+# the first and the last one.
 ANIMATION_FRAMES = 60
-# longest side of an animation in pixels; larger pictures are averaged down
+# Longest side of an animation in pixels. Larger images are averaged down.
 ANIMATION_SIDE = 320
-# an animation that is too large gets fewer frames, down to these, then smaller ones
+# An animation that is too large gets fewer frames, until it has at most
+# MIN_ANIMATION_FRAMES; then smaller frames, until a side is below MIN_ANIMATION_SIDE.
 MIN_ANIMATION_FRAMES = 10
 MIN_ANIMATION_SIDE = 16
 _PALETTE_PIXELS = 200_000
@@ -308,8 +306,8 @@ def _write_exr(
 def encode_animation(frames: Sequence[Any]) -> bytes:
     """Return pictures as a GIF that repeats and shows its last frame longer.
 
-    If the GIF is larger than `ANIMATION_BYTES`, it is made again with fewer frames,
-    down to `MIN_ANIMATION_FRAMES`, and then with smaller ones.
+    If the GIF is larger than `ANIMATION_BYTES`, it is made again with fewer frames, as
+    long as there are more than `MIN_ANIMATION_FRAMES`, and then with smaller ones.
 
     Args:
         frames: (H, W, 3) or (H, W) display-referred pictures in [0, 1], of one size.
@@ -329,8 +327,9 @@ def encode_animation(frames: Sequence[Any]) -> bytes:
         if len(data) <= ANIMATION_BYTES or is_minimal:
             return data
         if count > MIN_ANIMATION_FRAMES:
-            # a tenth less, or as many as would fit if all frames were equally large
-            count = min(count * 9 // 10, count * ANIMATION_BYTES // len(data))
+            # a tenth less, or fewer: as many as fit if all frames are equally large
+            fitting_count = count * ANIMATION_BYTES // len(data)
+            count = min(count * 9 // 10, fitting_count)
         else:
             shrink *= 2
 
@@ -346,7 +345,8 @@ def _shrink_images(images: Sequence[Image.Image], shrink: int) -> list[Image.Ima
         shrink: factor by which they are smaller than `ANIMATION_SIDE`.
     """
     longest_side = max(images[0].size)
-    # -(-a // b) is a / b, rounded up
+    # Side of a block in pixels: longest_side * shrink / ANIMATION_SIDE, rounded up by
+    # -(-a // b). It is at least `shrink`, so that small images become smaller, too.
     block = max(shrink, -(-longest_side * shrink // ANIMATION_SIDE))
     width, height = (
         side - side % block if side > block else side for side in images[0].size

@@ -1,4 +1,4 @@
-"""The runs in a folder at a glance."""
+"""List the runs in a folder, with their status and a short result."""
 
 from __future__ import annotations
 
@@ -20,11 +20,22 @@ FAULT = "it cannot be read, which is a fault of advsearch"
 
 @dataclass(frozen=True)
 class ListedRun:
-    """One run in its folder: the command that made it, what the model should recognise,
-    what could change, rows by kind; ``"running"`` where a process works on it,
-    ``"stopped"`` where it can be resumed, else its ending; the result in a few words;
-    whether it has begun, so that it can be resumed; when, seconds since 1970 (UTC), if
-    known; and what is wrong with it, empty where nothing is.
+    """An entry in the list of runs.
+
+    Attributes:
+        name: name of the run, that of its folder.
+        path: path of the folder.
+        command: command that made the run.
+        object: name of the object.
+        controls: names of the controls.
+        rows: number of stored rows.
+        state: "running" if a process works on it, "stopped" if it can be resumed,
+            otherwise the status with which it ended.
+        outcome: the result in a few words.
+        kinds: number of rows by kind.
+        started: whether its settings were stored, so that it can be resumed.
+        when: time of its start in seconds since 1970 (UTC); None if unknown.
+        fault: what is wrong with its files; empty if nothing is.
     """
 
     name: str
@@ -58,10 +69,12 @@ def list_runs(folder: Path) -> list[ListedRun]:
 def is_finished(path: Path) -> bool:
     """Return whether a run has come to its end.
 
-    A run has not if it was interrupted, or killed while its report was written.
+    It has not if it was interrupted, or killed while its report was written.
     """
     if not (path / summary.NAME).is_file() or summary.read_result(path).is_unfinished:
         return False
+    # A run that was killed while its report was written has a result, but can still be
+    # resumed.
     return not files.is_results_database(path / store.NAME) or not can_resume(path)
 
 
@@ -88,12 +101,14 @@ def read_listed_run(path: Path, *, counts: bool = True) -> ListedRun:
     read_paths = [
         path / name for name in (CONFIG, summary.NAME, store.NAME, f"{store.NAME}-wal")
     ]
-    # The cache has, by key, the state of the files when they were read, and the entry.
+    # The cache has, by key, the state of the files (their times and sizes) when they
+    # were read, and the entry. The state has the path as it was passed, too, since the
+    # entry contains it.
     key = (os.path.abspath(path), counts)
     state = (str(path), running, *map(_state, read_paths))
-    is_known = key in _LISTED and _LISTED[key][0] == state
-    gets_rows = running and counts
-    if not is_known or gets_rows:
+    is_cached = key in _LISTED and _LISTED[key][0] == state
+    count_may_change = running and counts
+    if not is_cached or count_may_change:
         faults: list[str] = []
         try:
             check_links(path)
@@ -128,7 +143,9 @@ def _make_damaged_run(path: Path) -> ListedRun:
 
 
 def _state(path: Path) -> object:
-    """Return what changes when a file is written; None if it is missing or empty."""
+    """Return a value that changes when a file is written; None if it is missing or
+    empty.
+    """
     with suppress(OSError):
         file = os.lstat(path)
         if file.st_size:  # who reads leaves an empty log
@@ -165,6 +182,7 @@ def _make_listed_run(
             kinds = results.count_by_kind()
     command = config.get("command") or (result.command if result else "?")
     object_name = config.get("object") or _get_object_names(result)
+    # With readable settings, the command just has no object, and the name is empty.
     if not object_name and not config:
         object_name = "?"
     controls = getattr(result, "controls", ()) or config.get("controls") or ()
@@ -209,7 +227,7 @@ def _find_start_time(path: Path) -> float | None:
 
 @contextmanager
 def _collect_faults(faults: list[str], file: Path) -> Iterator[None]:
-    """Note what is wrong with a file, but not that it is missing."""
+    """Add errors about a file to the faults, but not that it is missing."""
     try:
         yield
     except AdvsearchError as error:

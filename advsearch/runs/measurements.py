@@ -1,5 +1,7 @@
-"""Measurements of a run that may be stopped: each is stored at once under a key, and is
-not made again.
+"""Make the measurements of a run that may be stopped and resumed.
+
+Each measurement is stored under a key as soon as it is made. A resumed run reads it
+back.
 """
 
 from __future__ import annotations
@@ -20,22 +22,22 @@ AnyResult = TypeVar("AnyResult", bound=Result)
 
 
 class OutOfTime(Exception):
-    """The time that measurements may take is over."""
+    """Raised if the time for measurements is up."""
 
 
 class Measurements:
-    """What a run has measured, in its store; measures what is not there, until the time
-    is up.
+    """The measurements in the store of a run; new ones are made until the time is up.
 
-    One measurement is always made, so that a run that is resumed again and again gets
-    on. What is stored is read back before the first one.
+    At least one new measurement is made, so that a run makes progress each time that it
+    is resumed. Stored measurements are read back before.
 
     Attributes:
-        n_new: how many were made since the run was started or resumed.
+        n_new: number of measurements that were made, and not read back.
 
     Args:
         context: `experiment.RunContext` of the run that stores them.
-        seconds: seconds from now on, after which none is begun; None for no limit.
+        seconds: time from now in seconds, after which no measurement is started; None
+            for no limit.
     """
 
     def __init__(self, context: Any, seconds: float | None = None) -> None:
@@ -49,7 +51,7 @@ class Measurements:
 
         Args:
             key: key of the measurement in the store of the run.
-            measure: measures it; what it returns must have a JSON form.
+            measure: function that measures it and returns a value with a JSON form.
 
         Raises:
             OutOfTime: it would have to be measured, the time is up, and something was
@@ -57,6 +59,8 @@ class Measurements:
         """
         stored = self.read(key)
         if stored is None:
+            # The first one is always made, or a run with too little time would make no
+            # progress however often it is resumed.
             if self.n_new and time.monotonic() >= self._end:
                 raise OutOfTime
             self.n_new += 1
@@ -124,13 +128,14 @@ class Measurements:
         """
         context = self._context
         collected_rows: list[Row] = []
-        # replaced below if the rows end, or the time is up
+        # The status of the summaries that are written inside of the loop. It is
+        # replaced when the rows end, or the time is up.
         context.ending = INTERRUPTED
         try:
             with interruptible():
                 for row in rows:
                     collected_rows.append(row)
-                    if self.n_new:
+                    if self.n_new:  # otherwise the row was read back
                         context.run.write_summary(make_result(collected_rows))
                 context.ending = "done"
         except KeyboardInterrupt:
@@ -138,7 +143,8 @@ class Measurements:
         except OutOfTime:
             context.ending = OUT_OF_TIME
         result = make_result(collected_rows)
-        # without a new row, not all stored ones may have been read
+        # Stored rows come first. If the user interrupted before any new row, some
+        # stored rows may not have been read, and the earlier result may have more rows.
         may_lack_stored_rows = context.ending == INTERRUPTED and not self.n_new
         if may_lack_stored_rows and (context.run.path / NAME).is_file():
             earlier = read_stored_result(context.run.path)

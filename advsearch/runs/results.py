@@ -1,8 +1,7 @@
-"""What every result is made of: named fields, checked when they are put in, written as
-JSON and read back.
+"""Base classes of results, and parts of results that several experiments share.
 
-And what several questions end with: studies, how derivatives are obtained, how long
-light paths are, pictures.
+A result has named fields, which are validated, written as JSON and read back. Shared
+parts are about studies, derivatives, the length of light paths and images, for example.
 """
 
 from __future__ import annotations
@@ -33,19 +32,21 @@ if TYPE_CHECKING:
 
 
 SCHEMA = 2  # version of the fields of results
-INTERRUPTED = "interrupted"  # endings of a run that can go on
+# Statuses (`ending`) of a run that can be resumed.
+INTERRUPTED = "interrupted"
 OUT_OF_TIME = "out of time"
-# how a result stands that is read while a process works on its run; none is kept so
+# Status of a result that is read while a process works on its run. It is never stored.
 RUNNING = "running"
-# fields that are written last, in this order
+# Fields that are written after all others, in this order.
 LAST_FIELDS = ("warnings", "seconds", "seed", "command_line")
 
 JsonFloat = Annotated[
     float, BeforeValidator(lambda value: math.nan if value is None else value)
 ]
-"""A number that may be NaN or infinite: null in JSON, which is read as NaN."""
+"""A number that may be NaN or infinite. In JSON it is null then, which is read as NaN.
+"""
 
-Interval = tuple[JsonFloat, JsonFloat]  # both ends of a 95 % interval
+Interval = tuple[JsonFloat, JsonFloat]  # lower and upper bound of a 95 % interval
 
 
 def key_validator(*names: str) -> AfterValidator:
@@ -61,46 +62,52 @@ def key_validator(*names: str) -> AfterValidator:
 
 
 def as_fact(form: str = "{}") -> dict[str, JsonValue]:
-    """Return the `json_schema_extra` of a field that terminal, page and notebook show
-    under its name, as in
+    """Return the `json_schema_extra` of a field that terminal, page and notebook
+    display with its name.
 
-        speed: float | None = optional("pictures a second",
+    An example is
+
+        speed: float | None = optional_field("pictures a second",
             json_schema_extra=as_fact("{:.3g}"))
 
     Args:
-        form: how its value becomes a text.
+        form: format of its value as text, for `str.format`.
     """
     return {"fact": form}
 
 
 def optional_field(description: str, **more: Any) -> Any:
-    """Return a field that is None, and then left out, by what it is; `more` as for
-    `pydantic.Field`.
+    """Return a field whose default is None, and which is left out of JSON if it is
+    None.
+
+    Args:
+        description: description of the field.
+        **more: other arguments of `pydantic.Field`.
     """
     return Field(default=None, description=description, **more)
 
 
 class Fields(BaseModel):
-    """Named fields of a result.
+    """The base class of results and their parts, which have named fields.
 
-    A field without a default is always there, if need be as null. One with a default is
-    left out where it has it: it belongs to what was not asked for. Fields that a file
-    has and the class has not are passed over.
+    In JSON, a field without a default is always present, perhaps as null. A field with
+    a default is left out if it has that value: then it belongs to something that was
+    not requested. Unknown fields in a file are ignored.
     """
 
     model_config = ConfigDict(frozen=True, from_attributes=True, populate_by_name=True)
 
     @classmethod
     def from_values(cls, source: object) -> Self:
-        """Return the fields with the values that the attributes, or the keys, of
-        something have.
+        """Return an instance with the values of an object's attributes, or of a
+        mapping.
         """
         return cls.model_validate(source)
 
     @classmethod
     def described(cls) -> dict[str, FieldInfo | ComputedFieldInfo]:
-        """Return the fields by name, and behind them those that are computed from
-        others (`computed_field`).
+        """Return the fields by name, and after them those that are computed from others
+        (`computed_field`).
         """
         return {**cls.model_fields, **cls.model_computed_fields}
 
@@ -142,72 +149,80 @@ class Result(Fields):
 
     @property
     def is_unfinished(self) -> bool:
-        """Whether it has not come to its end: it is running, or was stopped and can be
-        resumed.
+        """Whether the run has not come to its end: it is running, or was stopped and
+        can be resumed.
         """
         return getattr(self, "ending", None) in (INTERRUPTED, OUT_OF_TIME, RUNNING)
 
     @property
     def brief(self) -> str:
-        """What came out, in a few words; empty where there are none."""
+        """The result in a few words; empty if the class has no such text."""
         return ""
 
 
 class Estimate(Fields):
-    """An estimated number with its interval."""
+    """An estimate with its confidence interval."""
 
     value: JsonFloat
-    interval: Interval | None = Field(description="95 %; null where there is none")
+    interval: Interval | None = Field(
+        description="95 % confidence interval; null if there is none"
+    )
 
 
 IN_PHOTOGRAPH = "twin in the photograph"
-"""Surroundings of twins that are composed over their photographs."""
+"""Surroundings of twins (renders) that are composed over their photographs."""
 WITHOUT_OBJECT = "photograph without the object"
-"""Surroundings of the control without a twin."""
+"""Surroundings of the comparison with photographs without the object, as a control."""
 
 
 class TwinAgreement(Fields):
-    """How far the predictions of renders hold for photographs of the same views.
+    """How well predictions for renders agree with those for photographs.
 
-    A twin is the render of an object as a photograph shows it.
+    A twin is a render of an object in the pose in which a photograph shows it.
     """
 
     model: str
     task: str
     surroundings: str = Field(
-        description="what is around the object in the twins: "
+        description="surroundings of the object in the twins: "
         "`twin in the photograph`, the name of an environment, or, as a control, "
         "`photograph without the object`"
     )
-    object: str = Field(description="empty: all of them")
-    condition: str = Field(description="of the photographs; empty: all of them")
-    pairs: int = Field(description="photographs with a twin")
-    frames: int = Field(description="independent frames or scenes that they are of")
+    object: str = Field(description="name of the object; empty for all objects")
+    condition: str = Field(
+        description="condition of the photographs; empty for all photographs"
+    )
+    pairs: int = Field(description="number of photographs with a twin")
+    frames: int = Field(
+        description="number of independent frames or scenes that the photographs show"
+    )
     wrong_photos: int
     wrong_twins: int
     both_wrong: int
     photo_right: Estimate
     twin_right: Estimate
-    agreement: Estimate = Field(description="both right, or both wrong")
+    agreement: Estimate = Field(
+        description="rate of pairs in which both are right, or both are wrong"
+    )
     kappa: Estimate | None = Field(
-        description="Cohen's, of right and wrong; null where too few are wrong"
+        description="Cohen's kappa of right and wrong; null if too few are wrong"
     )
     margins: Estimate | None = Field(
-        description="Spearman's correlation of the margins; null where it has none"
+        description="Spearman's correlation of the margins; null if it is undefined"
     )
     boxes: Estimate | None = optional_field(
-        "rate of boxes of the right class that overlap by half in photograph and twin, "
-        "of pairs that have one in both; absent without"
+        "rate of pairs whose boxes of the right class overlap by half, of all pairs "
+        "with such a box in both; absent if there are none"
     )
     photo_wrong: Estimate = Field(description="rate of wrong photographs")
     wrong_where_twin_wrong: Estimate | None = Field(
-        description="rate of wrong photographs where the twin is wrong; null where "
-        "too few twins are wrong"
+        description="rate of wrong photographs if the twin is wrong; null if too few "
+        "twins are wrong"
     )
 
 
 class TwinMatch(enum.Enum):
-    """Whether a run of twins measured what a verdict is about."""
+    """Whether a run of twins has a measurement for the model and task of a run."""
 
     MEASURED = "measured"
     OTHER_MODEL = "other model"
@@ -216,43 +231,47 @@ class TwinMatch(enum.Enum):
 
 
 class TwinEvidence(Fields):
-    """What a run of twins measured for the conditions nearest to those of a run."""
+    """The measurement of a run of twins for conditions most similar to those of a run."""
 
     run: str = Field(description="the run of twins")
     match: TwinMatch
-    same_object: bool = Field(description="the row is of the object of this run")
-    same_surroundings: bool = Field(
-        description="the twins had the surroundings of this run"
+    same_object: bool = Field(
+        description="whether the measurement is about the object of this run"
     )
-    row: TwinAgreement | None = Field(description="null where nothing was measured")
+    same_surroundings: bool = Field(
+        description="whether the twins had the surroundings of this run"
+    )
+    row: TwinAgreement | None = Field(
+        description="the measurement; null if there is none"
+    )
 
 
 class RunResult(Result):
-    """The result of a command that keeps a run."""
+    """The result of a command that stores a run."""
 
-    run: str | None = Field(description="the folder; null if nothing was kept")
+    run: str | None = Field(description="folder of the run; null if it was not stored")
     environment: str
     controls: list[str]
-    ending: str = Field(description="how it ended")
+    ending: str = Field(description="status with which the run ended")
     seconds: Annotated[dict[str, JsonFloat], key_validator("total")] = Field(
-        description="by part of the work, and in `total`"
+        description="seconds by part of the work, and in `total`"
     )
-    seed: int = Field(description="the root seed")
+    seed: int = Field(description="root seed")
     command_line: str | None = Field(
-        description="the command that asks the same again; null where none does"
+        description="command that repeats the run; null if no command does"
     )
     python_only: list[str] = Field(
         default=[],
-        description="parts that existed only in Python, so that no command "
-        "asks the same; absent without",
+        description="objects that existed only in Python, so that no command repeats "
+        "the run; absent if there are none",
     )
     twins: TwinEvidence | None = optional_field(
-        "how far verdicts hold for photographs, by the run of twins that was named; "
-        "absent without"
+        "how well results on renders hold for photographs, by the run of twins in the "
+        "settings; absent without such a run"
     )
 
     def to_dict(self) -> JsonObject:
-        """Return the fields as JSON values, what a reader looks for first in front."""
+        """Return the fields as JSON values, the most important ones first."""
         values = super().to_dict()
         for name in LAST_FIELDS:
             if name in values:
@@ -261,13 +280,15 @@ class RunResult(Result):
 
 
 Payload = Annotated[JsonValue, BeforeValidator(lambda value: to_json_value(value))]
-"""What a task keeps of a prediction beside its words."""
+"""Data of a prediction that a task stores in addition to its label, such as boxes."""
 
 Outcomes = dict[str, int] | None
-"""How often each of `options.Outcome` came about, by its value."""
+"""Counts of each `options.Outcome`, by its value."""
 
-OUTCOME_TEXT = "[what becomes of the object](tasks.md#what-becomes-of-the-object)"
-ONLY_OF_BOXES = "absent but for detection and segmentation"
+OUTCOME_TEXT = (
+    "counts of [what becomes of the object](tasks.md#what-becomes-of-the-object)"
+)
+ONLY_OF_BOXES = "absent for tasks other than detection and segmentation"
 
 
 class SceneResult(RunResult):
@@ -275,59 +296,61 @@ class SceneResult(RunResult):
 
     object: str
     model: str
-    task: str = Field(description="what judges the predictions")
+    task: str = Field(description="task by which predictions are evaluated")
 
 
 class MovedValue(Fields):
-    """A value of the scene that a control leaves out, so that the clean scene has
-    another.
+    """A value of the scene outside of the range of its control, so that the clean scene
+    has another value.
     """
 
     parameter: str
     unit: str
-    scene: float | str = Field(description="the value of the scene as it was described")
-    used: float | str = Field(description="the value that the clean scene has instead")
+    scene: float | str = Field(description="value in the description of the scene")
+    used: float | str = Field(description="value in the clean scene")
 
 
 class VariedValue(Fields):
-    """What a value was drawn from by chance."""
+    """The range or the names from which a value was sampled at random."""
 
     unit: str
-    low: float | None = optional_field("the least; absent of names")
-    high: float | None = optional_field("the most; absent of names")
+    low: float | None = optional_field("lower bound; absent for names")
+    high: float | None = optional_field("upper bound; absent for names")
     names: list[str] | None = optional_field(
-        "of which one was drawn; absent of numbers"
+        "names of which one was sampled; absent for numbers"
     )
 
 
 class CleanScene(Fields):
-    """The scene that a search starts from."""
+    """The scene from which a search starts."""
 
-    moved: list[MovedValue] = Field(description="the values that had to move")
+    moved: list[MovedValue] = Field(
+        description="values that differ from those of the described scene"
+    )
 
 
 class Formation(Fields):
-    """How radiance became pictures."""
+    """How images are computed from rendered radiance."""
 
     denoiser: str
     filter: str = Field(description="reconstruction filter of pixels")
     sampler: str = Field(description="sampler of pixels")
-    exposure: float = Field(description="stops over the metered one")
-    resolution: tuple[int, int] = Field(description="[height, width], pixels")
+    exposure: float = Field(description="stops above the metered exposure")
+    resolution: tuple[int, int] = Field(description="[height, width] in pixels")
     gain: float | None = Field(
-        description="from radiance to display-linear values; null where scenes have "
-        "gains of their own"
+        description="factor from radiance to display-linear values; null if each scene "
+        "has its own"
     )
 
 
 def to_json_value(value: Any) -> Any:
-    """Return `value` with everything in it turned into what JSON has.
+    """Convert a value, with everything inside of it, to types that JSON has.
 
-    Numbers and arrays of numpy and torch become Python's, dataclasses become mappings,
-    NaN and infinity become None.
+    Numbers and arrays of numpy and torch become numbers and lists of Python,
+    dataclasses become mappings, and NaN and infinity become None.
 
     Raises:
-        TypeError: something in it has no JSON form.
+        TypeError: a value inside of it cannot be converted.
     """
     if isinstance(value, enum.Enum):
         return to_json_value(value.value)
@@ -356,59 +379,64 @@ def to_json_value(value: Any) -> Any:
     )
 
 
-# a number, a name, or both ends of a part of a range
+# A number, a name, or the bounds of an interval.
 AxisValue = int | float | str | tuple[float, float]
 
 
 class CountedPredictions(Fields):
-    """Configurations, and in how many of them the model is right."""
+    """The number of configurations, and in how many of them the model is right."""
 
-    configurations: int = Field(description="how many were looked at")
-    correct: int = Field(description="right predictions")
+    configurations: int = Field(description="number of configurations")
+    correct: int = Field(description="number of right predictions")
     accuracy: float | None = Field(
-        description="their share; where some share a [draw](drives.md), the mean over "
-        "draws of the share of each; null where there is no configuration"
+        description="fraction of right predictions; if several configurations have the "
+        "same [draw](drives.md), the mean over draws of the fraction in each; null if "
+        "there are no configurations"
     )
     interval: Interval | None = Field(
-        description="of that share, 95 %; null where all are of one draw"
+        description="95 % confidence interval of the accuracy; null if all "
+        "configurations have the same draw"
     )
     outcomes: Outcomes = optional_field(
-        f"{OUTCOME_TEXT} in the other ones; {ONLY_OF_BOXES}"
+        f"{OUTCOME_TEXT} in the wrong predictions; {ONLY_OF_BOXES}"
     )
 
 
 class ConditionRow(Fields):
-    """A part of the values of one parameter."""
+    """A condition on one parameter: an interval of its values, or a set of names."""
 
     parameter: str
     unit: str
     over: float | None = Field(
-        description="values are larger; null without that bound, and for names"
+        description="lower bound, which values exceed; null without such a bound, and "
+        "for names"
     )
     at_most: float | None = Field(
-        description="values are no larger; null without that bound, and for names"
+        description="upper bound, which values do not exceed; null without such a "
+        "bound, and for names"
     )
-    options: list[str] = Field(description="the names it is about; empty for numbers")
+    options: list[str] = Field(description="names in the set; empty for numbers")
     turn: float | None = optional_field(
-        "degrees after which values count as the same, 180 or 360; `over` may then be "
-        "over `at_most`: the part goes through 0. Null for other parts"
+        "period of an angle in degrees, 180 or 360; then `over` may exceed `at_most`, "
+        "if the interval contains 0. Absent for other parameters"
     )
     text: str
 
 
 class Extent(Fields):
-    """A count with the interval of its share."""
+    """A count with the confidence interval of its fraction."""
 
     what: str = Field(description="what was counted")
     count: int
     total: int = Field(alias="of")
-    interval: Interval = Field(description="95 %, of the share")
+    interval: Interval = Field(description="95 % confidence interval of the fraction")
     share: float | None = Field(
         default=None,
-        description="the mean over draws of the share of each, where "
-        "some share one; absent elsewhere",
+        description="the mean over draws of the fraction in each, if several "
+        "configurations have the same draw; absent otherwise",
     )
-    # whether right predictions were counted, for a criterion of them; not stored
+    # Whether right predictions were counted, to compare them with a criterion; not
+    # stored.
     counts_right: bool = Field(default=False, exclude=True)
 
     @classmethod
@@ -422,14 +450,14 @@ class Extent(Fields):
         *,
         counts_right: bool = False,
     ) -> Extent:
-        """Return a count with the interval of its share.
+        """Return a count with the confidence interval of its fraction.
 
         Args:
             what: name of what is counted.
             count: number of cases in which it happened.
             total: number of all cases.
-            interval: interval of the share; None is the whole of [0, 1].
-            share: an estimate of the share; it is left out if it is count over total.
+            interval: interval of the fraction; None for [0, 1].
+            share: an estimate of the fraction; left out if it is count / total.
             counts_right: whether right predictions are counted.
         """
         is_known_from_counts = not total or share == count / total
@@ -445,35 +473,39 @@ class Extent(Fields):
 
 
 class StudyResult(RunResult):
-    """What several attacks found; each is a run of its own in the folder `parts`."""
+    """The result of several attacks, each of which is a run in the folder `parts`."""
 
     objects: list[str]
     model: str
-    task: str = Field(description="what judges the predictions")
+    task: str = Field(description="task by which predictions are evaluated")
     policy: str
-    parts: list[str] = Field(description="the attacks in the folder `parts`")
-    warnings: list[str] = Field(description="sentences that a reader has to know")
+    parts: list[str] = Field(
+        description="names of the runs of the attacks in the folder `parts`"
+    )
+    warnings: list[str] = Field(description="warnings as sentences")
 
 
 GradientStatus = Literal["ok", "biased", "noisy", "reference unusable"]
 
 
 class GroupDerivative(Fields):
-    """How the derivative of one parameter is obtained."""
+    """How the derivative with respect to one parameter is computed."""
 
     control: str
     parameter: str
-    size: int = Field(description="how many numbers it has")
+    size: int = Field(description="number of coordinates of the parameter")
     estimator: str
-    valid: list[str] = Field(description="the estimators that are valid")
-    step: float = Field(description="half-width of a difference in u")
-    step_reason: str = Field(description="why it is as wide; empty where none is taken")
-    reason: str = Field(description="why this estimator")
+    valid: list[str] = Field(description="names of the valid estimators")
+    step: float = Field(description="half-width of a finite difference in u")
+    step_reason: str = Field(
+        description="reason for the width; empty without finite differences"
+    )
+    reason: str = Field(description="reason for the choice of the estimator")
     variance_x_seconds: dict[str, JsonFloat] = Field(
-        description="squared error x time of each estimator that was measured"
+        description="squared error times seconds of each estimator that was measured"
     )
     step_in_unit: float | None = Field(
-        description="the step in `unit`; null where that is no single number"
+        description="the step in `unit`; null if it is not a single number"
     )
     unit: str
 
@@ -483,304 +515,330 @@ class GroupDerivative(Fields):
 
 
 class PlannedGradient(Fields):
-    """How every derivative is obtained."""
+    """How all derivatives are computed."""
 
     renders_per_gradient: int = Field(
-        description="beside the picture itself; adjoints are not counted"
+        description="number of renders in addition to the picture itself; adjoints are "
+        "not counted"
     )
     spp: int | None = Field(
-        description="samples a pixel of differences; null: that of the search"
+        description="samples per pixel of finite differences; null for those of the "
+        "search"
     )
     groups: list[GroupDerivative]
 
 
 class PathCut(Fields):
-    """What paths of at most so many segments leave out, the worst over the
-    configurations looked at.
+    """The error of light paths with a maximum length, as the worst case over the
+    measured configurations.
     """
 
-    depth: int = Field(description="longest path in segments")
-    light: float = Field(description="share of the radiance that is missing")
+    depth: int = Field(description="maximum length of a path in segments")
+    light: float = Field(description="fraction of the radiance that is missing")
     levels: float = Field(
         description="root-mean-square bias of the displayed picture in 8-bit levels"
     )
 
 
 class PathLength(Fields):
-    """The longest light path of the search, and why."""
+    """The maximum length of light paths in the search, and the reason for it."""
 
-    depth: int = Field(description="of the search, in segments")
-    full: int = Field(description="of the verification")
-    cuts: list[PathCut] = Field(description="what was measured, longest paths first")
-    configurations: int = Field(description="how many the measurement looked at")
+    depth: int = Field(description="maximum length in the search, in segments")
+    full: int = Field(description="maximum length in the verification, in segments")
+    cuts: list[PathCut] = Field(
+        description="measured errors by maximum length, the longest first"
+    )
+    configurations: int = Field(description="number of measured configurations")
     reason: str
 
 
 class Measured(Fields):
-    """A picture, a margin, a gradient or a derivative beside its reference, which took
-    far more renders.
+    """The error of a picture, a margin, a gradient or a derivative.
 
-    Errors and noise are relative to the size of the reference. What was not measured is
-    absent.
+    It is measured against a reference with far more renders. Errors and noise are
+    relative to the norm of the reference. Fields that were not measured are absent.
     """
 
     quantity: str = Field(
         description="`picture`, `margin` of the model, `gradient` of a control, or "
-        "`derivative` along a parameter"
+        "`derivative` with respect to a parameter"
     )
-    control: str = Field(default="", description="whose gradient")
-    parameter: str = Field(default="", description="along which the derivative is")
+    control: str = Field(default="", description="control of the gradient")
+    parameter: str = Field(default="", description="parameter of the derivative")
     estimator: str = Field(
-        description="what computes it: a sampler, or an estimator of derivatives"
+        description="sampler of the picture, or estimator of the derivatives"
     )
-    factor: float = Field(default=1.0, description="step as a multiple of the plan's")
-    spp: int = Field(description="samples a pixel")
-    repeats: int = Field(
-        description="how often it was computed, each time with other noise"
+    factor: float = Field(
+        default=1.0, description="step as a multiple of the planned step"
     )
-    seconds: float = Field(description="of one, median")
+    spp: int = Field(description="samples per pixel")
+    repeats: int = Field(description="number of computations, each with other noise")
+    seconds: float = Field(description="median time of one computation")
     status: GradientStatus = Field(description="whether it agrees with its reference")
     error: JsonFloat | None = optional_field(
-        "of one, root mean square; an upper limit where the reference is unusable"
+        "root-mean-square error of one computation; an upper bound if the reference is "
+        "unusable"
     )
-    interval: Interval | None = optional_field("of `error`")
-    bias: JsonFloat | None = optional_field("error of the mean")
-    doubt: JsonFloat | None = optional_field("how much of `bias` the noise explains")
-    noise: JsonFloat | None = optional_field("standard deviation of one")
-    cosine: JsonFloat | None = optional_field("of a gradient with its reference, mean")
-    value: JsonFloat | None = optional_field("of a derivative, mean")
-    reference: JsonFloat | None = optional_field("what `value` should be")
-    reference_error: JsonFloat | None = optional_field("the reference's own")
+    interval: Interval | None = optional_field("confidence interval of `error`")
+    bias: JsonFloat | None = optional_field("error of the mean over computations")
+    doubt: JsonFloat | None = optional_field(
+        "the part of `bias` that noise can explain"
+    )
+    noise: JsonFloat | None = optional_field("standard deviation of one computation")
+    cosine: JsonFloat | None = optional_field(
+        "mean cosine between a gradient and its reference"
+    )
+    value: JsonFloat | None = optional_field("mean of a derivative")
+    reference: JsonFloat | None = optional_field("reference of `value`")
+    reference_error: JsonFloat | None = optional_field("error of the reference")
     reference_cosine: JsonFloat | None = optional_field(
-        "smallest of two converged gradients, of which the reference is the mean"
+        "smallest cosine between two converged gradients, whose mean is the reference"
     )
 
     @property
     def name(self) -> str:
-        """``control.parameter``, or what there is of it; else the quantity."""
+        """``control.parameter``, or one of them if the other is empty, or else the
+        quantity.
+        """
         return ".".join(filter(None, (self.control, self.parameter))) or self.quantity
 
     @property
     def excess(self) -> float:
-        """What of the bias noise does not explain."""
+        """The part of the bias that noise cannot explain."""
         return max(0.0, (self.bias or 0.0) - (self.doubt or 0.0))
 
 
 class ClassPrediction(Fields):
-    """One prediction of a picture."""
+    """A prediction for a picture."""
 
-    label: str = Field(description="in words")
+    label: str = Field(description="predicted label as text")
     index: int | None = Field(
-        description="its number among the model's classes; null where there are none"
+        description="index of the class; null if the model has no classes"
     )
-    probability: float | None = Field(description="null where the model gives none")
+    probability: float | None = Field(
+        description="probability; null if the model outputs none"
+    )
 
 
 class VisibleThing(Fields):
-    """What a picture shows of the object, or of a thing beside it."""
+    """The visible part of the object, or of another object, in a picture."""
 
-    label: str | None = Field(description="what a model should call it")
+    label: str | None = Field(description="right label")
     box: tuple[int, int, int, int] | None = Field(
-        description="the smallest round what is seen of it, [x0, y0, x1, y1] in "
-        "pixels; null where nothing is"
+        description="bounding box of the visible part, [x0, y0, x1, y1] in pixels; "
+        "null if it is not visible"
     )
-    pixels: int = Field(description="in which it is what is seen first")
+    pixels: int = Field(description="number of pixels in which it is visible")
     share: float | None = Field(
-        description="of all that there would be of it if nothing stood before it and "
-        "the picture went on, 0 to 1; null where it is not known"
+        description="visible fraction, from 0 to 1, of all its pixels without occluders "
+        "and without the edge of the picture; null if unknown"
     )
     truncated: bool | None = Field(
-        description="whether it goes on beyond the picture; null where it is not known"
+        description="whether it extends beyond the edge of the picture; null if unknown"
     )
     distance: float | None = Field(
-        description="of the nearest point that is seen from the camera, metres"
+        description="distance of the nearest visible point from the camera in metres"
     )
 
 
 class ViewPredictions(Fields):
-    """What the model says of one view."""
+    """The predictions of a model for one view."""
 
-    azimuth: float = Field(description="of the camera, degrees")
+    azimuth: float = Field(description="azimuth of the camera in degrees")
     answers: list[ClassPrediction] = Field(
         validation_alias=AliasChoices("answers", "predictions"),
-        description="the likeliest first",
+        description="predictions, the most probable first",
     )
     things: dict[str, VisibleThing] | None = optional_field(
-        "what is seen of `object` and of each thing beside it; absent without any"
+        "visible parts of `object` and of each other object; absent without others"
     )
 
 
 class MeshUp(Fields):
-    """The axis of a mesh file that was taken for up, and why."""
+    """The axis of a mesh file that points up in the scene, and the reason."""
 
     axis: str
     reason: str
 
 
 class RenderResult(Result):
-    """A picture of a scene, and what the model says of it."""
+    """A picture of a scene, with the predictions of the model."""
 
     command: ClassVar[str] = "render"
 
-    out: str = Field(description="the file that was written")
+    out: str = Field(description="file of the picture")
     answered: str | None = optional_field(
-        "that with boxes and masks drawn in; absent where the task draws none"
+        "file of the picture with boxes and masks; absent if the task has none"
     )
-    size: tuple[int, int] = Field(description="of the file, [height, width] in pixels")
+    size: tuple[int, int] = Field(
+        description="size of the picture, [height, width] in pixels"
+    )
     object: str
     environment: str
     model: str
-    task: str = Field(description="what judges the predictions")
-    spp: int = Field(description="samples a pixel")
+    task: str = Field(description="task by which predictions are evaluated")
+    spp: int = Field(description="samples per pixel")
     image_formation: Formation
-    up: MeshUp | None = Field(description="null for an object without a mesh file")
+    up: MeshUp | None = Field(
+        description="axis of the mesh file that points up; null without a mesh file"
+    )
     views: list[ViewPredictions]
-    warnings: list[str] = Field(description="sentences that a reader has to know")
+    warnings: list[str] = Field(description="warnings as sentences")
 
 
 class DescribedValue(Fields):
-    """One value of a configuration, with its unit."""
+    """The value of a parameter in a configuration, with its unit."""
 
     value: int | float | str | list[float]
     unit: str
 
 
 class ControlGroup(Fields):
-    """Trials of the clean scene: how many are right."""
+    """Trials (verification renders) of the clean scene, and how many are right."""
 
     correct: int
     trials: int
     rate: float
     interval: Interval
     not_a_number: int = Field(
-        default=0, description="trials whose output is NaN or infinity; absent without"
+        default=0,
+        description="number of trials with an output of NaN or infinity; absent if 0",
     )
     outcomes: Outcomes = optional_field(
-        f"{OUTCOME_TEXT} in those that are not right; {ONLY_OF_BOXES}"
+        f"{OUTCOME_TEXT} in the wrong trials; {ONLY_OF_BOXES}"
     )
 
 
 class VerifiedRate(Fields):
-    """Trials with fresh seeds, and how many of them are a success."""
+    """Trials (verification renders) with new seeds, and how many are a success."""
 
     successes: int
     trials: int = Field(
-        description="that count: over conditions that vary, those "
-        "whose clean scene is right"
+        description="number of trials; if conditions vary, of those in which the model "
+        "is right about the clean scene"
     )
     rate: float
     interval: Interval
-    spp: int = Field(description="samples a pixel")
+    spp: int = Field(description="samples per pixel")
     labels: dict[str, int] = Field(
-        description="predictions of the successes, and how often each was given"
+        description="counts of the predicted labels in the successes"
     )
     outcomes: Outcomes = optional_field(
         f"{OUTCOME_TEXT} in the successes; {ONLY_OF_BOXES}"
     )
     margin: JsonFloat = Field(
-        description="mean over these trials, below 0 in a success, in logits; of a "
-        "detector in log-odds"
+        description="mean margin over these trials, in logits, or for a detector in "
+        "log-odds; a success has a margin below 0"
     )
     not_a_number: int = Field(
-        default=0, description="trials whose output is NaN or infinity; absent without"
+        default=0,
+        description="number of trials with an output of NaN or infinity; absent if 0",
     )
     stopped: str | None = optional_field(
-        "why there are no more: `asked for` (as many as were) or `decided` (the "
-        "verdict stands); absent of trials that are no verdict"
+        "why the trials ended: `asked for` (the requested number was done) or `decided` "
+        "(more could not change the result); absent for trials without a verdict"
     )
 
 
 class AverageCase(Fields):
-    """Configurations drawn from the whole space and budget."""
+    """The accuracy in configurations that are sampled from the full space and budget."""
 
     configurations: int
-    correct: int = Field(description="how many the model got right")
+    correct: int = Field(description="number of right predictions")
     accuracy: float
     interval: Interval
-    margin: JsonFloat = Field(description="the mean, in logits")
-    worst_margin: JsonFloat = Field(description="the smallest, in logits")
+    margin: JsonFloat = Field(description="mean margin in logits")
+    worst_margin: JsonFloat = Field(description="smallest margin in logits")
 
 
 class PredictionError(Fields):
-    """How far predicted pictures were from traced ones, at the last comparison."""
+    """The error of predicted pictures against traced ones, at the last comparison."""
 
     levels: JsonFloat = Field(
-        description="of 255, over the object's pixels (of a crop, over those outside), "
-        "root mean square"
+        description="root-mean-square error in levels of 255, over the object's pixels "
+        "(for a crop, over the pixels outside of it)"
     )
     margin_bias: JsonFloat = Field(
-        description="of the margin, the mean over the pictures that were compared"
+        description="mean error of the margin over the compared pictures"
     )
 
 
 class BankOfConditions(Fields):
-    """The conditions that matrices were made for."""
+    """The sampled conditions for which transport matrices were computed."""
 
-    created: int = Field(description="how many")
-    dropped: int = Field(description="of them made room for newer ones")
+    created: int = Field(description="number of conditions")
+    dropped: int = Field(description="number of those that were replaced by newer ones")
     grown: int = Field(
-        description="comparisons with unseen conditions after which "
-        "there had to be more"
+        description="number of comparisons with new conditions after which more "
+        "conditions were added"
     )
     gap: float | None = Field(
-        description="objective under them over that under unseen "
-        "ones, at the last comparison"
+        description="objective under these conditions minus that under new conditions, "
+        "at the last comparison"
     )
 
 
 class LinearTransport(Fields):
-    """What predicted the pictures of the searches."""
+    """How the pictures of the searches were predicted instead of rendered."""
 
     used: bool
     method: str | None = optional_field(
-        "by what: `matrix`, `basis pictures` (of a sweep), `surface light`, or `crop`, "
-        "which renders a part of each picture"
+        "method of prediction: `matrix`, `basis pictures` (for a sweep), `surface "
+        "light`, or `crop`, which renders a part of each picture"
     )
     reason: str | None = optional_field(
-        "why pictures were rendered, all or from some evaluation on, or not predicted "
-        "by surface light"
+        "why pictures were rendered, all or after some evaluation, or were not "
+        "predicted by surface light"
     )
-    crop: str | None = optional_field("why whole pictures were rendered")
+    crop: str | None = optional_field("why full pictures were rendered")
     window: tuple[int, int, int, int] | None = optional_field(
         "the part of the picture that was traced: top, left, height and width"
     )
-    conditions: BankOfConditions | None = optional_field("with `over`")
-    entries: int | None = optional_field("of the matrix")
-    bytes: int | None = optional_field("of its memory")
-    seconds: float | None = optional_field("that it and the comparisons took")
-    renewed: int | None = optional_field("how often it was made again")
-    error: PredictionError | None = optional_field("of the last comparison")
+    conditions: BankOfConditions | None = optional_field(
+        "conditions of the matrices; only with `over`"
+    )
+    entries: int | None = optional_field("number of entries of the matrix")
+    bytes: int | None = optional_field("memory of the matrix in bytes")
+    seconds: float | None = optional_field("time for the matrix and the comparisons")
+    renewed: int | None = optional_field("how often the matrix was computed again")
+    error: PredictionError | None = optional_field("error at the last comparison")
 
 
 class PrintTerms(Fields):
-    """How far colours are from what can be printed, without weights, summed over
-    textures and patches.
+    """How far colors are from printable ones, summed over textures and patches, without
+    weights.
     """
 
     variation: float = Field(
-        description="mean length of the step from a pixel to its neighbours, in sRGB"
+        description="mean distance between neighboring pixels in sRGB"
     )
     off_print: float = Field(
-        description="mean distance in sRGB from the nearest printable colour"
+        description="mean distance in sRGB from the nearest printable color"
     )
 
 
 class SharedWork(Fields):
-    """How the workers did that shared the work, in this sitting."""
+    """Counts and times of the workers of a run, since it was started or resumed."""
 
-    max_running: int = Field(description="workers that had work at once, at most")
-    lost: int = Field(description="that died or went away")
-    refused: int = Field(description="that could not do it")
-    retried: int = Field(description="batches that this process gave out again")
-    batches: int = Field(description="batches that came back")
-    busy: JsonFloat = Field(description="seconds that workers were at batches")
-    loading: JsonFloat = Field(description="seconds that they loaded scenes and models")
-    alive: JsonFloat = Field(
-        description="seconds that they were there and did not load"
+    max_running: int = Field(
+        description="maximum number of workers that computed at the same time"
     )
-    utilisation: JsonFloat | None = Field(description="`busy` over `alive`")
+    lost: int = Field(description="number of workers that died or disconnected")
+    refused: int = Field(description="number of workers that could not do the task")
+    retried: int = Field(description="number of batches that were submitted again")
+    batches: int = Field(description="number of finished batches")
+    busy: JsonFloat = Field(
+        description="seconds of computing batches, summed over workers"
+    )
+    loading: JsonFloat = Field(
+        description="seconds of loading scenes and models, summed over workers"
+    )
+    alive: JsonFloat = Field(
+        description="seconds of being connected, without loading, summed over workers"
+    )
+    utilisation: JsonFloat | None = Field(description="`busy` divided by `alive`")
     machines: dict[str, dict[str, str]] = Field(
-        description="what rows call by a name, where machines are not alike"
+        description="descriptions of machines that differ, by their names in rows"
     )
 
     @classmethod
@@ -795,10 +853,12 @@ class SharedWork(Fields):
         """
         if facts is None:
             return None
-        # times of different clocks may give a little over 1
-        share = min(1.0, facts.busy / facts.alive) if facts.alive else None
+        # `busy` and `alive` are seconds, summed over workers. They are measured by
+        # different clocks, so their ratio may slightly exceed 1.
+        utilisation = min(1.0, facts.busy / facts.alive) if facts.alive else None
+        # The passed `machines` replace those of the statistics.
         return cls.model_validate(
-            {**vars(facts), "utilisation": share, "machines": machines}
+            {**vars(facts), "utilisation": utilisation, "machines": machines}
         )
 
 

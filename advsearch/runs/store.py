@@ -1,6 +1,8 @@
-"""`results.sqlite`: every evaluated configuration of a run. Rows survive a kill when
-`Store.append` returns (write-ahead log); a power cut loses at most those of a second
-(on a slow disk more, so that forcing takes 2 % of the time).
+"""Store every evaluated configuration of a run in `results.sqlite`.
+
+When `Store.append` returns, its rows survive a kill of the process (write-ahead log). A
+power cut loses the rows of at most about a second. On a slow disk it may lose more, so
+that waiting for the disk takes at most 2 % of the time.
 """
 
 from __future__ import annotations
@@ -32,22 +34,30 @@ from advsearch.trust.stored_files import parse_json
 from advsearch.trust.writing import check_not_moved, note_open, storage_errors
 
 NAME = "results.sqlite"
-# least seconds between two forced writes to the disk; what a power cut may cost
+# Minimum seconds between two writes that wait for the disk. A power cut may lose the
+# rows in between.
 SYNC_INTERVAL = 1.0
-SYNC_SHARE = 0.02  # largest share of the time that forced writes may take
+SYNC_SHARE = 0.02  # maximum fraction of the time that waiting for the disk may take
 
 
 @dataclass(frozen=True)
 class Row:
-    """One evaluated configuration: a row of `evaluations`, whose columns `files.SCHEMA`
-    describes.
+    """A row of the table `evaluations`: an evaluated configuration.
 
-    What is no number is None: it is stored so. `success` is None where nothing is
-    sought, as in a sweep, `renders` 0 where pictures were predicted and None where they
-    were not counted, `phase` None of trials. `payload` has JSON values, `values` map a
-    parameter to ``{"value": ..., "unit": ...}``, and `metrics` a name to a number. The
-    store sets `time`, seconds since 1970, and `id`, the place in the file from 1, where
-    it is not given.
+    `files.SCHEMA` describes the columns. NaN and infinity are stored as None. These
+    fields need more explanation:
+
+    Attributes:
+        success: whether the prediction is what the search looks for; None if there is
+            no search, as in a sweep.
+        renders: number of rendered images; 0 if they were predicted instead, None if
+            they were not counted.
+        phase: phase of a search; None for trials (verification renders).
+        payload: other data of the prediction as JSON values, such as boxes.
+        values: the configuration; maps a parameter to its value and unit.
+        metrics: numbers by name of the metric.
+        time: time of writing in seconds since 1970; set by the store.
+        id: number of the row in the file, from 1; set by the store if it is None.
     """
 
     kind: str
@@ -82,21 +92,31 @@ class Row:
 
 @dataclass(frozen=True)
 class CachedEvaluation:
-    """What a search needs of an evaluation to be resumed, and the row does not have.
+    """The data of an evaluation that a search needs to be resumed, in addition to the
+    row.
 
-    The state of a policy follows from the evaluations that it has received. So a search
-    is resumed by sending it all of them again.
+    The state of a policy depends only on the evaluations that it has received. So a
+    search is resumed by passing all of them to the policy again.
+
+    Attributes:
+        number: index of the evaluation in the search.
+        u: digest of the configuration, to check that it is the same.
+        non_finite: number of entries of the gradient that were not finite.
+        cost: cost in evaluations.
+        gradient: (d,); None if there is none.
+        picture: (H, W, 3); None if it is not stored.
     """
 
-    number: int  # index of the evaluation in the search
-    u: bytes  # digest of the configuration
-    non_finite: int  # numbers of the gradient that were not finite
-    cost: int  # in evaluations
-    # (d,) and (H, W, 3), if they are stored
+    number: int
+    u: bytes
+    non_finite: int
+    cost: int
     gradient: NDArray[np.float32] | None = None
     picture: NDArray[np.uint8] | None = None
 
 
+# Cached evaluations are in the table "told", which has these columns after the id of
+# the row.
 _CACHED_COLUMNS = "number, u, non_finite, cost, gradient, picture, height"
 _AS_JSON = ("payload", "values", "metrics")
 _COLUMNS = tuple(
@@ -116,12 +136,14 @@ _INSERT_CACHED = (
 
 @final
 class Store:
-    """The open `results.sqlite` of a run; `read_only` beside a process that writes.
-    Close it, or use it in a `with` block.
+    """The open database `results.sqlite` of a run.
+
+    Close it, or use it in a `with` block. With `read_only`, it may be read while
+    another process writes it.
     """
 
     FILE: ClassVar[str] = NAME  # FILE in the directory of a run
-    # the prediction of a row without a label
+    # label for rows that have none
     NOT_A_NUMBER: ClassVar[str] = NOT_A_NUMBER
 
     def __init__(self, path: Path, *, read_only: bool = False) -> None:
@@ -150,8 +172,8 @@ class Store:
 
     @classmethod
     def open_to_read(cls, run: Path) -> Store:
-        """Open the results in a run directory for reading, beside a process that may
-        write.
+        """Open the results in a run directory for reading, while another process may
+        write them.
         """
         return cls(run / NAME, read_only=True)
 
@@ -166,7 +188,7 @@ class Store:
 
         Args:
             rows: rows of evaluations.
-            cached: what a search needs to be resumed and the last row does not have,
+            cached: data that a search needs to be resumed and the last row lacks,
                 such as the gradient of its evaluation; None if there is nothing.
         """
         check_not_moved(self.path)
@@ -186,6 +208,7 @@ class Store:
                     )
         if must_sync:
             end_time = time.monotonic()
+            # includes the time for encoding, which is short
             sync_seconds = end_time - start_time
             # On a slow disk the wait is longer, so that syncing takes at most
             # `SYNC_SHARE` of the time.
@@ -229,26 +252,26 @@ class Store:
             yield _decode(values, self.path)
 
     def read_row(self, kind: str, step: int) -> Row | None:
-        """Return the last row of a kind with a step; None where there is none."""
-        what = (
+        """Return the row of a kind with a step; None if there is none."""
+        query = (
             f"{', '.join(_COLUMNS)} FROM evaluations WHERE kind = ? AND step = ? "
             "ORDER BY id DESC LIMIT 1"
         )
         return next(
-            (_decode(values, self.path) for values in self._select(what, kind, step)),
+            (_decode(values, self.path) for values in self._select(query, kind, step)),
             None,
         )
 
     def read_cached(self, kind: str, step: int) -> tuple[Row, CachedEvaluation] | None:
-        """Return a row of a search, with what the search needs of it to be resumed.
+        """Return a row of a search, with the data that the search needs to be resumed.
 
         Args:
             kind: kind of the search.
             step: index of the evaluation.
 
         Returns:
-            The row, and gradient, cost and more, which the row lacks. None if there is
-            no such row, or if the run is done: then only rows are left.
+            The row, and its cached data such as the gradient. None if there is no such
+            row, or if the run is done: then the cached data have been deleted.
         """
         row = self.read_row(kind, step)
         if row is None:
@@ -262,7 +285,7 @@ class Store:
     def iterate_images(
         self, kind: str, after: int, until: int
     ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        """Yield the number and the image (H, W, 3) of rows of a kind.
+        """Yield the index in the search, and the image (H, W, 3), of rows of a kind.
 
         Images are stored only until the run is done.
 
@@ -272,7 +295,7 @@ class Store:
             until: only rows with at most this id.
         """
         query = (
-            # NULL instead of the gradient, which nobody needs here
+            # NULL instead of the gradient, which is not needed here
             "number, u, non_finite, cost, NULL, picture, height FROM told JOIN "
             "evaluations ON row = id "
             "WHERE kind = ? AND id > ? AND id <= ? AND picture IS NOT NULL ORDER BY id"
@@ -284,14 +307,13 @@ class Store:
 
     @property
     def has_cached(self) -> bool:
-        """Whether there is something that searches were told: the run is not done."""
+        """Whether there are cached evaluations: then the run is not done."""
         return bool(next(self._select("EXISTS (SELECT * FROM told)"))[0])
 
     def delete_cached(self) -> None:
-        """Delete what searches would need to be resumed, as the run is done.
+        """Delete the cached evaluations, since a run that is done is not resumed.
 
-        That is gradients and images, which take most of the file. So the file is then
-        compacted.
+        Their gradients and images take most of the file, so it is compacted then.
         """
         check_not_moved(self.path)
         with storage_errors(self.path):
@@ -316,13 +338,14 @@ class Store:
         )
 
     def find_missing_steps(self, kind: str, count: int) -> Iterator[range]:
-        """Yield the steps that have no row of a kind, neighbors as one range.
+        """Yield the steps that have no row of a kind; consecutive ones as one range.
 
         Args:
             kind: kind of the rows.
-            count: steps from 0 to below this are expected.
+            count: number of expected steps, which are 0 to count - 1. If there are rows
+                beyond, a range may be empty.
         """
-        expected = 0  # the step after the row before
+        expected = 0  # the step after that of the previous row
         steps = self._select("step FROM evaluations WHERE kind = ? ORDER BY step", kind)
         for (step,) in steps:
             if step > expected:
@@ -358,7 +381,7 @@ class Store:
         return any(self._select("key FROM meta WHERE key LIKE ? LIMIT 1", "answer %"))
 
     def write_note(self, key: str, value: str) -> None:
-        """Keep a text under `key`, in place of what was there."""
+        """Store a text under a key, and replace an earlier one."""
         check_not_moved(self.path)
         with storage_errors(self.path), self._db:
             self._db.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", (key, value))
@@ -382,7 +405,8 @@ class Store:
 
 
 _FIELDS = tuple(field.name for field in fields(Row))
-_ENCODED_FIELDS = _FIELDS[:-2]  # without the time and the id
+_ENCODED_FIELDS = _FIELDS[:-2]  # without the time and the id, which `_encode` adds
+# Types that SQLite stores as they are. So are finite floats; NaN and infinity are not.
 _SIMPLE = frozenset({str, int, bool, type(None)})
 _JSON = json.JSONEncoder(allow_nan=False)
 
@@ -390,8 +414,8 @@ _JSON = json.JSONEncoder(allow_nan=False)
 def _encode_cached(cached: CachedEvaluation) -> tuple[Any, ...]:
     """Return a cached evaluation as the values of its columns, for SQLite.
 
-    Arrays become bytes. The height of the picture is stored as well, from which its
-    width follows.
+    Arrays become bytes. The height of the picture is stored as well; its width follows
+    from the number of bytes.
     """
     arrays = [
         None if array is None else array.tobytes()
@@ -412,7 +436,7 @@ def _encode(row: Row, stamp: float) -> tuple[Any, ...]:
     """Return a row as the values of its columns, for SQLite.
 
     Numbers of NumPy and torch become numbers of Python, mappings become JSON, and empty
-    metrics become NULL. Time and id stand last in the columns.
+    metrics become NULL. Time and id are the last columns.
 
     Args:
         row: row of an evaluation.
@@ -426,8 +450,11 @@ def _encode(row: Row, stamp: float) -> tuple[Any, ...]:
         elif name in _AS_JSON and value is not None:
             value = _encode_json(value)
         else:
+            # SQLite stores these as they are. Most values are of this kind, so
+            # `to_json_value`, which takes longer, is only called for others.
             is_finite_float = type(value) is float and math.isfinite(value)
-            if type(value) not in _SIMPLE and not is_finite_float:
+            is_simple = type(value) in _SIMPLE or is_finite_float
+            if not is_simple:
                 value = to_json_value(value)
         values.append(value)
     return (*values, stamp, row.id)
@@ -452,10 +479,12 @@ _TYPES: dict[str, tuple[type, ...]] = {
     )
     for name, hint in get_type_hints(Row).items()
 } | {"payload": (str, type(None)), "metrics": (str, type(None)), "values": (str,)}
-"""What each column of a row holds; SQLite itself takes anything anywhere."""
+"""The types of the values in each column. SQLite itself accepts any type in any column.
+"""
 
 _INFINITE = (math.inf, -math.inf)
-# larger numbers are none in rows: what is reckoned from them would overflow
+# Maximum magnitude of a number in a row. Results computed from larger ones may
+# overflow.
 MAX_NUMBER = 1e300
 
 MAX_STEP = (1 << 32) - 1
@@ -464,8 +493,8 @@ MAX_STEP = (1 << 32) - 1
 def _decode(values: tuple[Any, ...], path: Path) -> Row:
     """Return a row from the values of its columns.
 
-    Each value is checked, since the file may come from somebody else, and SQLite allows
-    any type in any column.
+    Each value is checked, since another person may have written the file, and SQLite
+    allows any type in any column.
 
     Args:
         values: values in the order of the fields of `Row`.
@@ -504,13 +533,14 @@ def _decode_json_columns(by_name: dict[str, Any]) -> str | None:
     Returns:
         The first column whose JSON does not fit a row; None if all fit.
     """
+    # `_parse_named` returns None for a text that does not fit
     by_name["values"] = _parse_named(by_name["values"], _is_value)
     if by_name["values"] is None:
         return "values_json"
-    if by_name["metrics"] is None:
-        by_name["metrics"] = {}
-    else:
-        by_name["metrics"] = _parse_named(by_name["metrics"], _is_number_or_none)
+    metrics_text = by_name["metrics"]  # NULL for a row without metrics
+    by_name["metrics"] = (
+        {} if metrics_text is None else _parse_named(metrics_text, _is_number_or_none)
+    )
     if by_name["metrics"] is None:
         return "metrics_json"
     if by_name["payload"] is not None:
@@ -531,21 +561,22 @@ def _decode_cached(values: tuple[Any, ...], path: Path) -> CachedEvaluation:
     Raises:
         FileFormatError: a column has another type, or the picture another size.
     """
-    number, u, non_finite, cost, gradient, picture, height = values
+    number, u_digest, non_finite, cost, gradient, picture, height = values
     try:
-        types = [type(value) for value in (number, u, non_finite, cost)]
+        types = [type(value) for value in (number, u_digest, non_finite, cost)]
         if types != [int, bytes, int, int]:
-            raise TypeError("a number that is none")
+            raise TypeError("a column of another type")
         if gradient is not None:
             gradient = np.frombuffer(gradient, np.float32)
         if picture is not None:
             picture = np.frombuffer(picture, np.uint8).reshape(height, -1, 3)
         return CachedEvaluation(
-            number, u, non_finite, cost, gradient=gradient, picture=picture
+            number, u_digest, non_finite, cost, gradient=gradient, picture=picture
         )
     except (TypeError, ValueError) as error:
         raise FileFormatError(
-            f"{path}: expected what a search was told, got something else ({error})"
+            f"{path}: expected the cached evaluations of a search, got something else "
+            f"({error})"
         ) from None
 
 

@@ -1,7 +1,9 @@
-"""The result of a run: `summary.json` (docs/results.md), and
-`artifacts/adversarial.npy`, the configuration, so that it can be rendered again
-elsewhere. And what a run is made with: versions, and digests of the files that its
-settings name.
+"""Read and write the result of a run, and find out what it depends on.
+
+The result is in `summary.json` (docs/results.md). `artifacts/adversarial.npy` has the
+adversarial configuration, with which it can be rendered again. A run depends on the
+versions of packages, and on the files that its settings name, of which digests are
+computed.
 """
 
 from __future__ import annotations
@@ -56,7 +58,7 @@ def read_result(folder: Path) -> Result:
     Its ending is `RUNNING` if it is not finished and a process works on the run.
 
     Raises:
-        FileFormatError: there is none, or it is not what this version writes.
+        FileFormatError: there is none, or its contents are not those of this version.
     """
     result = read_stored_result(folder)
     return (
@@ -69,10 +71,12 @@ def read_result(folder: Path) -> Result:
 def read_stored_result(folder: Path) -> Result:
     """Return the result of the run in a folder as its `summary.json` states it.
 
-    Its ending is then not `RUNNING`, even if a process works on the run.
+    The status in it (`ending`) is that of the file. It is not replaced by `RUNNING` if
+    a process works on the run; `read_result` does that.
 
     Raises:
-        FileFormatError: there is none, or it is not what this version writes.
+        FileFormatError: there is no such file, or its contents are not those that this
+            version writes.
     """
     path = folder / NAME
     try:
@@ -91,18 +95,21 @@ def read_stored_result(folder: Path) -> Result:
             f"schema {str(values['schema'])[:40]} of another version (this one writes "
             f"{SCHEMA}); run it again",
         )
-    if (kind := kind_of(values)) is None:
+    result_type = kind_of(values)  # the class of the experiment's result
+    if result_type is None:
         raise make_summary_error(
             path, f"one of the command {str(values.get('command'))[:40]!r}"
         )
     try:
-        return kind.from_values(values)
+        return result_type.from_values(values)
     except ValidationError as error:
         # The message states the first error only, and no values, which may be long.
         first = error.errors(include_url=False, include_input=False)[0]
-        what = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"[:120]
+        field_name = ".".join(map(str, first["loc"]))
+        reason = f"{field_name}: {first['msg']}"[:120]
         got = (
-            f"one with a part that is missing or of another type ({what}); run it again"
+            f"one with a part that is missing or of another type ({reason}); run it "
+            "again"
         )
         raise make_summary_error(path, got) from None
 
@@ -114,15 +121,16 @@ def make_summary_error(path: Path, got: str) -> FileFormatError:
 CONFIGURATION = "adversarial.npy"
 FOLDER = "artifacts"
 MAX_CONFIGURATION_BYTES = 1 << 30
-MAGIC = b"\x93NUMPY\x01\x00"  # how a file of numpy's begins, of version 1.0
-MAX_HEADER_BYTES = 1 << 10  # bytes within which a header ends
+MAGIC = b"\x93NUMPY\x01\x00"  # first bytes of a file of numpy, version 1.0
+MAX_HEADER_BYTES = 1 << 10  # maximum size of the header after these bytes
 HEADER = re.compile(
     re.escape(MAGIC)
     + rb"..\{'descr': '<f4', 'fortran_order': False, 'shape': \((\d{1,12}),\), \} *\n",
     re.DOTALL,
 )
-"""What is before the numbers. numpy's own reader makes room for whatever shape is
-named, and parses the header as Python, which ends in errors of any kind.
+"""The header before the numbers. The reader of numpy is not used: it allocates memory
+for any shape that the header states, and parses the header as Python code, which may
+raise errors of any kind.
 """
 
 
@@ -154,7 +162,9 @@ def read_configuration(run: Path) -> NDArray[np.float32]:
         raise FileFormatError(f"{expected} no such file; did the run end?") from None
     except OSError as error:
         raise FileFormatError(f"{expected} {str(error)[:120]}") from None
-    if not data.startswith(MAGIC) or b"\n" not in data[: len(MAGIC) + MAX_HEADER_BYTES]:
+    # The header ends with a newline. Without one the file is truncated.
+    has_header_end = b"\n" in data[: len(MAGIC) + MAX_HEADER_BYTES]
+    if not data.startswith(MAGIC) or not has_header_end:
         raise FileFormatError(f"{expected} something else, or the beginning of one")
     u = _parse_array(data)
     if u is None or not bool(((u >= 0.0) & (u <= 1.0)).all()):
@@ -182,23 +192,23 @@ def _parse_array(data: bytes) -> NDArray[np.float32] | None:
     return numbers
 
 
-VERSIONS_NOTE = "made with"  # the note of versions and of digests of files
-MAX_FILES = 20_000  # files of a folder that a digest is taken of, at most
+VERSIONS_NOTE = "made with"  # the note with versions and digests of files
+MAX_FILES = 20_000  # maximum number of files of a folder that are in its digest
 FOLDERS = {"task": "*/*", "model": "*"}
-"""Settings that may name a folder, and which files in it decide: a task's pictures, or
-what `hf:FOLDER` consists of.
+"""Settings that may name a folder, with a pattern of the files in it on which the run
+depends: the reference pictures of a task, or the files of a model `hf:FOLDER`.
 """
 
 PACKAGES = ("advsearch", "mitsuba", "drjit", "torch", "numpy")
 
 NOT_READ_AGAIN = ("recipe", "suite")
-"""Settings whose file a run keeps in its store and goes on with, whatever became of the
-file.
+"""Settings whose file is copied into the store of the run. A resumed run reads the
+copy, even if the file has changed.
 """
 
 
 def collect_versions(settings: Mapping[str, object]) -> dict[str, str]:
-    """Return what decides the numbers of a run apart from its settings.
+    """Return facts on which the numbers of a run depend, apart from its settings.
 
     These are the versions of Python and of packages by name, and the SHA-256 of each
     file and each bundled object, environment or model that the settings name.
@@ -215,7 +225,7 @@ def collect_versions(settings: Mapping[str, object]) -> dict[str, str]:
 
 
 BUNDLED = {"objects": "object", "environments": "environment"}
-"""Folders of `advsearch.bundled`, and what stands in them."""
+"""Folders of `advsearch.bundled`, with the kind of their entries."""
 NAMES_BUNDLED = (
     "object",
     "environment",
@@ -227,7 +237,7 @@ NAMES_BUNDLED = (
     "over",
     "set",
 )
-"""Settings that name objects and environments."""
+"""Settings that may name bundled objects and environments."""
 
 
 def compute_bundled_digests(settings: Mapping[str, object]) -> dict[str, str]:
@@ -244,7 +254,7 @@ def compute_bundled_digests(settings: Mapping[str, object]) -> dict[str, str]:
         Digests by name, such as "bundled object mug".
     """
     package = Path(__file__).parent.parent
-    names = _list_bundled_names(settings)
+    names = _list_object_and_environment_names(settings)
     digests = dict[str, str]()
     for folder, kind in BUNDLED.items():
         for entry in sorted((package / "bundled" / "data" / folder).iterdir()):
@@ -257,16 +267,19 @@ def compute_bundled_digests(settings: Mapping[str, object]) -> dict[str, str]:
     return digests
 
 
-def _list_bundled_names(settings: Mapping[str, object]) -> set[str]:
-    """Return the words in settings that may name bundled objects and environments."""
+def _list_object_and_environment_names(settings: Mapping[str, object]) -> set[str]:
+    """Return the words in settings that may name bundled objects and environments.
+
+    There may be other words among them, since they are not compared with known names.
+    """
     names = {
         name
         for setting in NAMES_BUNDLED
         for name in _find_bundled_names(settings.get(setting))
     }
-    has_no_environment = "environment" in settings and not settings["environment"]
-    # a scene whose environment is not stated has the default one
-    if settings.get("object") and has_no_environment:
+    # The setting exists and is None: then the scene has the default environment.
+    uses_default_environment = "environment" in settings and not settings["environment"]
+    if settings.get("object") and uses_default_environment:
         names.add(DEFAULT_ENVIRONMENT)
     return names
 
@@ -350,20 +363,24 @@ def compute_file_digests(settings: Mapping[str, object]) -> dict[str, str]:
     for name, value in settings.items():
         for path in _find_paths(value):
             with suppress(OSError, ValueError):
-                # One by one: if a file cannot be read, the digests before it stay.
+                # The files of the path, and those that were read for them. They are
+                # added one by one: if a file cannot be read, the others before it
+                # remain. The name of the setting tells whether it may name files.
                 for file_name, digest in _iterate_digests(name, path):
                     digests[file_name] = digest
     return digests
 
 
 def _iterate_digests(setting: str, path: str) -> Iterator[tuple[str, str]]:
-    """Yield path and digest of each file that a value of a setting stands for.
+    """Yield path and digest of each file on which a run depends by a path in a setting.
 
-    It may be a folder, a file, and the files that were read for that file.
+    The path may be a folder, which has a single digest, or a file. In addition, files
+    are yielded that this process has read for that file, such as the materials of a
+    mesh.
 
     Args:
-        setting: name of the setting, by which it is known whether it may name a file
-            or a folder.
+        setting: name of the setting. Only some may name a folder (`FOLDERS`) or a file
+            (`FILES`).
         path: the path, a part of the setting's value.
 
     Raises:
@@ -371,20 +388,28 @@ def _iterate_digests(setting: str, path: str) -> Iterator[tuple[str, str]]:
         ValueError: it is no possible path.
     """
     absolute_path = os.path.abspath(path)
-    # If this process has read the file: the file itself, and those read for it.
+    # The file itself and those read for it; empty if this process has not read it.
     opened_files = list_opened_files(absolute_path)
+
+    # Only an absolute path counts as a folder, and the folder of a model hf:FOLDER.
     folder = ""
     if os.path.isabs(path):
         folder = path
     elif path.startswith("hf:"):
         folder = path.removeprefix("hf:")
     if folder and setting in FOLDERS and Path(folder).is_dir():
-        yield folder, _digest_folder(Path(folder), FOLDERS[setting])
-    if (opened_files or setting in FILES) and Path(path).is_file():
+        file_pattern = FOLDERS[setting]
+        yield folder, _digest_folder(Path(folder), file_pattern)
+
+    # A file that was read is one, whatever the setting.
+    may_be_file = bool(opened_files) or setting in FILES
+    if may_be_file and Path(path).is_file():
         yield path, _digest_file(Path(path))
+
     for opened_file in opened_files:
         if opened_file != absolute_path and Path(opened_file).is_file():
-            # named like the file itself: relative or absolute as in the setting
+            # Its name in the result is relative to the current directory if `path` is,
+            # and absolute otherwise.
             relative = os.path.relpath(opened_file, os.path.dirname(absolute_path))
             file_name = os.path.join(os.path.dirname(path), relative)
             yield file_name, _digest_file(Path(opened_file))
@@ -395,10 +420,12 @@ def _digest_folder(folder: Path, pattern: str) -> str:
 
     Args:
         folder: the folder.
-        pattern: pattern of the paths of its files that count, such as "*/*". At most
-            `MAX_FILES` do.
+        pattern: pattern of the paths of its files that count, such as "*/*". Only the
+            first `MAX_FILES` count; of more files, the order of the file system decides
+            which.
     """
     paths = sorted(islice(folder.glob(pattern), MAX_FILES))
+    # Joined without separator: all digests have the same length.
     lines = [
         f"{path.relative_to(folder).as_posix()}\n{_digest_file(path)}"
         for path in paths
@@ -408,7 +435,7 @@ def _digest_folder(folder: Path, pattern: str) -> str:
 
 
 def _find_paths(value: object) -> Iterator[str]:
-    """Yield what may be the path of a file in a setting.
+    """Yield the texts in a setting that may be paths of files.
 
     Names are separated by commas. Some name a file in a part of the text:
     ``reference@weights.safetensors``, ``scene.glb#NODE`` and

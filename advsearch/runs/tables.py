@@ -1,6 +1,4 @@
-"""Rows of a run as one pandas frame: a row for each configuration, a column for each
-thing that is known of it.
-"""
+"""Read the rows of a run as a pandas frame, and find out which rows are independent."""
 
 from __future__ import annotations
 
@@ -31,7 +29,7 @@ from advsearch.runs.store import NAME, Row, Store
 # nothing is drawn, samples of a point of the grid differ in noise alone: they are one
 # unit. In a folder of photographs, all pictures in one photograph are one unit.
 
-UNITS_NOTE = "units"  # the note of a run that says it
+UNITS_NOTE = "units"  # the note of a run with its `Units`
 PICTURE = "picture"
 CONFIGURATION = "configuration"
 DRIVE = "drive"
@@ -40,48 +38,64 @@ PHOTOGRAPH = "photograph"
 Number = TypeVar("Number", int, npt.NDArray[np.int64])
 
 MAX_AXES = 1024
-MAX_ROWS = 1 << 62  # of a whole sweep: numbers of rows are int64
+# Maximum number of rows of a sweep. Numbers of rows are int64.
+MAX_ROWS = 1 << 62
 Count = Annotated[int, Field(strict=True, ge=1, le=MAX_ROWS)]
 
 
 @dataclass(frozen=True)
 class Units:
-    """How rows follow from draws."""
+    """Which rows of a sweep belong to one unit, that is, are not independent.
 
-    # Sizes of the axes of the grid, the last one fastest.
+    A draw is a sampled configuration. The images of a draw form a unit: its frames, its
+    repetitions with other noise, and its image with the adversarial scene. If scenes
+    are rendered into the photographs of a folder, all images of a photograph form a
+    unit.
+
+    Attributes:
+        sizes: number of values along each axis of the grid; the last one varies
+            fastest.
+        frames: index of the axis whose values are the frames of a drive; None without.
+        samples: number of draws at each point of the grid.
+        models: number of models, each of which has a row for every image.
+        again: number of images after which the same draws are repeated with the
+            adversarial scene; 0 if they are not.
+        noise: number of images of each draw that differ only in noise.
+        photographs: number of photographs of a folder, into which the scenes are
+            rendered in turn; 1 without a folder.
+        scene: number of images of each scene; only used with a folder.
+    """
+
     sizes: Annotated[tuple[Count, ...], Field(max_length=MAX_AXES)] = ()
-    # place of the axis whose values are frames
     frames: Annotated[int, Field(strict=True, ge=0)] | None = None
-    samples: Count = 1  # draws at each point of the grid
-    models: Count = 1  # models that are shown the same pictures
-    # number of pictures after which the same draws come again, with the adversarial
-    # scene; 0 for never
+    samples: Count = 1
+    models: Count = 1
     again: Annotated[int, Field(strict=True, ge=0, le=MAX_ROWS)] = 0
-    noise: Count = 1  # pictures of each draw that differ in noise alone
-    # Photographs of a folder, in which the scenes are in turn; 1 where there is no
-    # folder.
+    noise: Count = 1
     photographs: Count = 1
-    scene: Count = 1  # pictures of a scene, where there is a folder
+    scene: Count = 1
 
     @property
     def size(self) -> int:
-        """Number of rows that follow one another and belong to one unit.
+        """Number of rows of a unit; with a folder, of one scene in a photograph.
 
-        Each image has a row for each model. With `again`, all images come twice:
-        without and with the adversarial scene.
+        Each image has a row for each model. With `again`, there are two images: without
+        and with the adversarial scene.
         """
+        n_arms = 2 if self.again else 1
         if self.photographs > 1:
-            return self.models * (2 if self.again else 1) * self.scene
-        frames = 1 if self.frames is None else self.sizes[self.frames]
-        return self.models * (2 if self.again else 1) * frames * self.noise
+            return self.models * n_arms * self.scene
+        n_frames = 1 if self.frames is None else self.sizes[self.frames]
+        return self.models * n_arms * n_frames * self.noise
 
     @property
     def name(self) -> str:
-        """What a unit is called."""
+        """The name of a unit in texts."""
         if self.photographs > 1:
             return PHOTOGRAPH
         if self.frames is not None and self.sizes[self.frames] > 1:
             return DRIVE
+        # With repetitions, a unit has several images of one configuration.
         return CONFIGURATION if self.noise > 1 else PICTURE
 
     def find_unit(self, step: Number) -> Number:
@@ -89,18 +103,19 @@ class Units:
         return self.find_cluster(step // self.models)
 
     def find_cluster(self, image_index: Number) -> Number:
-        """Return the number of the unit of a picture.
+        """Return the number of the unit (cluster) to which an image belongs.
 
         It is the number of its photograph or, without a folder of photographs, of its
         draw.
 
         Args:
-            image_index: number of the picture in the whole sweep, or an array of them.
+            image_index: index of the image in the sweep, or an array of indices.
         """
-        # Each scene has `scene` pictures and is in one photograph; the photographs are
-        # used in turn.
+        # Each scene has `scene` images, all in one photograph. The photographs are used
+        # in turn.
         if self.photographs > 1:
-            return image_index // self.scene % self.photographs
+            scene_index = image_index // self.scene
+            return scene_index % self.photographs
         return self.find_draw(image_index)
 
     def find_draw(self, image_index: Number) -> Number:
@@ -110,25 +125,27 @@ class Units:
         with and without an adversarial scene are of one draw.
 
         Args:
-            image_index: number of the picture in the whole sweep, or an array of them.
+            image_index: index of the image in the sweep, or an array of indices.
         """
-        # from `again` on, the same pictures come once more
+        # The second half repeats the draws with the adversarial scene.
         if self.again:
             image_index = image_index % self.again
-        image_index = image_index // self.noise
+        draw = image_index // self.noise  # `noise` consecutive images have one draw
         if self.frames is None:
-            return image_index
-        # A point of the grid is a number whose digits, in mixed radix, are the indices
-        # along the axes. The digit of the frame is left out of it, so that all frames
-        # of a drive get the same number.
-        point = image_index // self.samples
-        sample = image_index % self.samples
-        # number of points along the axes after that of the frames
-        after = prod(self.sizes[self.frames + 1 :])
-        # Index along the axes before that of the frames. Scenes act as one more axis,
-        # which is the first.
-        before = point // (self.sizes[self.frames] * after)
-        return (before * after + point % after) * self.samples + sample
+            return draw
+        # Draws are numbered by point of the grid, then by sample. A point has an index
+        # along each axis, the last one fastest, so it is
+        # (index_before * n_frames + frame) * n_after + index_after.
+        # Leaving out the frame gives all frames of a drive the same number.
+        point = draw // self.samples
+        sample = draw % self.samples
+        n_frames = self.sizes[self.frames]
+        n_after = prod(self.sizes[self.frames + 1 :])  # points along the axes after
+        # The index along the axes before also counts scenes, as an axis before all.
+        index_before = point // (n_frames * n_after)
+        index_after = point % n_after
+        point_without_frame = index_before * n_after + index_after
+        return point_without_frame * self.samples + sample
 
 
 def read_units(store: Store, *, is_sampled: bool = True) -> Units | None:
@@ -150,23 +167,26 @@ def read_units(store: Store, *, is_sampled: bool = True) -> Units | None:
         return None
     with suppress(ValidationError):
         units = TypeAdapter(Units).validate_python(noted)
-        # an older note: what it calls samples is repetitions of the noise
+        # Runs of older versions have no `noise`. If nothing is sampled, their samples
+        # are repetitions with other noise.
         if not is_sampled and units.noise == 1:
             units = replace(units, samples=1, noise=units.samples)
         is_frame_axis_valid = units.frames is None or units.frames < len(units.sizes)
+        # larger numbers would overflow int64
         n_rows = prod(units.sizes) * units.samples * units.noise * units.models
-        n_scene_rows = units.photographs * units.scene
-        if is_frame_axis_valid and n_rows <= MAX_ROWS and n_scene_rows <= MAX_ROWS:
+        n_photograph_images = units.photographs * units.scene
+        are_counts_valid = max(n_rows, n_photograph_images) <= MAX_ROWS
+        if is_frame_axis_valid and are_counts_valid:
             return units
     raise FileFormatError(
-        f"{store.path}: expected what units of sampling are, got {str(noted)[:80]}"
+        f"{store.path}: expected the units of a sweep, got {str(noted)[:80]}"
     )
 
 
 KIND = "sweep"  # rows of the sweep itself
 EDGES_NOTE = "parts of ranges"
-"""The note of a run that says where the range of each drawn parameter is cut: the ends
-of the parts, by name.
+"""The note of a run with the edges of the intervals into which the range of each
+sampled parameter is divided, by name of the parameter.
 """
 
 FIXED_COLUMNS = (
@@ -179,9 +199,8 @@ FIXED_COLUMNS = (
     "label",
     "outcome",
 )
-"""Columns of a sweep's frame before those of its parameters; `unit` is the last one."""
-
-# rows that become numbers and names at once, so that a million rows fit
+"""Columns of a sweep's frame before those of its parameters. `unit` is the last one."""
+# Number of rows that are converted at a time, so that a million rows fit into memory.
 CHUNK_ROWS = 10_000
 # names that a parameter cannot have in a frame
 RESERVED_NAMES = {*(field.name for field in fields(Row)), "unit", "outcome"}
@@ -241,8 +260,9 @@ def read_sweep(
         noted = store.read_json_note(EDGES_NOTE)
         units = read_units(store, is_sampled=is_sampled)
     frame.attrs["unit name"] = PICTURE if units is None else units.name
-    if units is not None:
+    if units is not None:  # otherwise each row is a unit
         frame["unit"] = units.find_unit(frame["step"].to_numpy())
+    # `make_sweep_frame` has set it to an empty mapping
     frame.attrs["edges"] |= _parse_edges(noted)
     return frame
 
@@ -269,17 +289,21 @@ def make_sweep_frame(
     """Return rows of a sweep as a pandas frame.
 
     Its columns are `FIXED_COLUMNS`, one for each parameter, those of `extra_columns`,
-    and `unit`, which here is the step. Numbers are float64, and NaN if a row has none.
+    and `unit`. Rows with the same value of `unit` are not independent; here it is the
+    step, so that all rows are. Numbers are float64, and NaN if a row has none.
     `correct` is 1 or 0, and NaN if the row was not judged. Columns with texts are
     categories, in the order in which these occur: `label`, `outcome` (of
     `options.Outcome`, or ""), and parameters of which any value is a text. A row
     without a value has the category "none". A parameter of several numbers has a
-    column for each, such as ``camera.target[0]``. ``attrs["units"]`` has the units.
+    column for each, such as ``camera.target[0]``. ``attrs["units"]`` has the units of
+    measurement by column. ``attrs["edges"]`` is empty; `read_sweep` fills it.
 
     Args:
         rows: rows of the sweep.
         extra_columns: function that returns more columns of a row.
     """
+    # units of measurement by column, which `_make_cells` fills while `cells` is
+    # iterated
     units = dict[str, str]()
     cells = (
         {
@@ -320,10 +344,15 @@ def _make_cells(row: Row, number: int, units: dict[str, str]) -> dict[str, Any]:
     Args:
         row: the row.
         number: number of the row from 1, which is its id if it has none.
-        units: units by column, to which those of the row's parameters are added.
+        units: units of measurement by column, to which those of the row's parameters
+            are added.
     """
-    # A row that was judged but has no label is that of an output that was NaN.
-    label = row.label or ("" if row.correct is None else NOT_A_NUMBER)
+    if row.label:
+        label = row.label
+    elif row.correct is None:  # the prediction was not evaluated
+        label = ""
+    else:  # it was, and the output of the model was NaN or infinite
+        label = NOT_A_NUMBER
     outcome = get_outcome(row.payload)
     # in the order of `FIXED_COLUMNS`
     fixed_values = (
@@ -338,6 +367,7 @@ def _make_cells(row: Row, number: int, units: dict[str, str]) -> dict[str, Any]:
     )
     cells: dict[str, Any] = dict(zip(FIXED_COLUMNS, fixed_values, strict=True))
     for name, described in row.values.items():
+        # The name of a parameter may be that of another column.
         parameter_name = f"parameter {name}" if name in RESERVED_NAMES else name
         for column, value, unit in iterate_values({parameter_name: described}):
             units.setdefault(column, unit)

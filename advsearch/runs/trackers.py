@@ -1,8 +1,7 @@
-"""Experiment trackers: MLflow, TensorBoard, and Weights & Biases get settings and the
-mean numbers of rows by kind.
+"""Send the settings of a run, and the means of its rows, to an experiment tracker:
+MLflow, TensorBoard, or Weights & Biases.
 
-A thread of its own sends them, so that neither a slow network nor one that fails holds
-up the run.
+A separate thread sends them, so that a slow or failing network does not delay the run.
 """
 
 from __future__ import annotations
@@ -21,12 +20,12 @@ from advsearch.files import JsonObject
 from advsearch.runs.store import Row
 
 PACKAGES = {"mlflow": "mlflow", "tensorboard": "tensorboard.summary", "wandb": "wandb"}
-"""The trackers, and what of each is imported."""
+"""The module that is imported for each tracker."""
 METRICS = ("objective", "score", "margin", "correct", "success", "probability")
-MAX_CLOSE_SECONDS = (
-    10.0  # seconds that the end of a run waits for what is still to be told
-)
-MAX_QUEUED = 10_000  # messages that may wait; further ones are not told
+# Maximum seconds for which the end of a run waits until all messages are sent.
+MAX_CLOSE_SECONDS = 10.0
+# Maximum number of messages that wait to be sent. Further ones are dropped.
+MAX_QUEUED = 10_000
 MAX_TEXT_LENGTH = 250
 _LOG = logging.getLogger("advsearch")
 
@@ -51,10 +50,10 @@ def _import_package(name: str) -> Any:
 
 
 class Tracker:
-    """Sends rows to a tracker, from a thread of its own.
+    """Sends rows to a tracker, from a separate thread.
 
-    Nothing that a tracker does stops the run: it is sent less if it is slow, and
-    nothing more after an error.
+    A tracker never stops the run. If it is slow, some messages are dropped. After an
+    error, nothing more is sent.
 
     Attributes:
         _n_correct: number of correct rows so far, by kind of row.
@@ -94,8 +93,9 @@ class Tracker:
             self._put((self._compute_metrics(kind, group), group[-1].step))
 
     def close(self) -> None:
-        """Wait, at most `MAX_CLOSE_SECONDS` seconds, until all is told; a second call does
-        nothing.
+        """Wait until all messages are sent, at most `MAX_CLOSE_SECONDS`.
+
+        A second call does nothing.
         """
         self._put(None)
         self._thread.join(MAX_CLOSE_SECONDS)
@@ -132,10 +132,10 @@ class Tracker:
         try:
             self._queue.put_nowait(message)
         except Full:
-            return  # a tracker that is that slow is told less; the run has all of it
+            return  # the tracker is slow; the rows themselves are in the run
 
     def _work(self, folder: Path, settings: Mapping[str, str]) -> None:
-        """Send messages until None comes; this is what the thread runs.
+        """Send messages until None comes. This is the main function of the thread.
 
         Args:
             folder: folder of the run.
@@ -150,7 +150,7 @@ class Tracker:
             close()
         except Exception as error:  # whatever a tracker does, the run goes on
             _LOG.warning(
-                "%s is told nothing more: %s",
+                "nothing more is sent to %s: %s",
                 self._name,
                 str(error)[:300] or type(error).__name__,
             )
@@ -170,7 +170,7 @@ def _open_tracker(
         A function that sends metrics by name with their step, and a function that ends
         the tracker's run.
     """
-    package = _import_package(name)
+    package = _import_package(name)  # `mlflow`, `wandb` or `tensorboard.summary`
     if name == "mlflow":
         package.start_run(run_name=folder.name, nested=True)
         package.log_params(settings)
@@ -179,7 +179,8 @@ def _open_tracker(
             package.log_metrics(dict(numbers), step=step)
 
         return log_metrics, package.end_run
-    # its files are in the run, whose run.yaml has the settings
+    # The settings are not sent to TensorBoard: its files are in the folder of the run,
+    # where run.yaml has them.
     if name == "tensorboard":
         writer = package.Writer(str(folder / "artifacts" / "tensorboard"))
 
@@ -197,8 +198,10 @@ def _open_tracker(
 
     def log(numbers: MetricValues, step: int) -> None:
         # The step of wandb itself may never decrease, but the steps of each kind of
-        # rows begin at 0. So the step is sent as a metric of its own.
-        kind = next(iter(numbers), "rows/").partition("/")[0]
+        # rows begin at 0. So the step is sent as a metric of its own, such as
+        # "search/step" with the metric "search/margin".
+        first_metric = next(iter(numbers), "rows/")
+        kind = first_metric.partition("/")[0]
         run.log({**numbers, f"{kind}/step": step})
 
     return log, run.finish

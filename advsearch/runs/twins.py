@@ -1,8 +1,9 @@
-"""What a run of `twins` measured, for results of other commands.
+"""Find out how far the results of a run hold for photographs, by a run of `twins`.
 
-A run of twins compares what a model says of photographs with what it says of their
-renders. `find_twin_evidence` picks the conditions that are nearest to those of another
-run: the same model and task, then the same object, then the same surroundings.
+A twin is a render of the scene in a photograph. A run of `advsearch twins` compares the
+predictions of a model for photographs and for their twins. `find_twin_evidence` selects
+the measurement whose conditions are most similar to those of another run: the same
+model and task, then the same object, then the same surroundings.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ COMMAND = "twins"
 
 
 def read_twins(run: str) -> Result:
-    """Return the result of a run of twins.
+    """Return the result of a run of the command `twins`.
 
     Args:
         run: its name or folder.
@@ -86,24 +87,25 @@ def find_twin_evidence(
     if not rows:
         return _make_empty(run, TwinMatch.OTHER_TASK)
     surroundings = IN_PHOTOGRAPH if in_photograph else environment
-    stem = PurePath(object_name).stem
-    # The nearest row is that of the same object, or else that of all objects together,
-    # which has no object. Among several, it is that of the same surroundings, or else
-    # one that is not in a photograph.
-    row = max(
-        (row for row in rows if not row.condition),
-        # tuples are compared by the first entry in which they differ
-        key=lambda row: (
-            row.object == stem,
-            not row.object,
+    object_stem = PurePath(object_name).stem
+
+    def rank(row: TwinAgreement) -> tuple[bool, ...]:
+        """Return how similar the conditions of a row are; the first entry counts most."""
+        is_of_all_objects = not row.object
+        return (
+            row.object == object_stem,
+            is_of_all_objects,
             row.surroundings == surroundings,
             row.surroundings != IN_PHOTOGRAPH,
-        ),
-    )
+        )
+
+    # A row with a condition is about a part of the photographs. For each model and task
+    # the table also has rows without one, about all of them.
+    row = max((row for row in rows if not row.condition), key=rank)
     return TwinEvidence(
         run=run,
         match=TwinMatch.MEASURED,
-        same_object=row.object == stem,
+        same_object=row.object == object_stem,
         same_surroundings=row.surroundings == surroundings,
         row=row,
     )

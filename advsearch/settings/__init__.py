@@ -1,7 +1,7 @@
-"""The machinery of a typed configuration: settings with one description each, read from
-YAML, flags and Python alike.
+"""Typed configurations: each setting is declared once, and read from YAML, flags or
+Python.
 
-`config` declares the settings themselves.
+This package has the functions and base classes; `config` declares the settings.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Declare settings once, for the help, the docs, errors and checks, and build
-configurations of them.
+"""Declare the settings of commands, and make configurations from their values.
 
-A configuration is what a command needs to know, checked as a whole. Whether it is made
-from flags, YAML or Python, its class reads the values.
+From one declaration the help, the docs, error messages and checks are made. A
+configuration has the values of all settings of a command, and is validated as a whole.
+Its class parses the values in the same way from flags, YAML and Python.
 """
 
 from __future__ import annotations
@@ -45,42 +45,42 @@ if TYPE_CHECKING:
 
 
 ReadTexts = Callable[[Sequence[str], str], Mapping[str, object]]
-"""Reads texts into a mapping; the second argument is the name of the setting, for
-errors. Raises ValueError if they are something else.
+"""A function that parses texts such as "NAME=VALUE" to a mapping. Its second argument
+is the name of the setting, for errors. It raises ValueError for texts of another form.
 """
 
 
 @dataclass(frozen=True)
 class Setting:
-    """The declaration of a setting; `settings` completes what is empty."""
+    """The declaration of a setting. `settings` completes the fields that are empty."""
 
-    # Or a function that creates it. `...` if the setting is required; `settings`
-    # replaces it by None.
+    # The default value, or a function that creates it. `...` if the setting is
+    # required, which `settings` replaces by None.
     default: Any
     group: str  # heading in the help
-    description: str  # what it is
-    # Completes "expected ..." in errors, and names the range in the help; by default
-    # derived from type and constraints.
+    description: str  # description in the help
+    # The allowed values in words, for the help and for "expected ..." in errors. By
+    # default it is derived from type and constraints.
     expects: str = ""
     unit: str = ""  # unit of the value
-    otherwise: str = ""  # what a default of None means
-    flag: str = ""  # if it is not its name: "--control"
-    # Placeholder of the value in the help, if it is not the last word of its name.
+    otherwise: str = ""  # meaning of the default None, for the help
+    flag: str = ""  # flag, if it is not made from the name: "--control"
+    # Placeholder of the value in the help, if it is not the last word of the name.
     metavar: str = ""
-    # Whether its flag may be repeated; that of a mapping always may.
+    # Whether the flag may be repeated. The flag of a mapping always may.
     repeats: bool = False
-    # Reads the texts that a mapping may be written as.
+    # Function that parses texts to a mapping, for settings that are mappings.
     read_texts: ReadTexts = written.parse_assignments
-    # What the flag does, if it is the opposite of the description.
+    # What the flag of a switch does, if it is the opposite of the description.
     switched: str = ""
-    # Returns what a value does beyond the run, which only a person may request
-    # (`trust.powers`).
+    # Function that returns the effect of a value outside of the run, such as to connect
+    # to an address. Only a person may request such a value (`trust.powers`).
     power: Power = no_power
     field: str = ""  # its name in the configuration
     name: str = ""  # its name in YAML
     required: bool = False
     is_switch: bool = False  # its flag takes no value
-    is_mapping: bool = False  # its flag takes one name with a value
+    is_mapping: bool = False  # its flag takes NAME=VALUE
 
     @property
     def text(self) -> str:
@@ -93,7 +93,7 @@ class Setting:
         elif isinstance(self.default, float):
             default = f"{self.default:g}"
         elif self.default is None:
-            default = self.otherwise  # what it means that there is no value
+            default = self.otherwise  # the meaning of None
         else:
             default = str(self.default)
         suffix = f" (default: {default})" if default else ""
@@ -121,34 +121,35 @@ def setting(
     Args:
         default: the default value, or a function that creates it.
         group: group of settings in the help.
-        description: what the setting is, for the help.
+        description: description of the setting, for the help.
         expects: the values that it takes, in words; "" to derive them from the type.
         unit: unit of measurement; "" for none.
-        otherwise: what None as a value means, for the help.
+        otherwise: meaning of the default None, for the help.
         flag: flag of the command line; "" to derive it from the name of the field.
         metavar: name of the value in the help; "" to derive it.
         repeats: whether the flag may be used several times.
         read_texts: function that converts texts to a mapping, for settings with one.
         switched: what the flag does, if it is the opposite of the description; "" if
             the description says it.
-        power: function that returns what a value does beyond the run, such as to
-            connect to an address; "" for nothing.
+        power: function that returns the effect of a value outside of the run, such as
+            to connect to an address; "" for no effect.
         constraints: constraints of `pydantic.Field`, such as `ge`.
     """
     declared = Setting(
-        default,
-        group,
-        description,
-        expects,
-        unit,
-        otherwise,
-        flag,
-        metavar,
-        repeats,
-        read_texts,
-        switched,
-        power,
+        default=default,
+        group=group,
+        description=description,
+        expects=expects,
+        unit=unit,
+        otherwise=otherwise,
+        flag=flag,
+        metavar=metavar,
+        repeats=repeats,
+        read_texts=read_texts,
+        switched=switched,
+        power=power,
     )
+    # pydantic keeps this with the field; `settings` and `setting_as_in` read it
     extra: Any = {"declared": declared, "constraints": constraints}
     default_name = "default_factory" if callable(default) else "default"
     return Field(
@@ -171,22 +172,25 @@ def setting_as_in(config: type[Config], field: str, **changes: Any) -> Any:
         field: field of the setting there.
         changes: arguments of `setting` that differ.
     """
+    # "declared" and "constraints", as `setting` has stored them
     extra: Any = config.model_fields[field].json_schema_extra
-    declared = {
+    declared_arguments = {
         name: value
         for name, value in vars(extra["declared"]).items()
         if name not in DERIVED_FIELDS
     }
-    return setting(**{**declared, **extra["constraints"], **changes})
+    return setting(**{**declared_arguments, **extra["constraints"], **changes})
 
 
 class Clash(NamedTuple):
-    """A setting that has no effect with others, or contradicts them.
+    """A setting that has no effect together with others, or contradicts them.
 
     Attributes:
-        setting: its field; it clashes if it differs from its default.
-        with_others: whether the others are set so.
-        why: completes "setting: ..." and states what to do.
+        setting: field of the setting. It clashes if it differs from its default, and
+            `with_others` returns True.
+        with_others: function of the configuration that returns whether the other
+            settings clash with it.
+        why: text of the error after "NAME: ", with what to do.
     """
 
     setting: str
@@ -204,7 +208,7 @@ def settings(config: type[Config]) -> tuple[Setting, ...]:
     for field, info in config.model_fields.items():
         if field in config.excluded_settings:
             continue
-        extra: Any = info.json_schema_extra
+        extra: Any = info.json_schema_extra  # of the field, from `setting`
         declared: Setting = extra["declared"]
         is_mapping = get_origin(info.annotation) is dict
         default = None
@@ -221,6 +225,7 @@ def settings(config: type[Config]) -> tuple[Setting, ...]:
                 expects=declared.expects or _describe_expected(info),
                 # the last word of the name
                 metavar=declared.metavar or field.rpartition("_")[2].upper(),
+                # each use of the flag adds an entry to a mapping
                 repeats=declared.repeats or is_mapping,
                 is_switch=info.annotation is bool,
                 is_mapping=is_mapping,
@@ -232,7 +237,9 @@ def settings(config: type[Config]) -> tuple[Setting, ...]:
 def _describe_expected(info: FieldInfo) -> str:
     """Describe the values that a field takes, such as "a whole number from 1 to 100".
 
-    The text is derived from the field's type and constraints.
+    The text is derived from the field's type and constraints. It is only used for
+    settings without a text of their own: booleans, choices, and numbers with an upper
+    limit (`le`) and a lower one (`ge` or `gt`).
     """
     types = [
         value_type
@@ -255,8 +262,11 @@ def _describe_expected(info: FieldInfo) -> str:
     }
     is_integer = types == [int]
     number = "a whole number" if is_integer else "a number"
-    # Python writes 1e+06; users read and write 1e6.
-    upper = limits["le"] if is_integer else f"{limits['le']:g}".replace("e+0", "e")
+    if is_integer:
+        upper = str(limits["le"])
+    else:
+        # Python writes 1e+06; users read and write 1e6.
+        upper = f"{limits['le']:g}".replace("e+0", "e")
     if "gt" in limits:
         return f"{number} greater than {limits['gt']:g} and at most {upper}"
     return f"{number} from {limits['ge']:g} to {upper}"
@@ -269,8 +279,8 @@ def _join_choices(choices: Sequence[Any]) -> str:
 
 
 RUN_LOCATION: Mapping[str, bool | None] = {"run": None, "overwrite": False}
-"""Settings of where a run is stored, not of what it does, with the values that a
-repetition has.
+"""Settings that determine where a run is stored, with the values that they have in a
+repetition of the run.
 """
 
 FILES = (
@@ -278,13 +288,14 @@ FILES = (
     *("held_out", "held_out_environment", "compared", "path"),
     *("backdrop", "occluder"),
 )
-"""The settings that may name files."""
+"""Settings that may name files."""
 
 
 class SettingsError(InputError):
-    """One or more settings have values that are not allowed.
+    """Raised if settings have values that are not allowed.
 
-    `problems` are pairs of a name and what is wrong.
+    Attributes:
+        problems: pairs of the name of a setting and a text about what is wrong.
     """
 
     def __init__(
@@ -296,13 +307,13 @@ class SettingsError(InputError):
 
 
 class PythonOnly(NamedTuple):
-    """A part of a run that exists only in one Python session: no file and no command
-    can name it.
+    """An object of a Python session that a run uses, and that no file and no command
+    can name.
 
     Attributes:
-        role: role of the part in the run: "model", "scene", "objective", "policy",
+        role: role of the object in the run: "model", "scene", "objective", "policy",
             "metric", "control", "task", ...
-        name: its name there; empty if it has none.
+        name: its name in that role; empty if it has none.
     """
 
     role: str
@@ -314,18 +325,21 @@ class PythonOnly(NamedTuple):
 
 
 class Config(BaseModel):
-    """The settings of a command, checked as a whole. Frozen; unknown names are
-    rejected.
+    """The base class of configurations, which have the settings of a command.
 
-    Each command's configuration is a subclass. Raises InputError if a value is out of
-    range or an unknown setting is named; the message lists every problem.
+    Each command has a subclass. An instance is validated as a whole, and is immutable.
+
+    Raises:
+        InputError: a value is out of range, or the name of a setting is unknown. The
+            message lists all problems.
     """
 
     command: ClassVar[str]
-    # settings of a class above that the command does not have
+    # inherited settings that the command does not have
     excluded_settings: ClassVar[tuple[str, ...]] = ()
     clashes: ClassVar[tuple[Clash, ...]] = ()
-    # they decide no number: they may change before a run goes on
+    # Settings on which no number of the result depends. They may change when a run is
+    # resumed.
     changeable_settings: ClassVar[tuple[str, ...]] = (*RUN_LOCATION, "threads")
 
     _python_only_parts: tuple[PythonOnly, ...] = PrivateAttr(())
@@ -382,8 +396,8 @@ class Config(BaseModel):
     def _without_clashes(self) -> Self:
         """Check that all settings exist for this command and do not contradict each other.
 
-        A command does not have the settings in `without`, although its class inherits
-        them. `clashes` lists the settings that contradict others.
+        A command does not have the settings in `excluded_settings`, although its class
+        inherits them. `clashes` lists the settings that contradict others.
         """
         for name in self.excluded_settings:
             field = type(self).model_fields[name]
@@ -398,6 +412,7 @@ class Config(BaseModel):
                 continue
             is_set = getattr(self, clash.setting) != defaults[clash.setting]
             if is_set and clash.with_others(self):
+                # The field of `set` is `set_`; messages have the name without "_".
                 raise InputError(f"{clash.setting.rstrip('_')}: {clash.why}")
         return self
 
@@ -445,9 +460,10 @@ class Config(BaseModel):
 
     @property
     def powers(self) -> tuple[OmittedSetting, ...]:
-        """The settings whose values affect more than the run, with what they do.
+        """The settings whose values have an effect outside of the run, with the effect.
 
-        An example is an address to which images are sent (`trust.powers`).
+        An example is an address to which images are sent (`trust.powers`). They have
+        the type of settings that are omitted if only a file, and no person, sets them.
         """
         powers = []
         for setting in settings(type(self)):
@@ -468,18 +484,18 @@ class Config(BaseModel):
     @property
     def left_out(self) -> tuple[OmittedSetting, ...]:
         """The settings of the file that were not taken over, since they do more than
-        decide what happens in the run.
+        change what happens in the run.
         """
         return self._left_out
 
     @property
     def session_settings(self) -> dict[str, Any]:
-        """The settings that the parts of a run get from this session, by name.
+        """The settings that a run passes on to the runs of its parts, by name.
 
-        The parts, such as the attacks of a study, read their other settings from their
-        own files. But settings that affect more than the run, such as an address to
-        connect to, are never read from files. They are passed on if the numbers of the
-        run do not depend on them (`free`).
+        A part, such as an attack of a study, reads its settings from its own file. But
+        settings with an effect outside of the run, such as an address to connect to,
+        are never read from files (`powers`). So they are passed on, if they do not
+        change the numbers of the run (`changeable_settings`).
         """
         return {
             setting.name: getattr(self, setting.field)
@@ -490,22 +506,23 @@ class Config(BaseModel):
         }
 
     def check_powers(self, where: str) -> None:
-        """Check that no setting of a file affects more than the run.
+        """Check that no setting has an effect outside of the run (`powers`).
 
-        It is for files about which the user cannot be asked.
+        This is for files of which the user cannot confirm single settings, such as
+        those that another file names.
 
         Args:
             where: name of the file, for messages.
 
         Raises:
-            InputError: a setting does, such as an address to connect to; the message
+            InputError: a setting has one, such as an address to connect to; the message
                 names the first one.
         """
         if self.powers:
-            power = self.powers[0]
+            setting = self.powers[0]
             raise InputError(
-                f"{where}: {power.name}: {power.effect}, which such a file can't ask "
-                "for; leave it out"
+                f"{where}: {setting.name}: {setting.effect}, which such a file can't "
+                "ask for; leave it out"
             )
 
     @classmethod
@@ -580,14 +597,15 @@ class Config(BaseModel):
         )
 
     def to_yaml(self) -> str:
-        """Return the YAML form.
+        """Return the configuration as YAML.
 
-        `from_yaml` of it gives an equal configuration, unless there are `powers` in it.
+        `from_yaml` returns an equal configuration. Only settings with an effect outside
+        of the run (`powers`) are lost: they are not read from files.
         """
         data = {"schema": written.SCHEMA, "command": self.command, **self.to_json()}
         note = ""
         if self._python_only_parts:
-            # after the header, which says how to repeat the run
+            # It continues the header: "To repeat it: advsearch run FILE".
             note = f"# But it can't be: {format_python_only(self.python_only)}\n"
         return written.HEADER + note + str(yaml.safe_dump(data, sort_keys=False))
 
@@ -684,7 +702,7 @@ def _read_mappings(config: type[Config], data: Mapping[str, Any]) -> dict[str, A
     for setting in settings(config):
         if not setting.is_mapping:
             continue
-        # a setting may be given by either name
+        # pydantic accepts both names of a setting, such as "set" and "set_"
         for name in {setting.name, setting.field} & values.keys():
             value = values[name]
             texts = [value] if isinstance(value, str) else value
@@ -697,6 +715,7 @@ def _read_mappings(config: type[Config], data: Mapping[str, Any]) -> dict[str, A
                 values[name] = setting.read_texts(texts, setting.name)
             except ValueError:
                 got = texts[0] if len(texts) == 1 else texts
+                # the same form as the errors of pydantic, for the same message
                 problem = _make_problem(name, got)
                 raise _make_settings_error(config, [problem]) from None
     return values

@@ -1,7 +1,7 @@
-"""Read values as users write them: names, assignments, numbers and YAML files.
+"""Parse values as users write them: names, assignments, numbers and YAML files.
 
-Values that are too deep, too large or duplicate are rejected. A YAML file overrides the
-files that its `base` names.
+Values that are nested too deeply, too large or duplicate are rejected. A YAML file may
+name other files in `base`, whose settings it overrides.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ def to_python(value: Any) -> Any:
 
     The value must not be nested too deeply (`is_shallow`), since this is recursive.
     """
-    # This mapping also holds a function, which a plain dict would lose.
+    # The quantiles of a Python function: this mapping also has the function itself,
+    # which a copy as a plain dict would lose.
     if isinstance(value, PythonQuantiles):
         return value
     if isinstance(value, Mapping):
@@ -44,10 +45,11 @@ def to_text(value: Any, *, several: bool = False) -> Any:
     """Return a name, a path or a number as a text.
 
     With `several`, a list of these becomes a text with commas between them. Any other
-    value is returned as it is.
+    value is returned as it is, to be rejected later; so is an empty list.
 
     Raises:
-        ValueError: it is empty, or there are several where one is expected.
+        ValueError: the text is empty or contains a zero byte, or there are several
+            names where one is expected.
     """
     items = value if isinstance(value, (list, tuple)) else [value]
     are_names = all(
@@ -59,7 +61,8 @@ def to_text(value: Any, *, several: bool = False) -> Any:
     if len(items) > 1 and not several:
         raise ValueError("several")
     text = ",".join(map(str, items))
-    if not text.strip(" ,\t\n") or "\0" in text:
+    has_no_name = not text.strip(" ,\t\n")
+    if has_no_name or "\0" in text:  # no name and no path contains a zero byte
         raise ValueError("an empty name")
     return text
 
@@ -158,7 +161,8 @@ def parse_assignments(texts: Iterable[str], setting: str) -> dict[str, object]:
     return dict(pairs)
 
 
-FOR_ALL = "*"  # the name of the choice for everything without a choice of its own
+# The key of a choice that is for everything without a choice of its own.
+FOR_ALL = "*"
 
 
 def parse_choices(texts: Iterable[str], setting: str) -> dict[str, object]:
@@ -281,10 +285,8 @@ HEADER = "# A run of advsearch. To repeat it: advsearch run FILE\n"
 by it.
 """
 MAX_BASES = 4  # maximum number of files that a `base` names, and of nested bases
-NAME_SETTINGS = (
-    "policy",
-    "task",
-)  # the settings that are a name, or a `name` with options
+# Settings that are a name, or a mapping with a `name` and options.
+NAME_SETTINGS = ("policy", "task")
 
 
 def read_yaml(path: str | Path, above: tuple[Path, ...] = ()) -> dict[str, object]:

@@ -1,3 +1,3 @@
-"""The viewer: runs as pages that a browser lets one explore, from a single file or from
-`advsearch dashboard`.
+"""The viewer: interactive HTML pages of runs, as single files or served by `advsearch
+dashboard`.
 """

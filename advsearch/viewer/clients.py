@@ -1,8 +1,8 @@
-"""Connections of the dashboard's server: worker threads, time limits, and HTTPS.
+"""The connections of the dashboard's server: worker threads, time limits, and HTTPS.
 
-A few workers serve the requests. A client that has sent nothing yet occupies none of
-them; a slow client occupies one until its time is up, or for `SLOW_CLIENT_SECONDS`
-while others wait.
+A fixed number of worker threads serve the requests. A client that has sent nothing yet
+occupies none of them. A slow client occupies one until its time is up; if other clients
+wait, its time is `SLOW_CLIENT_SECONDS`.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from dataclasses import dataclass
 from queue import Empty, LifoQueue
 from typing import Any, NamedTuple
 
-# requests that are served at once; others wait
-N_WORKERS = 16
+N_WORKERS = 16  # number of requests that are served at the same time
 MAX_WAITING = 128
-"""Connections that may be open and wait for a worker or for their client.
+"""Maximum number of open connections that wait for a worker or for their client.
 
-More wait in the operating system, without an open file in this process.
+More connections wait in the operating system, without an open file in this process.
 """
-# seconds that a client has to send its request
+# Maximum seconds for a client to send its request.
 REQUEST_SECONDS = 10.0
-# minimum bytes per second at which a client takes the response, after `REQUEST_SECONDS`
+# Minimum bytes per second at which a client must read the response, after
+# `REQUEST_SECONDS`.
 MIN_BYTES_PER_SECOND = 50_000
-# seconds that a slow client has while others wait
+# Maximum seconds for a slow client if others wait.
 SLOW_CLIENT_SECONDS = 1.0
 # seconds between two checks of the time limits
 CHECK_INTERVAL = 0.05
 # maximum bytes of a request's body
 MAX_BODY_BYTES = 16 << 20
-# what to type if QR codes cannot be drawn
+# The command that installs the package for QR codes.
 NO_QR = "pip install segno"
 
 
@@ -73,10 +73,10 @@ class _Connection:
     """A connection that a worker serves.
 
     Attributes:
-        connection: the socket of the client.
-        since: when the worker began to wait for the client; infinite while the worker
-            itself computes.
-        due: until when it waits; infinite likewise.
+        connection: socket of the client.
+        since: time at which the worker began to wait for the client; infinite if it
+            does not wait, but computes the response.
+        due: time until which the worker waits; infinite in the same case.
     """
 
     connection: socket.socket
@@ -85,20 +85,20 @@ class _Connection:
 
 
 class _SilentClient(NamedTuple):
-    """A client that has connected and sent nothing: its address, and since when."""
+    """A client that has sent nothing yet: its address, and the time of its connection."""
 
     address: Any
     since: float
 
 
 class ConnectionPool:
-    """Serve the connections that a socket accepts until `close`.
+    """Accepts connections, and serves them in worker threads until `close`.
 
     Args:
         listening_socket: the socket that listens.
-        handle: serves a connection in a worker's thread; calls `report_waiting` when it
-            begins or ends to wait for the client.
-        context: context for HTTPS; without it, HTTP.
+        handle: function that serves a connection in a worker thread. It calls
+            `report_waiting` when it begins or ends to wait for the client.
+        context: TLS context for HTTPS; None for HTTP.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class ConnectionPool:
         self._ready: LifoQueue[tuple[socket.socket, Any] | None] = LifoQueue()
         self._connections: dict[int, _Connection] = {}  # by the thread of their worker
         self._closed = threading.Event()
-        # set unless `serve` runs, so that `close` never waits for what has not begun
+        # set unless `serve` runs, so that `close` does not wait if it was never called
         self._ended = threading.Event()
         self._ended.set()
 
@@ -154,11 +154,15 @@ class ConnectionPool:
     def close(self) -> None:
         """End `serve`, and close the connections that wait for a worker."""
         self._closed.set()
-        self._ended.wait()
-        # first the connections: behind `None` no worker would come to them
+        self._ended.wait()  # `serve` checks `_closed` every CHECK_INTERVAL
+        # Close the connections before any `None` is put into the queue. The last entry
+        # is taken first, so workers would take the `None`, end, and leave them open.
         with suppress(Empty):
-            while (job := self._ready.get_nowait()) is not None:
-                connection, _ = job
+            while True:
+                job = self._ready.get_nowait()
+                if job is None:  # the pool was closed before
+                    break
+                connection, _address = job
                 connection.close()
         for _ in range(N_WORKERS):
             self._ready.put(None)

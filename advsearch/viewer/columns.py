@@ -1,7 +1,7 @@
-"""The rows of a sweep as columns of numbers, for a browser that aggregates them.
+"""Pack the rows of a sweep as columns of numbers, for a browser that aggregates them.
 
-A million rows are 30 MB of numbers; going through them takes a browser some ten
-milliseconds, SQLite some seconds.
+A million rows are 30 MB of numbers. A browser aggregates them in about ten
+milliseconds, SQLite in a few seconds.
 """
 
 from __future__ import annotations
@@ -25,31 +25,29 @@ from advsearch.trust.databases import DAMAGED
 if TYPE_CHECKING:
     import pandas as pd
 
-# distinct names of an axis, or predictions; further ones are merged to "others"
+# Maximum number of distinct names in a column. Further names become "others".
 MAX_LEVELS = 65535
-# `right` of a row whose prediction was not evaluated
+# Value of "right" for a row whose prediction was not evaluated.
 UNKNOWN = 2
-NO_PROBABILITY = 65535
-# steps of a pixel, in which the corners of boxes are counted
-BOX_STEPS = 8
-NO_BOX = 65535
-# the key in a frame's `attrs` of the boxes of its rows
+NO_PROBABILITY = 65535  # value for a missing probability
+BOX_STEPS = 8  # corners of boxes are integers in units of 1/8 of a pixel
+NO_BOX = 65535  # value for the corners of a missing box
+# Key in the `attrs` of a frame for the boxes of its rows.
 BOXES_ATTRIBUTE = "boxes"
-# values of a box in `Boxes`: its corners, the index of its name, its score
+# Number of values of a box in `Boxes`: four corners, the index of the name, the score.
 VALUES_PER_BOX = 6
 
 
 @dataclass
 class Boxes:
-    """All boxes of a detector's predictions, and the true ones, of rows with any
-    number.
+    """The predicted and the true boxes of rows, each of which may have any number.
 
     Attributes:
-        values: `VALUES_PER_BOX` uint16 values a box: x0, y0, x1 and y1 in `BOX_STEPS`
-            of a pixel, index of the name, score in 1/10000 (`NO_PROBABILITY` of true
-            boxes).
-        ends: number of boxes up to and including each row.
-        names: index of each name of a class or a thing.
+        values: `VALUES_PER_BOX` uint16 values for each box, one box after the other:
+            x0, y0, x1 and y1 in units of 1 / `BOX_STEPS` of a pixel, the index of the
+            name, and the score in units of 1/10000 (`NO_PROBABILITY` for true boxes).
+        ends: for each row, the number of boxes in this row and all rows before.
+        names: index of each name of a class or an object.
     """
 
     values: array[int] = field(default_factory=lambda: array("H"))
@@ -69,14 +67,16 @@ class Boxes:
     def _put_box(self, box: Any, name: object, score: int) -> None:
         """Add the values of a box (x0, y0, x1, y1) in pixels, with its name and score.
 
-        Corners are clipped to what uint16 can hold below `NO_BOX`.
+        Corners become integers in units of 1 / `BOX_STEPS` of a pixel, clipped to the
+        range of uint16 below `NO_BOX`. The score is in units of 1/10000.
         """
         x0, y0, x1, y1 = (
             min(max(round(BOX_STEPS * float(corner)), 0), NO_BOX - 1) for corner in box
         )
         name = str(name)
-        # a name beyond the limit is shown as the last one, "others"
-        if name not in self.names and len(self.names) >= MAX_LEVELS - 1:
+        # The last of the MAX_LEVELS indices is for all further names together.
+        is_beyond_limit = len(self.names) >= MAX_LEVELS - 1
+        if name not in self.names and is_beyond_limit:
             name = "others"
         name_index = self.names.setdefault(name, len(self.names))
         self.values.extend((x0, y0, x1, y1, name_index, score))
@@ -93,7 +93,7 @@ CORNERS = tuple(
     for box in ("true box", "predicted box")
     for corner in ("x0", "y0", "x1", "y1")
 )
-"""Columns of detection: corners of the true and of the predicted box, pixels."""
+"""Columns for detection: the corners of the true and of the predicted box in pixels."""
 
 
 def read_columns(
@@ -129,14 +129,15 @@ def read_columns(
 
 
 def _read_corners(row: Row, boxes: Boxes) -> Mapping[str, float]:
-    """Return the corners of a row's true box and of its best detection.
+    """Return the corners of a row's true box and of its best detection, and add all its
+    boxes to a collection.
 
     The names of the corners are `CORNERS`; a box that does not exist has NaN. Rows of
     other tasks than detection have no corners.
 
     Args:
         row: row of a sweep.
-        boxes: collection to which all boxes of the row are added.
+        boxes: collection to which the boxes are added, and an entry of `ends`.
     """
     payload: Any = row.payload
     corners: Mapping[str, float] = {}
@@ -148,8 +149,9 @@ def _read_corners(row: Row, boxes: Boxes) -> Mapping[str, float]:
             for corner in box or [None] * 4:  # no box: four NaN
                 values.append(math.nan if corner is None else float(corner))
         corners = dict(zip(CORNERS, values, strict=True))
-    # Every row has an entry: the number of boxes up to and including it.
-    boxes.ends.append(len(boxes.values) // VALUES_PER_BOX)
+    # Every row gets an entry, also one without boxes.
+    n_boxes_so_far = len(boxes.values) // VALUES_PER_BOX
+    boxes.ends.append(n_boxes_so_far)
     return corners
 
 
@@ -170,10 +172,12 @@ def pack_columns(
     """Pack rows into bytes for a browser.
 
     The bytes are the length of the head, the head, and the columns, all little-endian.
-    The length is a uint32. The head is JSON, padded to a multiple of 4 bytes; it has
-    the number of rows, the names, and the offset of each column from the end of the
-    head. Columns with the largest values (4 bytes) come first, so that each column is
-    aligned, as typed arrays of JavaScript require it.
+    The length is a uint32. The head is JSON, padded to a multiple of 4 bytes. It has
+    the number of rows ("count"), the id of the last one ("last"), whether there are
+    more ("more"), the names of labels ("answers"), outcomes and objects ("things"), and
+    the offset of each column from the end of the head. Columns with the largest values
+    (4 bytes) come first, so that each column is aligned, as typed arrays of JavaScript
+    require it.
 
     The column "boxes" is (n, 8) uint16: the corners of the true box and of the best
     detection, in units of 1 / `BOX_STEPS` of a pixel, or `NO_BOX`. "others" has the
@@ -188,7 +192,7 @@ def pack_columns(
     parameter_columns, parameters = _parameter_columns(rows)
     columns |= parameter_columns
     columns |= _box_columns(rows)
-    # the largest values first, so that all are aligned
+    # `itemsize` is the size of one value, also in a column with several for each row
     arrays = sorted(columns.items(), key=lambda item: -item[1].itemsize)
 
     boxes: Boxes | None = rows.attrs.get(BOXES_ATTRIBUTE)
@@ -248,20 +252,22 @@ def _prediction_columns(
         The columns by name; the names for which the indices in "answer" stand; and the
         names for those in "outcome".
     """
-    labels, label_names = _encode_levels(rows["label"])
-    outcomes, outcome_names = _encode_levels(rows["outcome"])
+    label_indices, label_names = _encode_levels(rows["label"])
+    outcome_indices, outcome_names = _encode_levels(rows["outcome"])
     probability = 10_000 * rows["probability"].clip(0.0, 1.0).to_numpy()
     probability = np.where(
         np.isnan(probability), NO_PROBABILITY, probability.round()
     ).astype(np.uint16)
-    # out of view nothing was predicted, so nothing was judged
-    is_right = rows["correct"].where(rows["label"] != OUT_OF_VIEW).fillna(UNKNOWN)
+    # Such a label marks a row whose object is not visible. Whether the prediction is
+    # right is unknown then.
+    is_in_view = rows["label"] != OUT_OF_VIEW
+    is_right = rows["correct"].where(is_in_view).fillna(UNKNOWN)
     columns = {
         "step": rows["step"].to_numpy(np.uint32),
         "margin": rows["margin"].to_numpy(np.float32),
-        "answer": labels,
+        "answer": label_indices,
         "probability": probability,
-        "outcome": outcomes,
+        "outcome": outcome_indices,
         "right": is_right.to_numpy(np.uint8),
         "unit": rows["unit"].to_numpy(np.uint32),
     }
@@ -287,7 +293,7 @@ def _parameter_columns(
             unit = ""
             values, levels = _encode_levels(column)
         else:
-            # what is too large for float32 becomes infinite, without a warning
+            # values too large for float32 become infinite, without a warning
             with np.errstate(over="ignore"):
                 values = column.to_numpy(np.float32)
         columns[f"parameter {index}"] = values

@@ -1,6 +1,7 @@
-"""The frame of every page, which needs no other file, and elements that pages share.
+"""The frame of every page, and elements that pages share.
 
-Its style sheet is light and dark, from a phone to a wide screen, and on paper.
+A page needs no other file. Its style sheet supports light and dark mode, small and wide
+screens, and print.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from advsearch.runs.directory import PARTS, REPORT
 from advsearch.trust import pages
 from advsearch.version import __version__
 
-# notes on files that are not folded
+# Maximum number of notes on files that are displayed without folding.
 MAX_UNFOLDED_NOTES = 3
 
 _SUFFIXES = "|".join(suffix[1:] for suffix in (*MESHES, ".hdr", ".exr", ".xml"))
@@ -30,7 +31,7 @@ _FILE_REMARK = re.compile(
     rf"[^:]{{1,200}}\.({_SUFFIXES})[: ]|The clean scene has ", re.IGNORECASE
 )
 """The beginning of remarks on how a file was read, or on a value without a control."""
-# characters of a cell above which its text is broken into lines
+# Maximum length of a cell whose text is not broken into lines.
 MAX_CELL_LENGTH = 32
 
 SCRIPTS = (
@@ -40,9 +41,7 @@ SCRIPTS = (
     ("make.js", "attack.js"),
     ("make.js", "attack.js", "object.js"),
 )
-"""Files of the viewer that run together in a page.
-
-There are no other scripts, and the server allows none.
+"""The combinations of scripts that pages contain. The server allows no other scripts.
 """
 
 

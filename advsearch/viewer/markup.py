@@ -1,7 +1,8 @@
-"""HTML of pages that experiments make: elements, tables, documents, and `RequestRejected`.
+"""Functions with which experiments make HTML pages: elements, tables and documents; and
+`RequestRejected`.
 
-`advsearch.extend` offers this module to added experiments. Text becomes markup only
-through `make_element`, which escapes it.
+Experiments of other packages use this module through `advsearch.extend`.
+`make_element` escapes all text.
 """
 
 from __future__ import annotations

@@ -1,5 +1,4 @@
-"""`report.html` of any run: the page of its experiment, or its result laid out as a
-page.
+"""Make `report.html` of a run: the page of its experiment, or a page from its result.
 
 The object of an attack can be rotated there: `object.js` draws the run's binary glTF.
 """
@@ -252,6 +251,7 @@ def make_object_part(data: bytes) -> ResultPart:
     """Return the part in which a script draws the object; empty without an object."""
     if not data:
         return ResultPart()
+    # the note about the object that `encode_glb` has written into the file
     extras = _read_header(data).get("asset", {}).get("extras", {})
     note = str(extras.get("note", "")) if isinstance(extras, dict) else ""
     return ResultPart(
@@ -335,21 +335,22 @@ def make_view_page(
         scripts: names of files with scripts that fill the parts that are `live`.
     """
     content = list[Html | None]()
-    names_figures = any(
+    has_chosen_images = any(
         part.draw or part.figure or part.pictures for part in view.sections
     )
-    if not names_figures:
+    if not has_chosen_images:  # then all images of the run are displayed
         content += _embed_all_images(run, view)
     for part in view.sections:
         is_for_page = part.only in ("", "page")  # and not for texts alone
         if is_for_page and not part.is_empty:
             content.append(make_part(run, part, view.statement))
     content.append(_list_parts(run, list(getattr(result, "parts", ()))))
-    subject = views.list_subjects(result, view)
+    subjects = views.list_subjects(result, view)
+    # `subject_html` takes pairs of a prefix and a name; here there is no prefix
     eyebrow = join_html(
         result.command,
-        "; " if subject else None,
-        document.subject_html(*(("", name) for name in subject)),
+        "; " if subjects else None,
+        document.subject_html(*(("", name) for name in subjects)),
     )
     return document.make_document(
         f"{run.name}, {result.command}",

@@ -1,16 +1,16 @@
-"""`advsearch dashboard`: a small server of the pages of runs, by default for this
-machine.
+"""`advsearch dashboard`: a small web server for the pages of runs, by default on this
+machine only.
 
-It responds to GET and HEAD of the list, of a run's page, rows and images, to POST of a
-photograph, and to nothing else. No part of an address becomes a path except a name in
-`runs/`. A request whose `Host` is not this server's is refused (DNS rebinding); so is
-one that another origin's page sends. Other machines need the token in every request,
-and HTTPS, with a certificate that `openssl` makes and that is valid for as long as the
-server runs.
+It responds to GET and HEAD requests for the list of runs, and for the page, the rows
+and the images of a run; and to POST requests with a photograph. Of an address, only the
+name of a run becomes part of a path. A request is rejected if its `Host` is not this
+server (DNS rebinding), or if a page of another origin sends it. Other machines need a
+token in every request, and HTTPS. `openssl` makes the certificate, which is valid as
+long as the server runs.
 
-The files of a run count as untrusted: they are served with a policy that gives them an
-origin of their own and lets no script run but those of this package. A photograph needs
-the key that only the run's page for photographs has.
+The files of a run are not trusted: they are served with a policy that gives them an
+origin of their own, and allows only the scripts of this package. A request with a
+photograph needs a key that only the page for photographs of the run contains.
 """
 
 from __future__ import annotations
@@ -162,7 +162,7 @@ def _run_row(name: str, run: listing.ListedRun, can_compare: bool) -> Html:
 
 
 def _comparison_checkbox(name: str) -> Html:
-    """Return the box by which a sweep is chosen to be shown beside others."""
+    """Return the check box that selects a sweep for comparison with others."""
     return make_element(
         "input",
         type="checkbox",
@@ -191,7 +191,7 @@ def _cover_link(run: listing.ListedRun, address: str) -> Html:
 
 
 def _run_subject(name: str, run: listing.ListedRun, address: str) -> Html:
-    """Return what a run is about, with a link to its page for photographs."""
+    """Return the subjects of a run, with a link to its page for photographs."""
     facts = (run.command, wording.shorten_names(run.object), " and ".join(run.controls))
     photographs = None
     if run.command in ("attack", "sweep"):
@@ -206,9 +206,9 @@ def _run_subject(name: str, run: listing.ListedRun, address: str) -> Html:
     return make_element("div", subject, photographs, class_="soft")
 
 
-# maximum evaluations in one response; the page requests the rest
+# Maximum number of rows in one response. The page requests the rest later.
 MAX_PROGRESS_ROWS = 2000
-# the last row that a new page has
+# Value of `after` for a page that has no rows yet; ids of rows begin at 1.
 FIRST_ROW_ID = 0
 
 
@@ -291,25 +291,26 @@ def make_progress_json(run: Path, after: int) -> bytes:
     """
     # The state is read before the rows. If the run ends in between, it counts as
     # running, so that the page requests its last rows once more.
-    running = is_held(run)
-    ended = not is_unfinished(run)
-    last = after
+    running = is_held(run)  # a process works on it
+    ended = not is_unfinished(run)  # not running, and cannot be resumed
+    last_id = after
     rows = list[dict[str, object]]()
     pictures = list[dict[str, object]]()
     if (run / store.NAME).is_file():
         with store.Store(run / store.NAME, read_only=True) as results:
             for row in islice(results.rows(after=after), MAX_PROGRESS_ROWS):
                 rows.append(_row_json(row))
-                last = row.id or after
-            # Only images of the search, since the page displays no others.
-            for step, picture in results.iterate_images("search", after, last):
+                last_id = row.id or after
+            # Only images of the search, since the page displays no others. The index of
+            # an evaluation in its search is its step.
+            for step, picture in results.iterate_images("search", after, last_id):
                 jpeg = make_thumbnail(picture.astype("float32") / 255.0)
                 url = make_data_url(jpeg, "image/jpeg")
                 pictures.append({"step": step, "picture": url})
     progress = {
         "rows": rows,
         "pictures": pictures,
-        "next": last,
+        "next": last_id,
         "running": running,
         "ended": ended,
     }
@@ -328,26 +329,25 @@ def _row_json(row: store.Row) -> dict[str, object]:
     return {**fields, "values": values}
 
 
+# Maximum number of rows of a sweep in one response. The first response of a page is
+# shorter, since the user waits for it.
 FIRST_ROWS = 4_000
 MAX_ROWS = 50_000
-"""Rows of a sweep in one response: of the first, which people wait for, and of
-others.
-"""
-# maximum bytes of a sweep's columns, and of a run's page
+# Maximum bytes of a sweep's columns, and of a run's page.
 MAX_COLUMNS_BYTES = 1 << 30
 MAX_PAGE_BYTES = 1 << 28
-# seconds in which a photograph has to arrive
+# Maximum seconds for receiving a photograph.
 UPLOAD_SECONDS = 60.0
 FAULT_MESSAGE = "this page could not be made, which is a fault of advsearch"
-# connections that may wait in the operating system
+# Maximum number of connections that wait in the operating system.
 BACKLOG = 4096
-# directory and file of a thumbnail
+# Pattern of the directory and file of a thumbnail.
 THUMBNAIL_PATH = re.compile(r"[0-9]+/[0-9]{1,12}\.jpg")
 
 
 class PhotographServer(Protocol):
-    """What responds for the page on which photographs are aligned with a run's
-    renderings.
+    """The interface of the object that serves the pages on which photographs are
+    aligned with the renderings of a run.
     """
 
     def make_page(
@@ -405,20 +405,13 @@ def _name_runs(paths: Sequence[Path]) -> dict[str, Path]:
 
 
 class Dashboard(HTTPServer):
-    """The server of runs, by default of those in ``runs/``, looked up at each request.
+    """The server of the pages of runs. `serve_forever` responds until `shutdown`.
 
-    `serve_forever` responds until `shutdown`. `token` is what every request needs, None
-    on this machine. `fingerprint` is SHA-256 of the certificate, None without HTTPS.
-
-    Args:
-        list_runs: directories of runs; without, those in ``runs/``.
-        host: address to listen at; one beyond this machine always has HTTPS.
-        port: port to listen at, 0 for a free one.
-        https: whether to use HTTPS on this machine too.
-        photographs: what handles photographs; without it they are refused.
-
-    Raises:
-        InputError: if it cannot listen at the address, or not make a certificate.
+    Attributes:
+        token: token that every request needs; None if only this machine can reach the
+            server.
+        fingerprint: SHA-256 of the certificate; None without HTTPS.
+        photographs: object that serves the pages for photographs; None rejects them.
     """
 
     request_queue_size = BACKLOG
@@ -451,6 +444,7 @@ class Dashboard(HTTPServer):
         self.token = None if is_local(host) else secrets.token_urlsafe(24)
         self._secret = secrets.token_bytes(32)  # from which `make_key` makes keys
         self.photographs = photographs
+        # Held while the list of runs is read. Other requests then find cached entries.
         self._listing = threading.Lock()
         self.host_name = host
         self.fingerprint = None
@@ -461,6 +455,7 @@ class Dashboard(HTTPServer):
             )
         # The socket is bound below, where an error about the address is converted.
         super().__init__((host, port), _Handler, bind_and_activate=False)
+        # `finish_request` is the method of `socketserver` that calls `_Handler`.
         self.clients = ConnectionPool(self.socket, self.finish_request, self._context)
         try:
             self.server_bind()
@@ -534,7 +529,7 @@ class Dashboard(HTTPServer):
 
     def make_list_page(self) -> str:
         """Return the page that lists the runs."""
-        with self._listing:  # one thread reads, the others find what it has cached
+        with self._listing:  # one thread reads, the others find its cached entries
             return make_list_page(self.list_runs())
 
     def serve_forever(self, poll_interval: float = CHECK_INTERVAL) -> None:
@@ -566,7 +561,7 @@ class Response(NamedTuple):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Responds to a request in a worker's thread."""
+    """Responds to a request in a worker thread."""
 
     server: Dashboard
     protocol_version = "HTTP/1.0"
@@ -628,7 +623,10 @@ class _Handler(BaseHTTPRequestHandler):
         )
 
     def _respond(self) -> tuple[Response, dict[str, str]]:
-        """Return the response to a request, and further headers to send with it."""
+        """Return the response to a request, and further headers to send with it.
+
+        The caller has checked the request, including its token.
+        """
         if not self.path.startswith("/"):
             raise RequestRejected(HTTPStatus.BAD_REQUEST, "this server is no proxy")
         address = urlsplit(self.path)
@@ -644,7 +642,7 @@ class _Handler(BaseHTTPRequestHandler):
             unquote(part, errors="surrogateescape")
             for part in address.path.split("/")[1:]
         ]
-        if self.command == "POST":
+        if self.command == "POST":  # only photographs are posted
             return self._take_photograph(parts), headers
         return self._route(query, parts), headers
 
@@ -776,17 +774,19 @@ class _Handler(BaseHTTPRequestHandler):
     def _serve_rows(self, query: Query, run: Path) -> Response:
         """Return rows of a sweep as packed columns.
 
-        The first rows of a finished sweep may be stored in this form already.
+        The first response for a page is short, since the user waits for it. But all
+        rows of a finished sweep may be stored in this form already; then they are
+        returned.
         """
         media_type = "application/octet-stream"
-        after = _parse_after(query)
+        after = _parse_after(query)  # id of the last row that the page has; 0 for none
         if not after and (run / COLUMNS).is_file() and listing.is_finished(run):
             stored = read_bytes(run / COLUMNS, "columns of a sweep", MAX_COLUMNS_BYTES)
             return Response(media_type, stored)
         max_rows = MAX_ROWS if after else FIRST_ROWS
         # The state is read before the rows. If the run ends in between, it counts as
         # running, so that the page requests its last rows once more.
-        is_running = is_held(run)
+        is_running = is_held(run)  # locked by a process that works on it
         rows = read_columns(run, after, max_rows)
         has_more = len(rows) == max_rows
         return Response(

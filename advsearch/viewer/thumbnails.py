@@ -1,4 +1,6 @@
-"""Thumbnails of a sweep's images: ``images/rows/0001/1234.jpg``, 1000 a directory."""
+"""Read and write thumbnails of a sweep's images: ``images/rows/0001/1234.jpg``, with
+1000 images in each directory.
+"""
 
 from __future__ import annotations
 
@@ -26,17 +28,17 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-# images in each directory
+# Number of images in each directory.
 IMAGES_PER_DIRECTORY = 1000
-# longest side of a thumbnail, pixels
+# Longest side of a thumbnail in pixels.
 THUMBNAIL_SIZE = 128
-# of JPEG files, from 1 to 95
+# Quality of JPEG files, from 1 to 95.
 JPEG_QUALITY = 85
 # maximum pixels of an image that is scaled down for the list of runs
 MAX_COVER_PIXELS = 50_000_000
 # maximum bytes of the file of a thumbnail
 MAX_THUMBNAIL_BYTES = 1 << 24
-# about the bytes of a thumbnail, measured on images of the bundled objects
+# Approximate size of a thumbnail in bytes, measured on images of the bundled objects.
 TYPICAL_BYTES = 5000
 
 
@@ -123,13 +125,13 @@ class Thumbnails:
 
     Attributes:
         run: directory of the run.
-        configurations_per_image: number of consecutive configurations that share an
-            image.
-        is_subset: whether only a subset of the images has thumbnails.
+        rows_per_image: number of consecutive rows about the same image, one for each
+            model.
+        is_subset: whether only some of the images have thumbnails.
     """
 
     run: Path
-    configurations_per_image: int
+    rows_per_image: int
     is_subset: bool
 
     @cached_property
@@ -141,16 +143,16 @@ class Thumbnails:
         return tuple(sorted(_list_numbers(self.run)))
 
     def read_png(self, step: int) -> bytes | None:
-        """Return the image of a configuration as a PNG; None if it was not stored.
+        """Return the thumbnail of a row's image as a PNG; None if it was not stored.
 
         Args:
-            step: step of the row; several rows may be of one image.
+            step: step of the row.
 
         Raises:
             FileFormatError: the file is no JPEG.
         """
         try:
-            data = read_thumbnail(self.run, step // self.configurations_per_image)
+            data = read_thumbnail(self.run, step // self.rows_per_image)
         except OSError:
             return None
         stream = io.BytesIO()
@@ -158,7 +160,7 @@ class Thumbnails:
             with Image.open(io.BytesIO(data), formats=("JPEG",)) as image:
                 image.save(stream, "PNG")
         except BAD_PICTURE:
-            file = thumbnail_path(self.run, step // self.configurations_per_image)
+            file = thumbnail_path(self.run, step // self.rows_per_image)
             raise FileFormatError(
                 f"{file}: expected a small picture of the run, got something else"
             ) from None
@@ -180,7 +182,7 @@ class Thumbnails:
         remaining = set(self.numbers)
         n_bytes = 0
         for step in steps[order]:
-            number = int(step) // self.configurations_per_image
+            number = int(step) // self.rows_per_image
             if number not in remaining:
                 continue
             remaining.discard(number)  # once, whichever of its rows comes first
@@ -198,8 +200,7 @@ def find_thumbnails(run: Path) -> Thumbnails | None:
     if next(_list_numbers(run), None) is None:
         return None
     settings = read_yaml(run / CONFIG) if (run / CONFIG).is_file() else {}
-    # Each image is evaluated once by every model, so that as many consecutive
-    # configurations share it. Without the setting there is a single model.
+    # Every model has a row for each image. Without the setting there is a single model.
     model_names = split_names(str(settings.get("model", "default")))
     is_subset = settings.get("keep_pictures") != "all"
     return Thumbnails(run, len(model_names), is_subset)

@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from advsearch import experiment
-from advsearch.cli.flags import IN_A_FILE as COMMANDS
+from advsearch.cli.flags import COMMANDS_OF_FILES as COMMANDS
 from advsearch.cli.main import main
 from advsearch.config import CONFIGS
 from advsearch.errors import InputError

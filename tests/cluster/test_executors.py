@@ -367,7 +367,7 @@ def test_a_scheduler_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch)
         ("class: os.system\narguments: {command: ls}", "class: expected one of SLURMCluster.*got 'os.system'"),
         ("address: tcp://a:1\nclass: SLURMCluster", "expected either address, or class"),
         ("address: 5", "address: expected tcp://HOST:PORT"),
-        ("address: tcp://a:1\nworkers: 3", "says how many there are"),
+        ("address: tcp://a:1\nworkers: 3", "workers of a scheduler run already"),
         ("class: SLURMCluster\nworkers: none", "workers: expected a whole number"),
         ("class: SLURMCluster\nsecurity: yes", "security: expected names and values"),
         ("class: SLURMCluster", "SLURMCluster needs dask-jobqueue; pip install dask-jobqueue"),

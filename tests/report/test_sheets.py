@@ -134,7 +134,7 @@ def test_the_command_writes_a_pdf_and_says_what_it_needs(
         (["--format", "print", "--out", str(out), "--size", "0"], "size: expected the object's longest side"),
         (["--format", "csv", "--size", "95"], "--size: belongs to --format print"),
         (["--format", "csv", "--sheets", "9"], "--sheets: belongs to --format print"),
-        (["--format", "print", "--out", str(out), "--size", "9900"], "or give a larger --paper or a smaller --size"),
+        (["--format", "print", "--out", str(out), "--size", "9900"], "or use a larger --paper or a smaller --size"),
     ):
         assert main(["export", run, *wrong]) == 2
         assert message in capsys.readouterr().err

@@ -379,5 +379,5 @@ def test_what_a_search_was_told_is_checked(change: str, tmp_path: Path) -> None:
         store.append([Row("search", 0)], CachedEvaluation(0, b"u", 0, 1))
     with closing(sqlite3.connect(path)) as db, db:
         db.execute(f"UPDATE told SET {change}")
-    with Store(path) as store, pytest.raises(FileFormatError, match="expected what a search was told, got"):
+    with Store(path) as store, pytest.raises(FileFormatError, match="expected the cached evaluations of a search, got"):
         store.read_cached("search", 0)

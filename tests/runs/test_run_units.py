@@ -50,7 +50,7 @@ def test_a_run_notes_its_units_and_what_is_none_is_refused(tmp_path: Path) -> No
         none = ("[]", '{"sizes": 3}', '{"sizes": [3], "models": 0}', '{"sizes": ["a"]}')
         for text in (*none, *map(json.dumps, huge), json.dumps({"sizes": [9], "samples": 1 << 61})):
             store.write_note(UNITS_NOTE, text)
-            with pytest.raises(FileFormatError, match="what units of sampling are"):
+            with pytest.raises(FileFormatError, match="the units of a sweep"):
                 read_units(store)
 
 

@@ -1,4 +1,4 @@
-"""A patch or texture as sheets of paper."""
+"""Export a patch or texture as sheets of paper, in a PDF file."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 from advsearch.extend import Exported, Exporter, Progress, writing
 
-# longest side of a printed object whose size is not known, in millimetres
+# Longest side, in millimetres, of a printed object whose size is unknown.
 USUAL_SIZE = 100.0
 
 

@@ -1,8 +1,8 @@
-"""A sweep as a folder of 3DB (Leclerc et al. 2021), for its dashboard.
+"""Export a sweep as a folder of 3DB (Leclerc et al. 2021), for the dashboard of 3DB.
 
-`details.log` has a JSON object a line, `class_maps.json` the names of classes, and
-``images/<id>_rgb.png`` the images. `advsearch.runs.export.read_threedb` reads such a
-folder.
+The folder contains `details.log` with a JSON object in each line, `class_maps.json`
+with the names of the classes, and the images as ``images/<id>_rgb.png``.
+`advsearch.runs.export.read_threedb` reads such a folder.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from advsearch.extend import (
 DETAILS = "details.log"
 CLASSES = "class_maps.json"
 IMAGES = "images"
-PLACED = ("environment", "object")  # values that have a place of their own in a line
+# Values that have a key of their own in a line of `details.log`.
+SEPARATE_VALUES = ("environment", "object")
 
 
 def write_threedb(
@@ -50,7 +51,9 @@ def write_threedb(
     # index of each predicted label; None where the model has no index for it
     index_of_label = dict[str, int | None]()
     for row in iterate_rows():
-        names |= dict.fromkeys(name for name in row.values if name not in PLACED)
+        names |= dict.fromkeys(
+            name for name in row.values if name not in SEPARATE_VALUES
+        )
         index_of_label.setdefault(_get_label(row), row.label_index)
     if not index_of_label:
         raise InputError("format 3db: needs the rows of a sweep, and this run has none")

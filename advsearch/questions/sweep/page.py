@@ -219,7 +219,7 @@ def _describe_images(
         The description; and a note if some are left out, else None.
     """
     # Several configurations share an image: one for each model.
-    images: JsonObject = {"models": thumbnails.configurations_per_image}
+    images: JsonObject = {"models": thumbnails.rows_per_image}
     if source.thumbnail_address is not None:
         images["folder"] = source.thumbnail_address
         images["suffix"] = "jpg"

@@ -1,4 +1,4 @@
-"""The images of a run as a dataset of boxes."""
+"""Export the images of a run as a dataset with bounding boxes."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class _Dataset(Exporter):
 
 
 class Coco(_Dataset):
-    """The pictures with boxes and masks, as COCO has them."""
+    """The pictures with boxes and masks, in the format of COCO."""
 
     name = "coco"
     example = "export mug-sweep-001 --format coco --out folder"

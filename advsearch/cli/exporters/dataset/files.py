@@ -1,6 +1,8 @@
-"""The pictures of a run as a dataset to look at, to label and to train on: at the size
-that the model sees, rendered again from what the rows say, with every thing in them
-that has a name: as COCO's JSON, or for trainers of YOLO.
+"""Export the images of a run as a dataset, to browse it, label it or train on it.
+
+The images have the size of the model's input, and are rendered again from the values in
+the rows of the run. Each visible object gets an annotation, in the format of COCO or
+YOLO.
 """
 
 from __future__ import annotations
@@ -28,8 +30,9 @@ from advsearch.extend import (
     writing,
 )
 
-OBJECT = "object"  # the name of the object among the things of an image
-IMAGES = "images"  # what is in the folder of a dataset
+OBJECT = "object"  # the name of the run's object among the objects in an image
+# Folders and files of a dataset.
+IMAGES = "images"
 LABELS = "labels"
 COCO = "annotations.json"
 YOLO = "data.yaml"
@@ -40,9 +43,11 @@ class Categories:
     """The categories of a dataset.
 
     Attributes:
-        labels: the category of each index: the labels of the model, or of a model
-            without labels the name of the object alone. Empty before the first image.
-        unnamed: names of the things that images show and that no label names.
+        labels: names of the categories, by index. They are the labels of the model; if
+            the model has none, the only category is the name of the object. Empty
+            before the first image.
+        unnamed: names of objects in the images that belong to no category, since they
+            are not among the labels.
     """
 
     labels: tuple[str, ...] = ()
@@ -88,14 +93,14 @@ def _find_object_category(image: Any) -> tuple[tuple[str, ...], int]:
     """
     task = image.task
     facts = image.facts
-    # an ensemble has a task for each model; the classes are those of the first
+    # an ensemble has a task for each model; the classes of the first one are used
     if isinstance(task, tasks.EnsembleTask):
         task = task.tasks[0]
     if isinstance(task, tasks.ClassTask) and task.labels:
         # several classes may be right for the object: the first of them
         return task.labels, task.find_right_classes(facts)[0]
-    # The model has no labels: the object's name is the only category. The label that
-    # the settings give it goes before its own.
+    # The model has no labels, so the only category is the object: by the label in the
+    # settings, else by the label in the file of the object, else by its name.
     name = facts.label or facts.object_label or facts.object
     return (name,), 0
 
@@ -112,7 +117,7 @@ def _find_category(label: str, labels: tuple[str, ...]) -> int | None:
 def write_dataset(
     run: str, out: Path, format: str, *, every: bool, progress: Progress
 ) -> tuple[int, list[str]]:
-    """Write the pictures of a run as a dataset, with what is true of them.
+    """Write the pictures of a run as a dataset, with their ground truth.
 
     The dataset is written in full or not at all. If there are no pictures, nothing is
     written.
@@ -258,23 +263,23 @@ def write_coco_index(
 
 
 def make_notes(categories: Categories, n_changed: int) -> list[str]:
-    """Return sentences about what a reader of the dataset has to know.
+    """Return sentences that users of the dataset should know.
 
     Args:
-        categories: the categories, with the names of things that have none.
-        n_changed: number of images about which the model predicts something else than
-            the run has stored.
+        categories: the categories of the dataset.
+        n_changed: number of images for which the model is now right and was wrong in
+            the run, or the reverse.
     """
     notes = []
     if categories.unnamed:
         notes.append(
-            "Without a category, as no label is called so: "
+            "These objects have no category, since the model has no such label: "
             f"{', '.join(sorted(categories.unnamed))}."
         )
     if n_changed:
         notes.append(
-            f"In {n_changed} of them the model says otherwise than the run's "
-            "rows: something has changed since."
+            f"For {n_changed} of the pictures the prediction is not as in the run: "
+            "something has changed since."
         )
     return notes
 
@@ -352,7 +357,7 @@ def make_thing(number: int, image: int, thing: Any, category: int) -> dict[str, 
     Args:
         number: the id of the annotation.
         image: the id of its picture.
-        thing: what is true of it.
+        thing: its ground truth.
         category: the index of its label.
     """
     fraction = thing.visible_fraction

@@ -1,4 +1,4 @@
-"""What a projector throws onto the object."""
+"""Export what a projector projects onto the object."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from advsearch.extend import Exported, Exporter, Progress
 
 
 class Projection(Exporter):
-    """A projector's picture, and marks to line it up."""
+    """The picture of a projector, and marks to align it."""
 
     name = "projector"
     writes = "a new folder"

@@ -1,5 +1,7 @@
-"""What a projector needs for an adversarial scene: the image, marks to line it up by,
-and what to set.
+"""Export a projector of an adversarial scene, to repeat it with a real projector.
+
+The files are the projected image, an image of marks to align the projector by, a render
+of the scene with these marks, and a text with the settings.
 """
 
 from __future__ import annotations
@@ -26,10 +28,10 @@ from advsearch.extend import (
     writing,
 )
 
-ROWS = 1024  # least height of the pictures to project, in pixels
-# where the nine marks are in a picture, of its width and height
-SHARES = (1 / 8, 1 / 2, 7 / 8)
-SPP = 64  # samples a pixel of the picture of the scene with the marks
+MIN_HEIGHT = 1024  # minimum height of the images to project, in pixels
+# Positions of the nine marks, as fractions of the width and of the height.
+MARK_POSITIONS = (1 / 8, 1 / 2, 7 / 8)
+MARKS_SPP = 64  # samples per pixel of the render of the scene with the marks
 
 
 class MarkedTexel(NamedTuple):
@@ -37,9 +39,10 @@ class MarkedTexel(NamedTuple):
 
     Attributes:
         row: row of the texel.
-        column: its column.
-        x: its center from the left, as a fraction of the width of the picture.
-        y: its center from above, as a fraction of the height.
+        column: column of the texel.
+        x: distance of its center from the left edge, as a fraction of the width of the
+            image.
+        y: distance of its center from the upper edge, as a fraction of the height.
     """
 
     row: int
@@ -61,7 +64,7 @@ def write_projection(run: str | Path, out: Path) -> list[str]:
         out: the folder, which must not exist.
 
     Returns:
-        Sentences about what to set.
+        Sentences about the settings of the projectors.
 
     Raises:
         InputError: the scene has no projector, or the folder is there already; other
@@ -92,32 +95,36 @@ def write_projection(run: str | Path, out: Path) -> list[str]:
 def write_projector(
     folder: Path, adversarial: Any, control: Any, values: dict[str, Tensor]
 ) -> list[str]:
-    """Write the files of one projector, and return sentences about what to set.
+    """Write the files of one projector, and return sentences about its settings.
 
     Args:
         folder: folder to write into.
         adversarial: the `AdversarialRun` with the scene.
         control: the projector.
-        values: its values by name; "pattern" is (rows, columns, 3) in sRGB.
+        values: values of the projector by name; "pattern" is (rows, columns, 3) in
+            sRGB.
     """
     pattern = values["pattern"]
     n_rows, n_columns = pattern.shape[:2]
-    # -(-a // b) is rounded up, so that pictures have ROWS pixels of height at least
-    factor = -(-ROWS // n_rows)
+    # pixels per texel, rounded up: images are at least MIN_HEIGHT pixels high
+    factor = -(-MIN_HEIGHT // n_rows)
+    # an image of nine crosses, and the texels at their centers
     marks, marked_texels = make_marks((n_rows, n_columns), factor)
-    # the mean of each texel, at the resolution of the pattern; avg_pool2d takes
-    # (1, 3, H, W)
+    # the marks at the resolution of the pattern, as the mean of each texel; avg_pool2d
+    # takes (1, 3, H, W)
     pooled_marks = torch.nn.functional.avg_pool2d(marks.permute(2, 0, 1)[None], factor)
     texel_marks = pooled_marks[0].permute(1, 2, 0)
     Exporter.write_png(folder / "picture.png", images.enlarge(pattern, factor))
     Exporter.write_png(folder / "texels.png", pattern)
     Exporter.write_png(folder / "marks.png", color.linear_to_srgb(marks))
     # the scene as the run has it, but with the marks in place of the pattern
-    lit_inputs = control.scene_inputs(
-        {**values, "pattern": color.linear_to_srgb(texel_marks)}, {}
+    inputs_with_marks = control.scene_inputs(
+        {**values, "pattern": color.linear_to_srgb(texel_marks)}, earlier_inputs={}
     )
     seed = seeds.stream(adversarial.problem.seed, "marks")
-    view = adversarial.render({**adversarial.inputs, **lit_inputs}, seed, SPP)
+    view = adversarial.render(
+        {**adversarial.inputs, **inputs_with_marks}, seed, MARKS_SPP
+    )
     Exporter.write_png(folder / "seen.png", view)
     settings = describe_settings(control, values)
     text = [
@@ -133,16 +140,18 @@ def write_projector(
 
 
 def describe_settings(control: Any, values: dict[str, Tensor]) -> list[str]:
-    """Return what to set at a projector and around it, a sentence each.
+    """Return the settings of a projector and of the room as sentences.
 
     Args:
         control: the projector.
-        values: its values by name; only single numbers are read.
+        values: values of the projector by name; only single numbers are read.
     """
     number = {name: float(value) for name, value in values.items() if value.ndim == 0}
     unit = "m" if control.scene.object.size_in_metres is not None else "object sizes"
-    fov = control.part.fov
-    white = control.compute_measurements(values, {})["white"]["value"]
+    fov = control.part.fov  # horizontal field of view in degrees
+    # illuminance of the object by a white image, in lux
+    measurements = control.compute_measurements(values, {})
+    white = measurements["white"]["value"]
     # Half the width of the picture at distance 1. The throw ratio of a projector is
     # distance / width, which is 1 / (2 half_width).
     half_width = math.tan(math.radians(fov) / 2.0)
@@ -215,7 +224,9 @@ def make_marks(shape: tuple[int, int], factor: int) -> tuple[Tensor, list[Marked
     draw.rectangle((0, 0, width - 1, height - 1), outline=255, width=2 * line)
     marked_texels = []
     # three rows and three columns of crosses
-    for fraction_down, fraction_across in itertools.product(SHARES, SHARES):
+    for fraction_down, fraction_across in itertools.product(
+        MARK_POSITIONS, MARK_POSITIONS
+    ):
         row = int(fraction_down * n_rows)
         column = int(fraction_across * n_columns)
         marked_texels.append(

@@ -1,4 +1,4 @@
-"""The adversarial scene of a run as files for Mitsuba, and its object as glTF."""
+"""Export the adversarial scene of a run for Mitsuba, and its object as glTF."""
 
 from __future__ import annotations
 
@@ -30,27 +30,29 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
         out: a file that ends in .xml, or a folder for `scene.xml`.
 
     Returns:
-        Sentences about how a rendering of it becomes the picture of the run, and what
-        is missing in it.
+        Sentences about how a rendering of the files becomes the picture of the run, and
+        about what is missing in them.
 
     Raises:
-        InputError: such files are there, or stock Mitsuba has no such scene; other
-            errors as for `AdversarialRun.load`.
+        InputError: the files exist already, or Mitsuba without advsearch cannot render
+            such a scene; other errors as for `AdversarialRun.load`.
     """
     path = out if out.suffix.lower() == XML else out / mitsuba_data.SCENE_FILE_NAME
     check_free(path, out)
     adversarial = exports.AdversarialRun.load(run)
     renderer = adversarial.problem.renderer
-    # `inputs` are those of the scene that Mitsuba renders; `on_picture` are those of
-    # steps after rendering, such as the exposure.
-    inputs, on_picture = adversarial.split_inputs()
-    backdrop = on_picture.get("backdrop.color")
-    hazy = has_haze(renderer, inputs)
+    # `scene_inputs` are inputs of the scene that Mitsuba renders; `image_inputs` are
+    # for the steps after rendering, such as the exposure.
+    scene_inputs, image_inputs = adversarial.split_inputs()
+    # color of a plain background; None if the environment is visible
+    backdrop = image_inputs.get("backdrop.color")
+    hazy = has_haze(renderer, scene_inputs)
     _check_backdrop(backdrop, adversarial.folder, hazy=hazy)
+    # factor from radiance to the value that the sRGB curve takes
     gain = renderer.formation.gain
-    if "camera.exposure" in on_picture:
+    if "camera.exposure" in image_inputs:
         # the exposure is in stops, each of which doubles the light
-        gain *= float(torch.exp2(on_picture["camera.exposure"]))
+        gain *= float(torch.exp2(image_inputs["camera.exposure"]))
     notes = [
         *describe_formation(renderer, gain, backdrop),
         *describe_omissions(adversarial, hazy=hazy),
@@ -60,12 +62,12 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
         with tempfile.TemporaryDirectory(prefix=".export-", dir=path.parent) as folder:
             mitsuba_data.write_scene(
                 renderer.scene,
-                inputs,
+                scene_inputs,
                 Path(folder) / path.name,
                 " ".join(notes),
                 hide_environment=backdrop is not None,
             )
-            # moved when all are written, so that an error leaves none
+            # moved when all are written, so that none is left after an error
             for file in sorted(Path(folder).iterdir()):
                 os.replace(file, path.parent / file.name)
         title = (
@@ -80,7 +82,7 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
 
 
 def _check_backdrop(backdrop: torch.Tensor | None, folder: Path, *, hazy: bool) -> None:
-    """Check that a scene file of Mitsuba can have what is behind the scene.
+    """Check that a scene file of Mitsuba can represent the background.
 
     Args:
         backdrop: a plain background (3,) or a photograph (H, W, 3); None without.
@@ -110,7 +112,7 @@ def check_free(path: Path, out: Path) -> None:
     Args:
         path: the XML file of the scene. The other files have names that begin with its
             own.
-        out: what the user named: that file, or its folder.
+        out: that file or its folder, as the user named it.
 
     Raises:
         InputError: one of the files exists, there is a file in place of the folder, or
@@ -126,13 +128,13 @@ def check_free(path: Path, out: Path) -> None:
 
 
 def has_haze(renderer: Any, inputs: Mapping[str, Any]) -> bool:
-    """Return whether a scene with these inputs has haze; with density 0 a haze does
-    nothing.
+    """Return whether a scene with these inputs has visible haze.
+
+    Haze with density 0 is invisible.
     """
+    description, _filter = renderer.scene.definition
     names = [
-        part.name
-        for part in renderer.scene.definition[0].parts
-        if isinstance(part, parts.HazePart)
+        part.name for part in description.parts if isinstance(part, parts.HazePart)
     ]
     return any(float(inputs[f"{name}.density"]) > 0.0 for name in names)
 
@@ -143,24 +145,25 @@ def describe_formation(renderer: Any, gain: float, backdrop: Any) -> list[str]:
 
     Args:
         renderer: renderer of the run.
-        gain: factor from radiance to the value that the sRGB curve takes.
-        backdrop: the colour (3,) behind the scene, already times the gain; None
-            without.
+        gain: factor from radiance to the value that the sRGB curve takes, with the
+            exposure of the scene.
+        backdrop: linear color (3,) of the plain background, times the renderer's gain
+            without exposure; None if there is no plain background.
     """
     height, width = renderer.formation.resolution
     notes = [
         f"The sensor has {width} x {height} pixels, and light paths have at most "
         f"{renderer.scene.max_depth} segments.",
-        f"The run's picture is the sRGB curve of {gain:.9g} times this radiance, cut "
-        "off at 1.",
+        f"The run's picture is the sRGB curve of {gain:.9g} times this radiance, "
+        "clipped at 1.",
     ]
     if backdrop is not None:
-        # in units of the radiance, to which it is added
+        # The color is added to the radiance, before the gain.
         channels = (backdrop / renderer.formation.gain).tolist()
         red, green, blue = (f"{channel:.9g}" for channel in channels)
         notes.append(
-            "Where its alpha is under 1, add 1 - alpha times the plain "
-            f"background ({red}, {green}, {blue})."
+            "Before that, add (1 - alpha) times the plain background "
+            f"({red}, {green}, {blue}) to each pixel of the radiance."
         )
     return notes
 
@@ -200,17 +203,17 @@ def write_gltf(run: str | Path, out: Path) -> list[str]:
         out: a file that ends in .glb.
 
     Returns:
-        Sentences about what is not as in the run.
+        Sentences about differences from the scene of the run.
 
     Raises:
-        InputError: the file is called otherwise; other errors as for
+        InputError: the file has another suffix; other errors as for
             `AdversarialRun.load`.
     """
     if out.suffix.lower() != GLB:
         raise InputError(f"out: expected the name of a .glb file, got {out}")
     adversarial = exports.AdversarialRun.load(run)
-    # the mesh of the object in the scene, and the object as the search left it
-    part, posed_asset = adversarial.posed_object()
+    # the object as the scene describes it, and in its adversarial pose and texture
+    described_object, posed_asset = adversarial.posed_object()
     description = adversarial.problem.space.scene
     metres = None if description is None else description.object.size_in_metres
     if metres is not None:
@@ -222,14 +225,13 @@ def write_gltf(run: str | Path, out: Path) -> list[str]:
         writing.write_bytes(out, reading.encode_glb([posed_asset]))
     unit = "object sizes" if metres is None else "metres"
     notes = [f"Lengths are in {unit}, y is up, and the texture is rounded to 8 bits."]
-    if part.surface is not None:
+    if described_object.surface is not None:
         notes.append(
-            "Its surface is one of Mitsuba's own, of which glTF has the base "
-            "colour only."
+            "The object has a BSDF of Mitsuba. Of it, the file has the base color only."
         )
     elif posed_asset.material.specular > reading.DEFAULT_SPECULAR:
         notes.append(
-            f"A specular of {posed_asset.material.specular:g} is over glTF's largest, "
-            f"{reading.DEFAULT_SPECULAR:g}, which it has there."
+            f"The object has a specular of {posed_asset.material.specular:g}. The "
+            f"file has {reading.DEFAULT_SPECULAR:g}, the maximum of glTF."
         )
     return notes
