@@ -154,7 +154,7 @@ def test_one_file_has_the_cameras_of_a_folder_and_is_read_once(
     (tmp_path / "transforms.json").write_text(json.dumps(lens | {"frames": frames}))
     (tmp_path / "images.txt").write_text("".join(lines))
     (tmp_path / "cameras.txt").write_text("7 PINHOLE 64 48 50 60 32 24\n")
-    with pytest.raises(FileFormatError, match=r"0.png: expected its camera file .* or give `camera` for all"):
+    with pytest.raises(FileFormatError, match=r"0.png: expected its camera file .* or set `camera` for all"):
         advsearch.load_scene("mug", backdrop=photographs)
     opened: list[str] = []
     open_regular = stored_files.open_regular
