@@ -268,7 +268,7 @@ class ViewTracer:
         """
         ray, active = self._make_rays(lane, cameras, lens)
         direction = ray.d
-        to_local = texel_rays.world_to_map(self._scene)
+        to_local = texel_rays.get_world_to_map(self._scene)
         ray_flags = mi.RayFlags.UV | mi.RayFlags.ShadingFrame
 
         n_layers = texel_rays.count_cut_out_layers(self._scene)
@@ -378,7 +378,7 @@ class ViewTracer:
             diffuse fraction; and 1 on the front of the searched texture, -1 on its
             back, 0 elsewhere.
         """
-        to_local = texel_rays.world_to_map(self._scene)
+        to_local = texel_rays.get_world_to_map(self._scene)
         masks = [
             mask & valid
             for mask in texel_rays.find_hit_grids(mitsuba_scene, self._grids, si, d)
@@ -468,7 +468,7 @@ class ViewTracer:
             lit: the light.
         """
         _, up, along, core, tail = lobe
-        to_local = texel_rays.world_to_map(self._scene)
+        to_local = texel_rays.get_world_to_map(self._scene)
         # The part of d along the surface. 1e-8: a ray along the normal has none, and
         # normalising zeros would give NaN.
         tangent = dr.normalize(d + n * cosine + 1e-8)
@@ -531,7 +531,7 @@ class ViewTracer:
             si: the hit.
             masks: for each grid whether the hit is on it.
             lit: the light.
-            to_local: rotation from the world to the map, as from `world_to_map`.
+            to_local: rotation from the world to the map, as from `get_world_to_map`.
         """
         radiance = self._look_up_texel(si, masks, lit)
         if self._photograph_height is not None:
@@ -707,7 +707,7 @@ def _look_up_sky(lit: LightMaps, direction: Any, to_local: Any) -> Any:
     Args:
         lit: the light.
         direction: unit directions in the world.
-        to_local: rotation from the world to the map, as from `world_to_map`.
+        to_local: rotation from the world to the map, as from `get_world_to_map`.
     """
     n_rows, n_columns = lit.sky_shape
     x, y = texel_rays.compute_map_position(direction, to_local)
@@ -731,7 +731,7 @@ def _look_up_blurred(
     Args:
         lit: the light, with the blurred maps.
         direction: unit directions in the world.
-        to_local: rotation from the world to the map, as from `world_to_map`.
+        to_local: rotation from the world to the map, as from `get_world_to_map`.
         spread: the angle, one in each lane.
         widths: root mean square angles of the maps, radians.
     """

@@ -134,7 +134,7 @@ def _find_sky_cell(
         sky_shape: rows and columns of the environment's cells, counted row by row.
     """
     n_rows, n_columns = sky_shape
-    column, row = compute_map_position(direction, world_to_map(scene))
+    column, row = compute_map_position(direction, get_world_to_map(scene))
     sky_column = mi.UInt32(column * n_columns) % n_columns
     sky_row = mi.UInt32(dr.minimum(row * n_rows, n_rows - 1))
     return sky_row * n_columns + sky_column
@@ -215,7 +215,9 @@ def compute_visible_cosines(
         (n, k) cosines; 0 where something is in between.
     """
     # a row times the rotation is turned by its inverse: from the map to the world
-    world_directions = (directions @ np.array(world_to_map(scene))).astype(np.float32)
+    world_directions = (directions @ np.array(get_world_to_map(scene))).astype(
+        np.float32
+    )
     lane = dr.arange(mi.UInt32, len(positions) * len(world_directions))
     texel = lane // len(world_directions)
     position = _to_drjit_points(mi.Point3f, positions, texel)
@@ -352,7 +354,7 @@ def find_hit_grids(
     ]
 
 
-def world_to_map(scene: MitsubaScene) -> Any:
+def get_world_to_map(scene: MitsubaScene) -> Any:
     """Return the rotation from the world to the axes of the environment's map.
 
     It is a list of three rows: the transpose, which is the inverse, of the rotation of
@@ -366,7 +368,7 @@ def compute_map_position(direction: Any, to_local: Any) -> tuple[Any, Any]:
     """Return where a direction lies in the environment's map.
 
     The position is a fraction of the map's width and one of its height, from the left
-    and from the top, which is straight up; `to_local` is that of `world_to_map`.
+    and from the top, which is straight up; `to_local` is that of `get_world_to_map`.
     """
     x, y, z = (
         row[0] * direction.x + row[1] * direction.y + row[2] * direction.z
