@@ -910,10 +910,7 @@ def _sample_tangents(mesh: TriMesh, random: Tensor) -> _TangentLines | None:
     edge_sine = (1.0 - edge_cosine.square()).clamp_min(0.0).sqrt()
     direction = edge_cosine * axis + edge_sine * perpendicular
 
-    # Both faces go from the edge to the side where the mesh is.
-    normal = _orient_outwards(
-        torch.linalg.cross(axis, perpendicular), along_first + along_second
-    )
+    normal = _orient_outwards(torch.linalg.cross(axis, perpendicular), inwards)
     # `measure` contains the edge's length and the exterior angle. The range of
     # `signed_choice`, 4, is the rest: cosines from -1 to 1, for two opposite angles.
     return _TangentLines(
