@@ -884,8 +884,9 @@ def _sample_tangents(mesh: TriMesh, random: Tensor) -> _TangentLines | None:
         The samples; None if there is nothing to sample.
     """
     edges = _measure_exterior_angles(mesh)
-    edge_length = _compute_edge_vectors(mesh.vertices, edges.ends).norm(dim=1)
-    measure = edge_length * edges.angle
+    # length times exterior angle of each edge
+    measure = _compute_edge_vectors(mesh.vertices, edges.ends).norm(dim=1)
+    measure = measure * edges.angle
     if len(random) == 0 or not float(measure.sum()) > 0.0:
         return None
     # Only the choice of the edge is used: the point on it has a random number of its
