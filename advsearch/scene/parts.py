@@ -129,7 +129,8 @@ class _Point(ScenePart):
     ) -> tuple[Float64Array, Float64Array]:
         """Return the vector (3,) from a position to the lamp, and its irradiance (3,).
 
-        The irradiance is that of a surface that faces the lamp. By base values.
+        The irradiance is that of a surface that faces the lamp, for the base values of
+        the lamp's position and intensity.
         """
         to_lamp = np.array(self.position) - position
         return to_lamp, np.array(self.intensity) / max(float(to_lamp @ to_lamp), 1e-12)
@@ -206,6 +207,7 @@ class SpotLamp(_Point):
         # Degrees from the axis: full light up to `beam`, falling to none at `cutoff`.
         cutoff, beam = self.cone
         distance = max(float(np.linalg.norm(to_lamp)), 1e-12)
+        # The lamp shines along its z, and `-to_lamp` points from it to the position.
         cosine = -to_lamp @ self.to_world[:3, 2] / distance
         angle = math.degrees(math.acos(min(max(float(cosine), -1.0), 1.0)))
         fraction = min(max((cutoff - angle) / (cutoff - beam), 0.0), 1.0)

@@ -164,9 +164,12 @@ class SceneData:
         return compute_base_vertices(self.meshes[OBJECT])
 
     def get_number(self, name: str) -> float:
-        """Return a setting that always has a value.
+        """Return the value of a setting that is a number in every scene.
 
-        Of the field of view, that of the camera in use.
+        The field of view is that of the camera in use.
+
+        Raises:
+            KeyError: the setting has no value, or there is no such setting.
         """
         if name == "camera.fov" and self.camera != ORBIT_CAMERA:
             return self.cameras[self.camera].compute_larger_fov(self.aspect)
