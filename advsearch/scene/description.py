@@ -437,7 +437,7 @@ class SceneDescription(SceneData):
             if is_on_table:
                 floor = -TABLE_HEIGHT
             preset_values["camera.height"] = preset.height + floor
-        if preset.in_lane:  # the camera stands in the lane of the object, ahead of it
+        if preset.in_lane:  # azimuth 0 is in the lane of the object
             preset_values["camera.azimuth"] = 0.0
         if is_on_table:
             preset_values["ground.size"] = TABLE_SIDE / self.size_in_metres

@@ -62,12 +62,12 @@ class MeshPart(Shape, ScenePart):
     `advsearch.scene.assembly`.
     """
 
-    to_world: Float64Array = field(
-        default_factory=lambda: np.eye(4)
-    )  # (4, 4) its base pose
-    place: Place | None = None  # which it belongs to, and goes with
-    is_ground: bool = False  # of a place: things stand on it
-    # Solids of a place: what nothing else can be in, in object sizes.
+    # (4, 4) base pose
+    to_world: Float64Array = field(default_factory=lambda: np.eye(4))
+    # place that the mesh belongs to; it is removed with the place
+    place: Place | None = None
+    is_ground: bool = False  # whether it is the part of a place on which things stand
+    # Solids of a place, in object sizes: nothing else can be inside them.
     solids: tuple[Solid, ...] = ()
 
     @property

@@ -1,8 +1,8 @@
 """Divide a mesh's surface into parts that can be counted: cells of a map, and faces.
 
-The map is that of the mesh's own texture coordinates, cut into cells. Where these
-cannot tell points of the surface apart (charts lie on each other, faces without area),
-the mesh is unwrapped anew for it, with xatlas.
+The map is the square of the mesh's own texture coordinates, cut into cells. If several
+points of the surface have the same texture coordinates (charts overlap, or faces have
+no area there), the mesh gets new ones from xatlas.
 """
 
 from __future__ import annotations
