@@ -186,7 +186,7 @@ def read_place_meshes(
     with without_pillows_limit(), np.errstate(all="ignore"):
         primitives, surfaces = _read_primitives(file, variant_index, notes)
     note_left_out(_drop_supported_extensions(header), notes)
-    _note_place_omissions(header, primitives, notes)
+    _note_omissions(header, primitives, notes)
     check_faces(path, sum(len(primitive.part.faces) for primitive in primitives))
     groups = _group_by_material(header, primitives)
     if not groups:
@@ -214,7 +214,7 @@ def _drop_supported_extensions(header: Header) -> Header:
     )
 
 
-def _note_place_omissions(
+def _note_omissions(
     header: Header, primitives: Sequence[PosedPrimitive], notes: Notes
 ) -> None:
     """Note what only a place leaves out: vertex colors, skins and lights.
@@ -514,9 +514,9 @@ def _with_finish(
 ) -> MeshPart:
     """Return a mesh with the specular and the clear coat of its material.
 
-    In the file these are extensions of the material. The gloss of a coat needs a surface in Mitsuba's own description, which a mesh with
-    an opacity or a normal map cannot have. The coat of such a mesh has Mitsuba's
-    default gloss.
+    In the file these are extensions of the material. The gloss of a coat needs a
+    surface in Mitsuba's own description, which a mesh with an opacity or a normal map
+    cannot have. The coat of such a mesh has Mitsuba's default gloss.
 
     Args:
         path: the file, for messages.
