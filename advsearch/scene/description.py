@@ -445,7 +445,7 @@ class SceneDescription(SceneData):
 
     @property
     def things(self) -> Mapping[str, ThingPart]:
-        """The things beside the object by name, as they came."""
+        """The things next to the object by name, in the order of the setting."""
         return {part.name: part for part in self.parts if isinstance(part, ThingPart)}
 
     @property
@@ -789,9 +789,9 @@ def _import_source(
 
 
 def _choose_environment(imported: ImportedScene, *, is_mitsuba: bool) -> str:
-    """Return the environment where none is requested: none where lights shine already.
+    """Return the environment if none is requested; "none" if the scene has lights.
 
-    What shines may be a light around the object; of a Mitsuba scene also the object.
+    A light may be one around the object, or in a Mitsuba scene also the object itself.
     """
     object_shines = is_mitsuba and imported.object.emission is not None
     if object_shines or _has_lights(imported.surroundings):

@@ -1,9 +1,9 @@
-"""What may be in a scene beside its environment map, as data: meshes, lamps, haze, each
-under a name. And cameras.
+"""Named parts of a scene other than its environment map, as data: meshes, lamps and
+haze; and cameras.
 
-A part says what it is and which scene inputs it takes, torch tensors under names of
-ours; `mitsuba_backend` translates it. A part of another kind is a subclass, with a
-translation registered in `mitsuba_backend.parts.translation`.
+A part states its properties and which scene inputs it takes: torch tensors with our own
+names. `mitsuba_backend` translates it. A new kind of part is a subclass, with a
+translation registered by `mitsuba_backend.parts.translate_part.register`.
 """
 
 from __future__ import annotations
@@ -376,9 +376,10 @@ class PluginNumber:
     key: str  # key that name: "red.reflectance.value"
     values: tuple[float, ...]  # its one or three numbers in the scene as it is
     input: str  # the scene input that sets it
-    # the valid ways to differentiate it, preferred first
+    # valid estimators of its derivative, the preferred one first
     valid: tuple[str, ...] = ("differences",)
-    # Mitsuba has it as a plain number, which light paths are traced anew for
+    # whether it is a plain number in Mitsuba, a constant of the compiled kernels: after
+    # a change they are recorded again
     plain: bool = False
 
 

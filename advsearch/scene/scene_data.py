@@ -95,10 +95,10 @@ class SceneData:
     # exposure is; otherwise a radiance of 1 is the white of the picture, as Mitsuba
     # shows it
     metered: bool = True
-    # Remarks for users: of further files that controls have read, of things in each
-    # other.
+    # remarks for users: on further files that controls have read, on things that
+    # overlap
     remarks: tuple[str, ...] = ()
-    things_spec: str = ""  # how the things beside the object were asked for
+    things_spec: str = ""  # the setting that names the things next to the object
 
     @property
     def azimuth_zero(self) -> float:

@@ -566,7 +566,7 @@ GROUND = (
         low=-1e4,
         high=1e4,
         default=0.0,
-        description="Height of the ground that takes the shadow in a photograph "
+        description="Height of the ground that receives the shadow in a photograph "
         "(`backdrop`).",
     ),
     Parameter(

@@ -38,12 +38,14 @@ from advsearch.scene.raster import (
 ATLAS_SIZE = 512
 # texels between charts in an atlas of `ATLAS_SIZE`: two in a texture of half that size
 ATLAS_PADDING = 4
-_XATLAS_SCALE = 100.0  # xatlas takes faces under about 1e-7 square units for empty
-# xatlas takes neighbours whose normals have a product over 1 - 1e-4 for one plane
+# factor on lengths, since xatlas ignores faces below about 1e-7 square units
+_XATLAS_SCALE = 100.0
+# xatlas treats neighbors as one plane if the product of their normals is over 1 - 1e-4
 _MIN_FLUSH_COSINE = 1.0 - 1.5e-4
-# how far the normals of what it takes for a plane may stray before it matters
+# smallest cosine between a normal and the mean of its plane, up to which treating it as
+# a plane does no harm
 _MIN_PLANE_COSINE = np.cos(np.radians(10.0))
-# faces of a mesh above which it is always cut where the surface turns
+# a mesh with more faces is always cut where the surface turns
 _FACES_PER_ATLAS = 20_000
 _CELL_FACES = ((200_000, 1_500), (10_000, 500))
 """Faces of a mesh above which it is cut for the sake of speed, and how many faces

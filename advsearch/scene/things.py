@@ -1,11 +1,11 @@
-"""Things beside the object, which stand on the ground with it where they were asked
-for.
+"""Things next to the object, at requested positions on the ground.
 
     car@12,3.5,heading=180; person@6,-2; bike.glb@3,1,size=1.8,label=bicycle
 
-Places are in metres from where the object stands by itself: x forwards, the way that
-the object faces, and y to its left. A heading is in degrees counter-clockwise, seen
-from above; at 0 a thing faces where the object does.
+Positions are in meters from the position of the object without a shift: x forwards, in
+the direction that the object faces, and y to its left. A heading is in degrees
+counterclockwise, seen from above; at 0 a thing faces in the same direction as the
+object.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ from advsearch.scene.settings import LAMPS, LAMPS_OFF
 MAX_DISTANCE = 1000.0  # how far from the object a thing may stand, metres
 MAX_HEADING = 3600.0  # limit of a heading, degrees
 MAX_THINGS = 64  # things beside an object
-EYE_SIZE = 1e-3  # half the width of what stands for a camera, object sizes
+EYE_SIZE = 1e-3  # half the width of the box that represents a camera, object sizes
 OPTIONS = ("heading", "size", "name", "label", "lamps", "facing")
-GROUND_NAMES = ("road", "floor")  # what the ground of a bundled place is called
-ALL_THINGS = "all"  # what stands for the object and every thing beside it
+GROUND_NAMES = ("road", "floor")  # names of the ground of bundled places
+ALL_THINGS = "all"  # name that means the object and all things next to it
 # what a thing can't be called
 RESERVED_NAMES = (
     "object",
@@ -79,7 +79,7 @@ class RequestedThing:
 
 @dataclass(frozen=True, eq=False)
 class ThingPart(MeshPart):
-    """A thing beside the object."""
+    """A thing next to the object."""
 
     size_in_metres: float = 1.0  # its longest side
     lamps: str = LAMPS_OFF  # which it has on

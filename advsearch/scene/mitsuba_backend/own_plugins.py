@@ -126,7 +126,7 @@ def _find_highest_drops(drops: Float64Array, half_width: float) -> IntArray:
 
 common: Any = mi.ad.integrators.common
 PRBIntegrator: Any = mi.ad.integrators.prb.PRBIntegrator
-PLANE_SHAPE = "ground"  # Mitsuba's id of the plane that takes the shadow
+PLANE_SHAPE = "ground"  # Mitsuba's id of the plane that receives the shadow
 COAT_FRACTION = 0.5  # fraction of the paths from a coated plane that leave its coat
 MIN_DENSITY = 1e-20  # smallest density to divide by, per steradian
 ISOTROPIC_PHASE = 1.0 / (4.0 * math.pi)  # isotropic phase function, per steradian

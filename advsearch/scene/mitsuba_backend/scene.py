@@ -287,7 +287,7 @@ class MitsubaScene:
         """Return another scene, made with the same arguments except for some changes.
 
         `changes` may have `max_depth`, `sampler`, `integrator` and `leave_out`. The
-        integrator is chosen anew if it is not among them.
+        integrator is chosen again if it is not among them.
         """
         description, filter_name = self.definition
         arguments = {
@@ -388,7 +388,8 @@ class MitsubaScene:
             inputs: inputs that differ from the base values.
             seeds: seed of each image, by its kind. "path" is the linear radiance;
                 "hidden" is the same without the environment that the camera sees
-                directly, for a backdrop; "guides" is what guides the denoiser.
+                directly, for a backdrop; "guides" is the image of the denoiser's
+                guides.
             spp: samples per pixel.
 
         Returns:
@@ -480,7 +481,7 @@ class MitsubaScene:
     def render_guides(
         self, inputs: Mapping[str, Tensor], seed: int, spp: int
     ) -> tuple[Tensor, Tensor]:
-        """Render what guides the denoiser.
+        """Render the guides of the denoiser.
 
         Args:
             inputs: what differs from the base values.
