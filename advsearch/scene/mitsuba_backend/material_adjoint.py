@@ -472,10 +472,11 @@ def _reflect_light(
     # A sample on a surface counts by the solid angle that this covers: the cosine at
     # the emitter over the squared distance. `em_weight` contains its value, so that
     # only its relative change is multiplied; its sign cancels in that.
-    squared_distance = dr.select(is_surface, dr.squared_norm(ds.p - moving_si.p), 1.0)
-    falloff = dr.dot(ds.n, ds.d) / squared_distance
-    relative_falloff = dr.select(is_surface, _with_relative_gradient(falloff), 1.0)
-    em_weight = dr.replace_grad(em_weight, moving_weight) * relative_falloff
+    falloff = dr.dot(ds.n, ds.d) / dr.select(
+        is_surface, dr.squared_norm(ds.p - moving_si.p), 1.0
+    )
+    em_weight = dr.replace_grad(em_weight, moving_weight)
+    em_weight = em_weight * dr.select(is_surface, _with_relative_gradient(falloff), 1.0)
     bsdf_value, bsdf_pdf = si.bsdf().eval_pdf(
         mi.BSDFContext(), moving_si, moving_si.to_local(ds.d), active
     )

@@ -690,8 +690,8 @@ def compute_shadow_term(
     # Only the gradient of the motion counts: a point that does not move may be
     # anywhere.
     index = shadow.line_index
-    edge_point = mesh.interpolate_edge(lines.ends[index], lines.fraction[index])
     lit_point, _normal, _shading_normal, lit_point_moves = view.attach_hit(shadow.hit)
+    edge_point = mesh.interpolate_edge(lines.ends[index], lines.fraction[index])
     moving_lit_point = dr.select(lit_point_moves, lit_point, 0.0)
     motion = dr.dot(shadow.edge_normal, edge_point - moving_lit_point)
     # sine of the angle between each line and its edge: an edge along the line sweeps no
